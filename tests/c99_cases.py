@@ -150,9 +150,14 @@ def _pointer(values: np.ndarray):
 def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
     """The controller's files and the driver in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in c99_texts(document).items():
+    texts = c99_texts(document)
+    for name, text in texts.items():
         (folder / name).write_text(text)
-    shutil.copy(DRIVER, folder)
+    # Where a division or a square root may fail, the law's step has an error flag.
+    fails = re.search(
+        r"^static double jaxhil_law_step\([^)]*bool \*error\)", texts["jaxhil_controller.c"], re.M
+    )
+    (folder / DRIVER.name).write_text(("#define LAW_CAN_FAIL\n" if fails else "") + DRIVER.read_text())
     return folder
 
 

@@ -39,18 +39,23 @@ int driver_init(jaxhil_controller *controller, const double *parameters) {
 }
 
 void driver_law(jaxhil_controller *controller, size_t count, const double *rows, double *results) {
-    jaxhil_law *law = &controller->law;
     for (size_t n = 0; n < count; n++, rows += ROW, results += RESULT) {
         if (rows[0] == RESET) {
-            jaxhil_law_reset(law);
+            jaxhil_law_reset(&controller->law);
         } else if (rows[0] == NEXT_CONTACT) {
-            jaxhil_law_next_contact(law);
+            jaxhil_law_next_contact(&controller->law);
         }
         memset(results, 0, RESULT * sizeof *results);
-        results[0] = jaxhil_law_step(law, rows[1], rows[2], rows[3], rows[4]);
-        results[1] = jaxhil_law_position_command(law, rows[7], rows[8], rows[9]);
-        jaxhil_law_identified(law, &results[2], &results[3]);
-        results[4] = jaxhil_law_own_status(law);
+#ifdef LAW_CAN_FAIL
+        bool error = false;
+        results[0] = jaxhil_law_step(&controller->law, rows[1], rows[2], rows[3], rows[4], &error);
+        results[0] = error ? NAN : results[0];
+#else
+        results[0] = jaxhil_law_step(&controller->law, rows[1], rows[2], rows[3], rows[4]);
+#endif
+        results[1] = jaxhil_law_position_command(&controller->law, rows[7], rows[8], rows[9]);
+        jaxhil_identified(controller, &results[2], &results[3]);
+        results[4] = jaxhil_law_status(controller);
     }
 }
 

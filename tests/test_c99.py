@@ -32,15 +32,14 @@ from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES
 from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
 from jaxhil.runtime.law_status import STATUS_NAMES, STATUSES
-from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.runtime.limits import LIMITS, complete
 from tuning.bundle.c99 import c99_texts
 from tuning.bundle.c99_tables import UNUSABLE, decimal
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-LAWS = tuple(name for name in COMPENSATORS if name not in WITHOUT_C)
+LAWS = tuple(COMPENSATORS)
 # Most of the C code between them.
-LONG_CODE = ("response_error", "virtual_contact")
+LONG_CODE = ("response_error", "virtual_contact", "impulse_ledger")
 KINDS = ("contact", "random", "hostile")
 
 
@@ -239,6 +238,32 @@ def test_same_bits(law, kind, batch):
     for n in range(12):
         gain_file = drawn_gains(law, rng, hostile=n % 2 == 1)
         compare(batch(law), gain_file, drawn_rows(kind, 1000, rng, gain_file.control_period))
+
+
+def test_same_bits_in_contacts_that_the_impulse_ledger_follows(batch):
+    """Contacts after an approach, of every status that the law states of a tick."""
+    law, statuses = "impulse_ledger", set()
+    for n in range(12):
+        rng = np.random.default_rng([11, n])
+        drawn = drawn_gains(law, rng, hostile=False, period=PERIOD)
+        gain_file = drawn if n % 2 else check_gain_document(gain_document(law))
+        gains = gain_file.gains | ({"delay_spread": 0.002} if n % 3 == 1 else {})
+        limits = complete({"equivalent_mass": 350.0, "settling": 0.02})
+        clearance = math.inf if n % 4 else 1e-4
+        gain_file = gain_file._replace(gains=gains, limits=limits, clearance=clearance)
+        motion = rng.uniform(0, 6), rng.uniform(8, 60), 10 ** rng.uniform(-4.5, -2.7)
+        rows = c99_cases.contact_rows(2000, rng, PERIOD, *motion)
+        if n % 4 == 0:  # a sensor that is neither late nor noisy
+            rows[:, 1] = 1.2e5 * np.maximum(rows[:, 4], 0.0) + 0.1 * rng.standard_normal(len(rows))
+        if n % 4 == 2:  # contact that is over soon
+            rows[:, 1] *= 300.0
+        compare(batch(law), gain_file, rows)
+        assert batch(law).begin(packed(law, gain_file))
+        statuses |= set(batch(law).run(rows, True)[:, c99_cases.RESULT.index("law_status")].tolist())
+    assert {STATUS_NAMES[status] for status in statuses} == {*STATUS_NAMES.values()} - {
+        "unstated",
+        "not_reached",
+    }
 
 
 @pytest.mark.parametrize("law", LAWS)

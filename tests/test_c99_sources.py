@@ -1,12 +1,15 @@
 """The C99 controller as sources: no warning, no memory of its own, no more exported than needed."""
 
 import functools
+import inspect
 import platform
 import re
 import shutil
 import subprocess
+from typing import ClassVar
 
 import c99_cases
+import numpy as np
 import pytest
 from c99_cases import (
     compiled,
@@ -15,11 +18,12 @@ from gain_documents import gain_document, sign
 
 from jaxhil.errors import InputError
 from jaxhil.runtime import COMPENSATORS, GainFileError
-from jaxhil.runtime.laws import WITHOUT_C
+from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.runtime.registry import Compensator, GainSpecification
 from tuning.bundle.c99 import c99_texts
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-LAWS = tuple(name for name in COMPENSATORS if name not in WITHOUT_C)
+LAWS = tuple(COMPENSATORS)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,10 @@ def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, c
     wanted = {name for name, kind in symbols if kind == "U"}
     assert wanted <= {
         "ceil",
+        "exp",
         "floor",
+        "log",
+        "pow",
         "sqrt",
         "memset",
         "memcpy",
@@ -163,20 +170,57 @@ def test_only_what_the_law_needs_is_exported():
     assert texts == c99_texts(gain_document("phase_lead"))
 
 
-def test_law_without_a_c_file_is_named(monkeypatch):
-    class Toy(COMPENSATORS["none"]):
-        pass
+class ToyLaw(Compensator):
+    """F_c = F + share (F - F of the tick before); é in a comment."""
 
-    monkeypatch.setitem(COMPENSATORS, "toy", Toy)
-    document = sign(gain_document("none") | {"compensator": "toy"})
-    with pytest.raises(InputError, match=r"^jaxhil/c99/laws/toy\.c: found no such file"):
-        c99_texts(document)
+    gains: ClassVar = {"toy_share": GainSpecification("1")}
+
+    def __init__(self, gains, period, clearance):
+        self._share = gains["toy_share"]
+        self._before = 0.0
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured):
+        # The share of the change /* of a tick */ only.
+        command = force_measured + self._share * (force_measured - self._before)
+        self._before = force_measured
+        return command / (1.0 + velocity_desired)
+
+    def reset(self):
+        self._before = 0.0
 
 
-@pytest.mark.parametrize("law", WITHOUT_C)
-def test_law_without_c_sources_is_refused_in_one_line(law):
-    with pytest.raises(InputError, match=rf"^c99: found {law}, which has no C99 sources yet; [^\n]*$"):
-        c99_texts(gain_document(law))
+class ToyLawWithText(ToyLaw):
+    """A law outside the subset."""
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured):
+        return force_measured + sum([position_desired, velocity_desired])
+
+
+def toy_document(monkeypatch, law):
+    """A document of a user-registered law `toy`."""
+    monkeypatch.setitem(COMPENSATORS, "toy", law)
+    gains = {"toy_share": {"value": 0.5, "unit": "1", "lower": 0.0, "upper": 1.0}}
+    return sign(gain_document("none") | {"compensator": "toy", "gains": gains})
+
+
+def test_user_registered_law_is_exported_to_c_and_gives_the_same_bits(monkeypatch, tmp_path):
+    document = toy_document(monkeypatch, ToyLaw)
+    folder = c99_cases.write_sources(tmp_path, document)
+    made = c99_cases.Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), "toy")
+    gain_file = check_gain_document(document)
+    for kind in ("contact", "random", "hostile"):
+        rows = c99_cases.drawn_rows(kind, 500, np.random.default_rng(0), c99_cases.PERIOD)
+        rows[::7, 3] = -1.0  # a division by zero
+        for guarded, python in ((True, c99_cases.controller_in_python), (False, c99_cases.law_in_python)):
+            assert made.begin(c99_cases.packed("toy", gain_file))
+            c99_cases.assert_same(made.run(rows, guarded), python(gain_file, rows), rows)
+
+
+def test_user_registered_law_outside_the_subset_is_refused_with_file_and_line(monkeypatch):
+    line = inspect.getsourcelines(ToyLawWithText)[1] + 4
+    expected = rf"^c99: toy: \S*test_c99_sources\.py:{line}: found sum\(\.\.\.\), expected [^\n]*$"
+    with pytest.raises(InputError, match=expected):
+        c99_texts(toy_document(monkeypatch, ToyLawWithText))
 
 
 def test_document_that_the_runtime_refuses_is_refused():

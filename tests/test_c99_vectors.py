@@ -15,11 +15,10 @@ from gain_documents import gain_document, sign
 
 from jaxhil.runtime import COMPENSATORS
 from jaxhil.runtime.gain_file import check_gain_document
-from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.runtime.limits import LIMITS
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-LAWS = tuple(name for name in COMPENSATORS if name not in WITHOUT_C)
+LAWS = tuple(COMPENSATORS)
 
 
 VECTORS_LIMITS = {"held_readings": 4.0, "late_fraction": 0.25, "force_slew": 1e5, "limited_in_a_row": 50.0}

@@ -11,7 +11,6 @@ from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
 from jaxhil.runtime import COMPENSATORS
 from jaxhil.runtime.faults import FAULTS, names
 from jaxhil.runtime.gain_file import check_gain_document
-from jaxhil.runtime.laws import WITHOUT_C
 
 BLOCK = 500_000
 # What needs a closed loop, a law gone wrong or a call: the tests of guards and watchdog have these.
@@ -83,7 +82,6 @@ def test_a_fault_that_is_not_raised_is_found():
 
 # Faults are raised around the law, whichever it is.
 FEW = ("none", "response_error")
-IN_C = [law for law in COMPENSATORS if law not in WITHOUT_C]
 
 
 def few_of(laws: Iterable[str]) -> pytest.MarkDecorator:
@@ -98,7 +96,7 @@ def test_python_raises_every_fault_on_its_tick(law):
 
 
 @needs_compiler
-@few_of(IN_C)
+@few_of(COMPENSATORS)
 def test_c_raises_every_fault_on_its_tick(law):
     c_runs(60_000, law, 20)
 
@@ -111,6 +109,6 @@ def test_ten_million_ticks_in_python(law):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("law", IN_C)
+@pytest.mark.parametrize("law", COMPENSATORS)
 def test_a_hundred_million_ticks_in_c(law):
     c_runs(100_000_000 if law == "response_error" else 10_000_000, law, 2000)

@@ -38,6 +38,7 @@ from jaxhil.runtime.law_status import (
     UNSURE,
     ContactRecord,
     StatusCount,
+    contact_record,
 )
 from jaxhil.runtime.laws import PUBLISHED
 from jaxhil.runtime.limits import NO_LIMITS
@@ -158,13 +159,12 @@ def test_contact_before_the_specified_surface_is_audited(nearer):
     assert np.all(rows[:, 2] < 0) and law.last_contact[:2] == (1, "identified")
 
 
-# Functions that the controller calls and no exported law reaches yet: none of those in C has a status.
 COUNTED = """
-static jaxhil_contact_record record;
-void count_begin(void) { record = jaxhil_contact_record_begin(7, JAXHIL_UNSTATED); }
-void count_take(int status) { jaxhil_contact_record_take(&record, status); }
-int count_end(int measured) { return jaxhil_contact_record_end(&record, measured != 0); }
-void count_read(long long *numbers) {
+static jaxhil_status_count statuses;
+void count_begin(void) { jaxhil_status_count_restart(&statuses); }
+void count_take(int status) { jaxhil_status_count_take(&statuses, status); }
+void count_read(int measured, long long *numbers) {
+    const jaxhil_contact_record record = jaxhil_status_count_count(&statuses, 7, measured != 0);
     numbers[0] = record.number, numbers[1] = record.status, numbers[2] = record.ticks;
     numbers[3] = record.unsure, numbers[4] = record.saturated, numbers[5] = record.too_short;
     numbers[6] = record.noisy;
@@ -196,10 +196,10 @@ def test_c_counts_statuses_as_python_does(counting_in_c):
         for status in ticks:
             count.take(status)
             counting_in_c.count_take(status)
-        in_doubt, values = counting_in_c.count_end(int(measured)), record_type()
-        counting_in_c.count_read(values)
-        record = count.record(7, measured)
-        assert STATUS_NAMES[values[1]] == record.status and in_doubt == record.in_doubt
+        values = record_type()
+        counting_in_c.count_read(int(measured), values)
+        record = contact_record(count.count(7, measured))
+        assert STATUS_NAMES[values[1]] == record.status
         assert [values[0], *values[2:]] == [record.number, *record[2:]]
         statuses.add(record.status)
     assert statuses == {*STATUS_NAMES.values()} - {"out_of_contact", "unstated"}
@@ -315,7 +315,7 @@ def test_the_status_that_counts(counts, status):
     for one, number in counts.items():
         for _ in range(number):
             made.take(one)
-    record = made.record(7, measured=True)
+    record = contact_record(made.count(7, measured=True))
     assert (record.number, record.status) == (7, STATUS_NAMES[status])
     assert record.ticks == sum(counts.values()) - counts.get(OUT_OF_CONTACT, 0)
     assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT, NOISY, UNEXPLAINED))

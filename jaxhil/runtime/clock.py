@@ -1,9 +1,9 @@
 """Guard of the times of the ticks: early, late and missed ticks, and a clock that parts from the ticks."""
 
-from collections.abc import Mapping
 from math import inf, isfinite
 
 from .faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
+from .types import Limits, NonNegative, Positive
 
 MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
 LONGEST_GAP = 1.5  # periods since the last tick beyond which a tick is missing
@@ -18,15 +18,16 @@ class Clock:
     """
 
     __slots__ = (
-        "_awaited", "_drift", "_early", "_in_a_row", "_late", "_missing", "_period", "_time", "_tolerated",
-        "fatal", "late", "missed",
+        "_awaited", "_drift", "_early_gap", "_in_a_row", "_late_gap", "_missing", "_period", "_time",
+        "_tolerated", "fatal", "late", "missed",
     )  # fmt: skip
+    _period: Positive
 
-    def __init__(self, limits: Mapping[str, float], period: float) -> None:
+    def __init__(self, limits: Limits, period: Positive) -> None:
         self._period = period
         self._missing = LONGEST_GAP * period
-        self._late = (1.0 + limits["late_fraction"]) * period
-        self._early = (1.0 - limits["late_fraction"]) * period
+        self._late_gap = (1.0 + limits["late_fraction"]) * period
+        self._early_gap = (1.0 - limits["late_fraction"]) * period
         self._tolerated = limits["missed_in_a_row"]
         self.reset()
 
@@ -64,7 +65,7 @@ class Clock:
         self._in_a_row = 0
         drift = DRIFT_KEPT * self._drift + (periods - 1.0)
         fault = 0
-        if gap < self._early:
+        if gap < self._early_gap:
             fault = EARLY_TICK
             if self._awaited:
                 # It was late by more than half a period, not missed.
@@ -72,16 +73,16 @@ class Clock:
                 drift += 1.0
         else:
             self._awaited = 0
-            if gap > self._late:
+            if gap > self._late_gap:
                 self.late += 1
                 fault = LATE_TICK
         return self._part(drift, fault)
 
-    def _miss(self, periods: float) -> int:
+    def _miss(self, periods: NonNegative) -> int:
         """Count the ticks missed in a gap of so many periods; the fault."""
-        if periods > MOST_MISSED:
-            left_out, drift = MOST_MISSED - 1, 0.0
-        else:
+        left_out = MOST_MISSED - 1
+        drift = 0.0
+        if periods <= MOST_MISSED:
             left_out = int(periods + 0.5) - 1
             drift = DRIFT_KEPT * self._drift + (periods - 1.0 - left_out)
         self.missed += left_out

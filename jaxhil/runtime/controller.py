@@ -22,13 +22,15 @@ from .faults import (
     POSITION_NOT_FINITE,
     RESTITUTION,
     TARE,
+    UNUSABLE,
     names,
 )
 from .gain_file import GainFile, check_gain_document, read_gain_document
 from .inputs import InputGuard, Tare
-from .law_status import STATUS_NAMES, UNSTATED, ContactRecord
+from .law_status import STATUS_NAMES, UNSTATED, ContactCount, ContactRecord, contact_record
 from .outputs import ForceGuard, PositionGuard
-from .registry import COMPENSATORS
+from .registry import COMPENSATORS, Compensator
+from .types import Bits, Limits, Positive, SmallInt
 from .watchdog import Watchdog
 
 
@@ -40,30 +42,38 @@ class Controller:
     """
 
     __slots__ = (
-        "_clock", "_compensator", "_detail", "_forces", "_inputs", "_period", "_positions", "_stopped",
-        "_tare", "_watchdog", "cause", "faults", "seen",
+        "_clock", "_detail", "_forces", "_inputs", "_law", "_period", "_positions", "_stopped", "_tare",
+        "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
+    cause: Bits
+    faults: Bits
+    seen: Bits
+    _detail: str
+    _law: Compensator
 
     def __init__(self, gain_file: GainFile, source: str = "gain document") -> None:
-        compensator = COMPENSATORS[gain_file.compensator]
+        law = COMPENSATORS[gain_file.compensator]
         period, clearance = gain_file.control_period, gain_file.clearance
+        self._period = period
         try:
-            self._compensator = compensator(gain_file.gains, period, clearance)
+            self._law = law(gain_file.gains, period, clearance)
         except ValueError as error:
             raise refusal(source, "gains", str(error), "gains that fit the control period") from None
-        limits = gain_file.limits
-        self._period = period
+        try:
+            self._guard(gain_file.limits, period, clearance)
+        except ValueError as error:
+            raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
+
+    def _guard(self, limits: Limits, period: Positive, clearance: float) -> None:
+        """Set up the guards about the law, and begin."""
         self._clock = Clock(limits, period)
         self._tare = Tare(limits)
         self._inputs = InputGuard(limits, period, clearance)
-        try:
-            stated = self._compensator.status != UNSTATED
-            self._watchdog = Watchdog(limits, period, clearance, stated)
-        except ValueError as error:
-            raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
+        self._watchdog = Watchdog(limits, period, clearance, self._law.status != UNSTATED)
         self._forces = ForceGuard(limits, period)
         self._positions = PositionGuard(limits, period, clearance)
         self._stopped = False
+        self.cause = 0
         self.reset()
 
     @classmethod
@@ -117,22 +127,31 @@ class Controller:
     @property
     def identified(self) -> tuple[float, float]:
         """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
-        return self._compensator.identified
+        return self._law.identified
 
     @property
     def force_delay(self) -> float:
         """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
-        return self._compensator.force_delay
+        return self._law.force_delay
 
     @property
     def law_status(self) -> str:
         """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
-        return STATUS_NAMES[self._compensator.status]
+        return STATUS_NAMES[self._status()]
+
+    def _status(self) -> SmallInt:
+        """Return what the law says of the last command, by its number."""
+        return self._law.status
 
     @property
     def last_contact(self) -> ContactRecord:
         """What the law said of the contact audited last, whatever follows, `reset` included, until the next
         one is; contact 0 before the first."""
+        return contact_record(self._last_count())
+
+    def _last_count(self) -> ContactCount:
+        """Return what the law said of the contact audited last, whatever follows, `reset` included, until the
+        next one is."""
         return self._watchdog.record
 
     def tare(self, force_measured: float) -> bool:
@@ -143,7 +162,7 @@ class Controller:
         """
         if self.cause:
             return True
-        over = self._tare.take(_float(force_measured))
+        over = self._tare.take(force_measured if type(force_measured) is float else _float(force_measured))
         if self._tare.fatal:
             self._fail(TARE, f"reading {force_measured!r}")
         return over
@@ -173,7 +192,7 @@ class Controller:
         faults = 0
         fatal = 0
         if time is not None:
-            faults = self._clock.tick(_float(time))
+            faults = self._clock.tick(time if type(time) is float else _float(time))
             if self._clock.fatal:
                 fatal = faults
         reading = force_measured if type(force_measured) is float else _float(force_measured)
@@ -181,16 +200,16 @@ class Controller:
         velocity = velocity_desired if type(velocity_desired) is float else _float(velocity_desired)
         faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
         fatal |= inputs.fatal
-        compensator = self._compensator
+        law = self._law
         watchdog = self._watchdog
         if watchdog.on and not fatal:
-            status = compensator.status
+            status = law.status
             found = watchdog.tick(forces.output, status, inputs.force, position, velocity, inputs.measured)
             faults |= found
             fatal = found & ~LAW_IN_DOUBT
         if not fatal:
             try:
-                command = compensator.step(inputs.force, position, velocity, inputs.measured)
+                command = law.step(inputs.force, position, velocity, inputs.measured)
             except Exception:  # a law's; the rig must not be left without a command
                 command = nan
             faults |= forces.limit(command)
@@ -198,14 +217,14 @@ class Controller:
         self.faults = faults
         self.seen |= faults
         if fatal:
-            readings = {
-                "time": 0.0 if time is None else time,
-                "force_measured": force_measured,
-                "position_desired": position_desired,
-                "velocity_desired": velocity_desired,
-                "position_measured": position_measured,
-            }
-            self._fail(fatal, _detail(fatal, readings, watchdog))
+            self._fail(
+                fatal,
+                _detail(
+                    fatal,
+                    watchdog,
+                    (time, force_measured, position_desired, velocity_desired, position_measured),
+                ),
+            )
             forces.fade()
         return forces.output
 
@@ -222,9 +241,11 @@ class Controller:
         """
         positions, inputs = self._positions, self._inputs
         measured = inputs.located
-        position = _float(position)
+        position = position if type(position) is float else _float(position)
         if not self.cause:
-            command = self._sent(position, _float(velocity), _float(acceleration))
+            velocity = velocity if type(velocity) is float else _float(velocity)
+            acceleration = acceleration if type(acceleration) is float else _float(acceleration)
+            command = self._sent(position, velocity, acceleration)
             faults = positions.limit(command, position, measured, inputs.is_located)
             self.faults |= faults
             self.seen |= faults
@@ -239,7 +260,7 @@ class Controller:
         if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
             return nan
         try:
-            return self._compensator.position_command(position, velocity, acceleration)
+            return self._law.position_command(position, velocity, acceleration)
         except Exception:  # a law's; the rig must not be left without a command
             return nan
 
@@ -261,9 +282,9 @@ class Controller:
         drives have been moved since by other means, call `next_contact` as well. Refused, with False, while
         the emergency stop is active.
         """
-        if self._stopped:
+        if self._stopped or self.cause & UNUSABLE:
             return False
-        self._compensator.reset()
+        self._law.reset()
         self._clock.reset()
         self._tare.restart()
         self._inputs.restart()
@@ -286,14 +307,14 @@ class Controller:
         """
         if self.cause:
             return
-        faults = self._watchdog.conclude(self._forces.output, self._compensator.status)
+        faults = self._watchdog.conclude(self._forces.output, self._law.status)
         self.faults = faults
         self.seen |= faults
         fatal = faults & ~LAW_IN_DOUBT
         if fatal:
-            self._fail(fatal, _detail(fatal, {}, self._watchdog))
+            self._fail(fatal, self._watchdog.detail() if fatal & RESTITUTION else "")
             return
-        self._compensator.next_contact()
+        self._law.next_contact()
         self._clock.pause()
         self._inputs.restart()
         self._inputs.is_located = False
@@ -317,11 +338,17 @@ def _float(value: Any) -> float:
         return nan
 
 
-def _detail(fatal: int, readings: Mapping[str, Any], watchdog: Watchdog) -> str:
-    """What a cause looked like, in words."""
+READINGS = "time", "force_measured", "position_desired", "velocity_desired", "position_measured"
+
+
+def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
+    """Describe a cause in words, by the values of `READINGS`."""
     if fatal & RESTITUTION:
         return watchdog.detail()
     if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):
-        bad = (item for item in readings.items() if not isfinite(_float(item[1])))
+        given = (
+            item for item in zip(READINGS, values, strict=True) if item[1] is not None or item[0] != "time"
+        )
+        bad = (item for item in given if not isfinite(_float(item[1])))
         return ", ".join(f"{name} is {shown(value)}" for name, value in bad)
     return ""

@@ -41,6 +41,7 @@ EMERGENCY_STOP = 0x80000
 TARE = 0x100000
 LAW_IN_DOUBT = 0x200000
 EARLY_TICK = 0x400000
+UNUSABLE = 1 << 30  # cause of a controller in C whose gains or limits are refused: Python raises instead
 
 _HELD = "the last good reading is used; more than `held_readings` in a row trip"
 _HELD_AFTER_THE_FIRST = f"{_HELD}, and so does one on a run's first tick"

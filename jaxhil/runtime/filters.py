@@ -5,6 +5,9 @@ allocates nothing per tick.
 """
 
 from math import floor
+from typing import Annotated
+
+from .types import Count, Index, Positive
 
 
 class LeadFilter:
@@ -85,8 +88,9 @@ class DelayLine:
     LONGEST = 100_000
 
     __slots__ = ("_fraction", "_head", "_period", "_remainder", "_samples", "_size", "_whole")
+    _head: Annotated[Count, "index"]
 
-    def __init__(self, delay: float, period: float) -> None:
+    def __init__(self, delay: float, period: Positive) -> None:
         ratio = delay / period
         if not 0.0 <= ratio <= self.LONGEST:
             raise ValueError(f"a delay of {ratio!r} periods, allowed 0 to {self.LONGEST}")
@@ -104,8 +108,8 @@ class DelayLine:
         period = self._period
         samples = self._samples
         size = self._size
-        for j in range(-size + 1, 0):
-            samples[j] = position + j * period * velocity
+        for j in range(1, len(samples)):
+            samples[j] = position + (j - size) * period * velocity
         self._head = 0
 
     def step(self, position: float) -> float:
@@ -114,8 +118,9 @@ class DelayLine:
         samples = self._samples
         samples[head] = position
         # Negative indices wrap: the line holds exactly the `whole + 2` latest samples.
-        newer = head - self._whole
-        delayed = self._remainder * samples[newer] + self._fraction * samples[newer - 1]
+        newer: Index = head - self._whole
+        older: Index = newer - 1
+        delayed = self._remainder * samples[newer] + self._fraction * samples[older]
         head += 1
         self._head = 0 if head == self._size else head
         return delayed

@@ -4,7 +4,6 @@ A bad sensor reading is replaced by the last good one. `InputGuard.check` says w
 which of them trip; `force` and `measured` are then what the law is to use.
 """
 
-from collections.abc import Mapping
 from math import inf, isfinite, nan
 
 from .bounds import POSITIONS
@@ -18,6 +17,7 @@ from .faults import (
     POSITION_OUT_OF_RANGE,
     POSITION_STUCK,
 )
+from .types import Count, Limits, Positive
 
 TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
 
@@ -31,8 +31,9 @@ class Tare:
     __slots__ = (
         "_count", "_highest", "_limit", "_lowest", "_range", "_spread", "_sum", "_ticks", "bias", "fatal",
     )  # fmt: skip
+    _count: Count
 
-    def __init__(self, limits: Mapping[str, float]) -> None:
+    def __init__(self, limits: Limits) -> None:
         self._ticks = limits["tare_ticks"]
         self._spread = limits["tare_spread"]
         self._limit = limits["bias_limit"]
@@ -91,7 +92,7 @@ class InputGuard:
         "_range", "_settling", "fatal", "force", "is_located", "located", "measured",
     )  # fmt: skip
 
-    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
+    def __init__(self, limits: Limits, period: Positive, clearance: float) -> None:
         self._clearance = clearance
         self._range = limits["force_range"]
         self._lowest = limits["measured_lowest"]

@@ -18,6 +18,8 @@ How often an identified contact errs: `pytest -m slow -s tests/test_law_status.p
 
 from typing import NamedTuple
 
+from .types import SmallInt
+
 DOUBTFUL = 0.4  # of the ticks on which the law acts
 
 
@@ -31,7 +33,6 @@ class Status(NamedTuple):
 
 OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, UNSTATED = range(6)
 NOISY, NOT_REACHED, UNEXPLAINED = 7, 8, 9  # 6 was `displaced`, of laws that are retired
-DOUBTS = UNSURE, TOO_SHORT, NOISY
 
 STATUSES = (
     Status(OUT_OF_CONTACT, "out_of_contact", "the law does not act"),
@@ -55,8 +56,21 @@ STATUSES = (
 STATUS_NAMES = {status.number: status.name for status in STATUSES}
 
 
+class ContactCount(NamedTuple):
+    """What the law said of one contact: the number of ticks with each status, and the status that counts."""
+
+    number: int  # of the contact; 0 before the first
+    ticks: int  # on which the law acted
+    unsure: int  # of these, the ticks with that status; so with the others that are counted
+    saturated: int
+    too_short: int
+    noisy: int
+    last: SmallInt  # status on the last tick on which the law acted
+    status: SmallInt  # what counts
+
+
 class ContactRecord(NamedTuple):
-    """What the law said of one contact."""
+    """What the law said of one contact, as a reader sees it."""
 
     number: int = 0  # of the contact; 0 before the first
     status: str = STATUS_NAMES[UNSTATED]  # what counts, one of `STATUSES` by name
@@ -72,38 +86,62 @@ class ContactRecord(NamedTuple):
         return self.status not in (STATUS_NAMES[UNSTATED], STATUS_NAMES[IDENTIFIED])
 
 
+def contact_record(count: ContactCount) -> ContactRecord:
+    """Return the record of a contact with the status by its name."""
+    number, ticks, unsure, saturated, too_short, noisy, _, status = count
+    return ContactRecord(number, STATUS_NAMES[status], ticks, unsure, saturated, too_short, noisy)
+
+
 class StatusCount:
     """On how many ticks of a contact a law said what."""
 
-    __slots__ = ("_counts", "_last")
+    __slots__ = ("_last", "_noisy", "_saturated", "_ticks", "_too_short", "_unsure")
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
         """Another contact."""
-        self._counts = [0] * (1 + max(STATUS_NAMES))
+        self._ticks = 0
+        self._unsure = 0
+        self._saturated = 0
+        self._too_short = 0
+        self._noisy = 0
         self._last = OUT_OF_CONTACT
 
     def take(self, status: int) -> None:
         """One tick's status."""
-        self._counts[status] += 1
-        if status not in (UNSTATED, OUT_OF_CONTACT):
-            self._last = status
+        if status in (UNSTATED, OUT_OF_CONTACT):
+            return
+        self._ticks += 1
+        self._last = status
+        if status == IDENTIFIED:
+            return
+        if status == UNSURE:
+            self._unsure += 1
+        elif status == SATURATED:
+            self._saturated += 1
+        elif status == TOO_SHORT:
+            self._too_short += 1
+        elif status == NOISY:
+            self._noisy += 1
 
-    def record(self, number: int, measured: bool) -> ContactRecord:
-        """Contact `number`, now that it is over, and whether a force was `measured` in it."""
-        counts = self._counts
-        doubts = [counts[status] for status in DOUBTS]
-        ticks = sum(counts) - counts[UNSTATED] - counts[OUT_OF_CONTACT]
+    def count(self, number: int, measured: bool) -> ContactCount:
+        """Return the count of contact `number`, which is over; `measured`: whether there was a force."""
+        ticks, unsure, too_short, noisy = self._ticks, self._unsure, self._too_short, self._noisy
         status = IDENTIFIED
         if not measured:
             status = NOT_REACHED
         elif ticks == 0:
             status = UNSURE
-        elif sum(doubts) > DOUBTFUL * ticks:
-            status = DOUBTS[doubts.index(max(doubts))]
+        elif unsure + too_short + noisy > DOUBTFUL * ticks:
+            status = UNSURE
+            most = unsure
+            if too_short > most:
+                status = TOO_SHORT
+                most = too_short
+            if noisy > most:
+                status = NOISY
         elif self._last in (UNEXPLAINED, SATURATED):
             status = self._last
-        unsure, *others = doubts
-        return ContactRecord(number, STATUS_NAMES[status], ticks, unsure, counts[SATURATED], *others)
+        return ContactCount(number, ticks, unsure, self._saturated, too_short, noisy, self._last, status)

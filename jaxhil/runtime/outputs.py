@@ -6,11 +6,11 @@ Where a run begins, the position command goes on from where the drives read. Aft
 moves away at `retreat_velocity`, and comes to rest.
 """
 
-from collections.abc import Mapping
 from math import isfinite
 
 from .faults import COMMAND_NOT_FINITE, FORCE_LIMIT, FORCE_SLEW, MODEL_NOT_FINITE, STROKE, VELOCITY_LIMIT
 from .surfaces import deflection
+from .types import Limits, Positive
 
 
 class ForceGuard:
@@ -21,7 +21,7 @@ class ForceGuard:
 
     __slots__ = ("_cut", "_cut_tolerated", "_limit", "_most", "fatal", "output")
 
-    def __init__(self, limits: Mapping[str, float], period: float) -> None:
+    def __init__(self, limits: Limits, period: Positive) -> None:
         self._limit = limits["force_limit"]
         self._most = limits["force_slew"] * period
         self._cut_tolerated = limits["limited_in_a_row"]
@@ -74,7 +74,7 @@ class PositionGuard:
         "_most", "_rate", "_retreat", "_start", "at_rest", "fatal", "known", "output",
     )  # fmt: skip
 
-    def __init__(self, limits: Mapping[str, float], period: float, clearance: float) -> None:
+    def __init__(self, limits: Limits, period: Positive, clearance: float) -> None:
         self._clearance = clearance
         self._lowest = limits["command_lowest"]
         self._highest = limits["command_highest"]

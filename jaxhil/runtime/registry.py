@@ -9,6 +9,7 @@ from math import inf
 from typing import ClassVar, NamedTuple, Protocol, TypeVar
 
 from .law_status import UNSTATED
+from .types import Gains, Positive
 
 
 class GainSpecification(NamedTuple):
@@ -37,7 +38,7 @@ class Compensator(Protocol):
     # What stands behind the last command, one of `law_status`; a law says so always or never.
     status: int = UNSTATED
 
-    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None: ...
+    def __init__(self, gains: Gains, period: Positive, clearance: float) -> None: ...
 
     @property
     def identified(self) -> tuple[float, float]:

@@ -26,13 +26,20 @@ polynomial is one of k alone:
 each of p, w, z kept to the range that it was fitted over.
 """
 
-from collections.abc import Mapping
 from math import inf, sqrt
 
 from .faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION
 from .filters import DelayLine
-from .law_status import OUT_OF_CONTACT, UNSTATED, ContactRecord, StatusCount
+from .law_status import (
+    IDENTIFIED,
+    OUT_OF_CONTACT,
+    STATUS_NAMES,
+    UNSTATED,
+    ContactCount,
+    StatusCount,
+)
 from .surfaces import deflection
+from .types import Limits, Positive
 
 FADED = 1e-6  # of the largest force, and impulse of the rest over that of the approach
 PATIENCE = 0.1  # s, that the force is given to die out
@@ -53,10 +60,9 @@ class Watchdog:
         "_ticks", "_tolerance", "_unfelt", "_velocity", "_work", "balance", "contacts", "expected", "on",
         "record", "restitution",
     )  # fmt: skip
+    _period: Positive
 
-    def __init__(
-        self, limits: Mapping[str, float], period: float, clearance: float, stated: bool = False
-    ) -> None:
+    def __init__(self, limits: Limits, period: Positive, clearance: float, stated: bool = False) -> None:
         self.on = stated or limits["equivalent_mass"] > 0.0
         self._stated = stated
         self._statuses = StatusCount()
@@ -74,7 +80,7 @@ class Watchdog:
         self._expectation = Expectation(limits)
         self.restart()
         self.contacts = 0
-        self.record = ContactRecord()
+        self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
 
     def restart(self) -> None:
         """Forget the contact under way and the motion so far, but not `contacts` and `record`."""
@@ -164,7 +170,7 @@ class Watchdog:
     def detail(self) -> str:
         """The last audit in words."""
         found = f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
-        return f"{found}, law {self.record.status.replace('_', ' ')}" if self._stated else found
+        return f"{found}, law {STATUS_NAMES[self.record.status].replace('_', ' ')}" if self._stated else found
 
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
@@ -199,12 +205,12 @@ class Watchdog:
         self.contacts += 1
         doubt = 0
         if self._stated:
-            self.record = self._statuses.record(self.contacts, self._measured)
-            doubt = LAW_IN_DOUBT if self.record.in_doubt else 0
-        return doubt | (self._energies(velocity) if self._mass > 0.0 else 0)
+            self.record = self._statuses.count(self.contacts, self._measured)
+            doubt = LAW_IN_DOUBT if self.record.status != IDENTIFIED else 0
+        return doubt | (self._energies(velocity, self._mass) if self._mass > 0.0 else 0)
 
-    def _energies(self, velocity: float) -> int:
-        entry, mass = self._entry, self._mass
+    def _energies(self, velocity: float, mass: Positive) -> int:
+        entry = self._entry
         energy = 0.5 * mass * entry * entry
         self.balance = 0.5 * mass * velocity * velocity - energy + self._work
         if not abs(self.balance) <= self._tolerance * energy:
@@ -230,25 +236,28 @@ class Expectation:
     __slots__ = (
         "_coefficients", "_loss", "_reference_stiffness", "_reference_velocity", "_softness", "_speed",
     )  # fmt: skip
+    _reference_stiffness: Positive
+    _reference_velocity: Positive
 
-    def __init__(self, limits: Mapping[str, float]) -> None:
+    def __init__(self, limits: Limits) -> None:
         self._reference_stiffness = limits["reference_stiffness"]
         self._reference_velocity = limits["reference_velocity"]
         self._softness = limits["softness_lowest"], limits["softness_highest"]
         self._speed = limits["speed_lowest"], limits["speed_highest"]
         self._loss = limits["loss_lowest"], limits["loss_highest"]
-        self._coefficients = tuple(
+        self._coefficients = [
             limits[f"expected_{term}"]
             for term in ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
-        )
+        ]
 
-    def restitution(self, stiffness: float, damping: float, speed: float, mass: float) -> float:
+    def restitution(self, stiffness: float, damping: float, speed: float, mass: Positive) -> float:
         """The polynomial of the module's text; a stiffness that is not above 0 counts as the softest."""
         p, z = self._softness[1], self._loss[0]
-        root = sqrt(stiffness * mass) if stiffness > 0.0 else 0.0
-        if root > 0.0:
-            p = _within(sqrt(self._reference_stiffness / stiffness) - 1.0, self._softness)
-            z = _within(damping / (2.0 * root), self._loss)
+        if stiffness > 0.0:
+            root = sqrt(stiffness * mass)
+            if root > 0.0:
+                p = _within(sqrt(self._reference_stiffness / stiffness) - 1.0, self._softness)
+                z = _within(damping / (2.0 * root), self._loss)
         w = _within(speed / self._reference_velocity - 1.0, self._speed)
         c_1, c_p, c_pp, c_ppp, c_w, c_ww, c_pw, c_z, c_zz, c_pz, c_wz = self._coefficients
         expected = c_1 + p * (c_p + p * (c_pp + p * c_ppp)) + w * (c_w + w * c_ww + p * c_pw)

@@ -1,34 +1,59 @@
 """The controller in C99: from a gain document to the sources that a rig computer compiles.
 
-The sources stand as fragments in `jaxhil/c99`, the laws' in `laws`, one file per subject, as in the Python
-runtime. A fragment opens with a comment and its `#include` lines; `/* == Declarations == */` begins what goes
-into the header, if anything does, `/* == Definitions == */` what goes into the source. It includes the
-fragments that it needs by name; `law.c` stands for the exported law's own file, which has the law's name,
-`..._table.c` for what `c99_tables` makes of the runtime's tables. Where a fragment sizes an array by
-`JAXHIL_<NAME>_SAMPLES`, that constant is the length of a line which delays by the gain or limit of that name.
+`jaxhil.codegen` makes them of the rig's Python: controller, guards and the law of the gain document. What is
+no Python stands here and in `c99_tables`: the header's checks of the compiler, the tables of gains, limits,
+faults and statuses, and `jaxhil_init`, which admits gains and limits. The test program is
+`jaxhil/c99/test_vectors.c`. Where the generated code sizes an array by `JAXHIL_<NAME>_SAMPLES`, that constant
+is the length of a line which delays by the gain or limit of that name.
 """
 
+import functools
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
+from jaxhil.codegen import Program, SubsetError
 from jaxhil.errors import InputError, one_line
 from jaxhil.runtime.controller import Controller
+from jaxhil.runtime.faults import FAULTS
 from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from jaxhil.runtime.laws import WITHOUT_C
-from tuning.bundle.c99_tables import Table, constants, faults_table, gains_table, limits_table, statuses_table
+from jaxhil.runtime.inputs import Tare
+from jaxhil.runtime.law_status import STATUSES, ContactCount
+from jaxhil.runtime.limits import LIMITS
+from jaxhil.runtime.registry import COMPENSATORS, Compensator
+from tuning.bundle.c99_tables import (
+    UNUSABLE,
+    constants,
+    faults_table,
+    gains_table,
+    limits_table,
+    statuses_table,
+)
 
 HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS, TEST = "jaxhil_gains.h", "test_vectors.c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-DECLARATIONS = "/* == Declarations == */\n"
-DEFINITIONS = "/* == Definitions == */\n"
-LAW = "law.c"
 FOLDER = resources.files("jaxhil") / "c99"
+# Methods and properties that are the interface in C, in the header's order.
+PUBLIC = {
+    "tare": "tare",
+    "step": "step",
+    "position_command": "position_command",
+    "emergency_stop": "emergency_stop",
+    "reset": "reset",
+    "next_contact": "next_contact",
+    "tripped": "tripped",
+    "at_rest": "at_rest",
+    "bias": "bias",
+    "missed_ticks": "missed_ticks",
+    "late_ticks": "late_ticks",
+    "force_delay": "force_delay",
+    "_status": "law_status",
+    "_last_count": "last_contact",
+}
 
-_INCLUDE = re.compile(r'^#include ([<"])([a-z0-9_]+\.[ch])[>"]\n', re.MULTILINE)
 _SAMPLES = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
 
 _HEADER = """\
@@ -46,7 +71,11 @@ _HEADER = """\
 #define JAXHIL_CONTROLLER_H
 
 #include <float.h>
-{includes}
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
 #if defined(__FAST_MATH__) || defined(_M_FP_FAST)
 #error "-ffast-math loses what is not finite, and the controller with it (of MSVC: /fp:precise)"
 #endif
@@ -107,95 +136,110 @@ _GAINS = """\
 """
 
 
-_TABLES: Mapping[str, Callable[[str], Table]] = {
-    "gains_table.c": gains_table,
-    "limits_table.c": lambda law: limits_table(),
-    "faults_table.c": lambda law: faults_table(),
-    "law_status_table.c": lambda law: statuses_table(),
-}
+_PROTOTYPES = """
+/* Begin with these gains and limits. False if they are not admitted, or ask for a longer delay than this code
+ * holds: the controller then stays tripped, with the cause JAXHIL_UNUSABLE. */
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits);
 
+/* Identified stiffness [N/m] and damping [N s/m]; 0 and 0 if the law identifies none. */
+void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
+"""
 
-class _Fragment(NamedTuple):
-    """A part of the C sources."""
+_INIT = """
+static void jaxhil_clear(jaxhil_controller *controller) {{
+    unsigned char *bytes = (unsigned char *)controller;
+    for (size_t n = 0; n < sizeof *controller; n++) {{
+        bytes[n] = 0;
+    }}
+}}
 
-    system: tuple[str, ...]  # the headers that it includes, as `math.h`
-    local: tuple[str, ...]  # the fragments that it includes
-    declarations: str  # what it adds to the header, "" or a newline if nothing
-    definitions: str  # what it adds to the source, likewise
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits) {{
+    bool error = !(jaxhil_gains_admitted(gains) && jaxhil_limits_fit(limits));
+    jaxhil_clear(controller);
+    if (!error) {{
+        jaxhil_law_init(&controller->law, gains, gains->control_period, gains->clearance{law_error});
+    }}
+    if (!error) {{
+        jaxhil_controller_guard(controller, limits, gains->control_period, gains->clearance, &error);
+    }}
+    if (error) {{
+        bool ignored = false;
+        jaxhil_clear(controller);
+        jaxhil_controller_guard(controller, &jaxhil_no_limits, 1.0, INFINITY, &ignored);
+        jaxhil_controller_fail(controller, JAXHIL_UNUSABLE);
+    }}
+    return !error;
+}}
+
+void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping) {{
+    double identified[2];
+    jaxhil_controller_identified(controller, identified);
+    *stiffness = identified[0];
+    *damping = identified[1];
+}}
+"""
 
 
 def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:
-    """The files of the controller in C99 by name: header, source, gains, test program.
+    """Return the files of the controller in C99 by name: header, source, gains, test program.
 
-    Raises GainFileError for a document that the runtime refuses, InputError for a compensator that has no
-    C file. Same document, same texts.
+    Same document, same texts.
+
+    Raises:
+        GainFileError: for a document that the runtime refuses.
+        InputError: for a law with a construct that has no C; it names file and line.
     """
     gain_file = check_gain_document(document, source)
     Controller(gain_file, source)  # refuses delays that no line can hold
     law = gain_file.compensator
-    if law in WITHOUT_C:
-        raise InputError(f"c99: found {law}, which has no C99 sources yet; expected the other formats")
-    fragments = _in_order("controller.c", law)
-    declarations = "\n".join(part for fragment in fragments if (part := fragment.declarations).strip())
-    definitions = "\n".join(part for fragment in fragments if (part := fragment.definitions).strip())
-    system = sorted({name for fragment in fragments for name in fragment.system} - {"float.h"})
+    declarations, definitions = _generated(law, COMPENSATORS[law])
     return {
-        HEADER: _HEADER.format(
-            law=law,
-            includes="".join(f"#include <{name}>\n" for name in system),
-            lengths=_lengths(declarations, gain_file),
-            declarations=declarations,
-        ),
+        HEADER: _HEADER.format(law=law, lengths=_lengths(declarations, gain_file), declarations=declarations),
         SOURCE: _SOURCE.format(definitions=definitions),
         GAINS: _GAINS.format(law=law, digest=document["sha256"], constants=constants(gain_file)),
-        TEST: _read(TEST),
+        TEST: (FOLDER / TEST).read_text(encoding="utf-8"),
     }
 
 
-def _in_order(root: str, law: str) -> list[_Fragment]:
-    """The fragment `root` and what it needs, each after what it includes itself."""
-    found: dict[str, _Fragment] = {}
-    visited: set[str] = set()
-
-    def visit(name: str) -> None:
-        if name in visited:
-            return
-        visited.add(name)
-        fragment = _fragment(name, law)
-        for needed in fragment.local:
-            visit(f"{law}.c" if needed == LAW else needed)
-        found[name] = fragment
-
-    visit(root)
-    return list(found.values())
-
-
-def _fragment(name: str, law: str) -> _Fragment:
-    if name in _TABLES:
-        comment, declarations, definitions = _TABLES[name](law)
-        return _Fragment(("math.h", "stdbool.h", "stdint.h"), (), f"{comment}\n{declarations}", definitions)
-    before, marked, definitions = _read(name).partition(DEFINITIONS)
-    if not marked:
-        raise InputError(f"jaxhil/c99/{name}: found no definitions, allowed {DEFINITIONS.strip()}")
-    head, _, declarations = before.partition(DECLARATIONS)
-    includes = _INCLUDE.findall(head)
-    comment = _INCLUDE.sub("", head).strip() + "\n"
-    parts = [declarations.strip("\n"), definitions.strip("\n")]
-    # The comment opens what there is: most fragments declare something.
-    first = 0 if parts[0] else 1
-    parts[first] = f"{comment}\n{parts[first]}"
-    return _Fragment(
-        tuple(file for mark, file in includes if mark == "<"),
-        tuple(file for mark, file in includes if mark == '"'),
-        *(f"{part}\n" for part in parts),
+@functools.cache
+def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
+    """Return declarations and definitions of the controller with a law."""
+    signs = {
+        "gains": {name: _sign(gain.lowest) for name, gain in class_.gains.items()},
+        "limits": {name: _sign(limit.lowest) for name, limit in LIMITS.items()},
+    }
+    enumerators = {fault.name.upper(): fault.bit for fault in FAULTS} | {"UNUSABLE": UNUSABLE}
+    enumerators |= {status.name.upper(): status.number for status in STATUSES}
+    methods = {name: vars(Controller)[name] for name in PUBLIC}
+    functions: dict[str, Any] = {
+        name: one.fget if isinstance(one, property) else one for name, one in methods.items()
+    }
+    program = Program(
+        "jaxhil_",
+        structs=signs,
+        names={class_: "law", ContactCount: "contact_record", Tare: "bias_tare"},
+        public={functions[name]: f"jaxhil_{named}" for name, named in PUBLIC.items()},
+        bindings={Compensator: class_},
+        enumerators=enumerators,
     )
+    try:
+        made = program.add(class_.__init__, class_)
+        program.add(vars(Controller)["_guard"], Controller)
+        for function in functions.values():
+            program.add(function, Controller)
+        program.add(vars(Controller)["identified"].fget, Controller)
+        output = program.output()
+    except SubsetError as error:
+        raise InputError(one_line(f"c99: {law}: {error}; `--format csv` leaves C out")) from None
+    tables = [gains_table(law), limits_table(), faults_table(), statuses_table()]
+    declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
+    defined = "\n".join(table.definitions for table in tables if table.definitions)
+    init = _INIT.format(law_error=", &error" if made.fails else "")
+    return f"{declared}{output.declarations}{_PROTOTYPES}", f"{defined}\n{output.definitions}{init}"
 
 
-def _read(name: str) -> str:
-    for folder in (FOLDER, FOLDER / "laws"):
-        if (folder / name).is_file():
-            return (folder / name).read_text(encoding="utf-8")
-    raise InputError(one_line(f"jaxhil/c99/laws/{name}: found no such file, allowed one per law"))
+def _sign(lowest: float) -> str:
+    return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 
 def _lengths(declarations: str, gain_file: GainFile) -> str:

@@ -11,14 +11,21 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES, span
-from jaxhil.runtime.faults import FAULTS
+from jaxhil.runtime.faults import FAULTS, UNUSABLE
 from jaxhil.runtime.gain_file import GainFile
 from jaxhil.runtime.law_status import STATUSES
 from jaxhil.runtime.limits import LIMITS
 from jaxhil.runtime.registry import COMPENSATORS
 
-UNUSABLE = 1 << 30
 WIDTH = 110
+
+
+# What `limits.complete` asks of limits beside each one's range.
+_FIT = (
+    "limits->measured_lowest < limits->measured_highest",
+    "limits->command_lowest < limits->command_highest",
+    "!(limits->retreat_velocity > limits->velocity_limit)",
+)
 
 
 class Table(NamedTuple):
@@ -70,7 +77,7 @@ def limits_table() -> Table:
         "/* The limits of the controller, each within bounds that no gain file can move. */\n",
         _struct("jaxhil_limits", entries),
         f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
-        + _check("jaxhil_limits_admitted", "jaxhil_limits", "limits", checks),
+        + _check("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *_FIT]),
     )
 
 

@@ -124,7 +124,7 @@ def csv_table(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def c99(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """The controller in C99, in the folder `c99`. Raises `InputError` for a compensator without a C file."""
+    """The controller in C99, in the folder `c99`. Raises `InputError` for a law that has no C."""
     from tuning.bundle.c99 import c99_texts
 
     return {f"c99/{name}": text.encode("ascii") for name, text in c99_texts(document).items()}

@@ -100,7 +100,7 @@ def export(
         folder: where to write the bundle: new, empty, or a bundle, which is replaced.
         sweep: what `tuning.sweep` returned for these gains, or its store's folder: limits and the watchdog's
             rates come from it.
-        formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all that there are for the law.
+        formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all.
         limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
         progress: say on standard error what is going on.
     OPTIONS
@@ -125,7 +125,7 @@ def export(
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
         check_mechanism(target, loaded.mechanism.name)
-        chosen = _formats(formats, loaded.compensator)
+        chosen = _formats(formats)
         found = _calibrated(loaded, sweep, replaced, (asked.false_alarms, asked.missed), progress)
         with terminal.stages(2, progress) as stages:
             bundle = build_bundle(
@@ -231,12 +231,8 @@ def _check_formats(formats: Any) -> None:
         arguments.one_of(tuple(WRITERS), format=name)
 
 
-def _formats(formats: Sequence[str] | None, compensator: str) -> list[str]:
-    """The formats asked for, in the order of the table; by default all that there are for the law."""
-    from tuning.bundle.c99 import FOLDER
+def _formats(formats: Sequence[str] | None) -> list[str]:
+    """Return the formats asked for, in the order of the table; by default all."""
     from tuning.bundle.writers import WRITERS
 
-    if formats:
-        return [name for name in WRITERS if name in formats]
-    has_c = (FOLDER / "laws" / f"{compensator}.c").is_file()
-    return [name for name in WRITERS if name != "c99" or has_c]
+    return [name for name in WRITERS if not formats or name in formats]

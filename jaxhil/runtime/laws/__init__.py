@@ -1,8 +1,8 @@
 """The compensation laws by name: the one entry that a law has anywhere.
 
-The law `<name>` is `jaxhil/compensators/<name>.py` in JAX, `jaxhil/runtime/laws/<name>.py` in plain Python
-and `jaxhil/c99/laws/<name>.c` in C99. Simulation, tuning, command line, export and tests go by this list;
-`PUBLISHED` are those of the literature, the rest is ours.
+The law `<name>` is `jaxhil/compensators/<name>.py` in JAX and `jaxhil/runtime/laws/<name>.py` in plain
+Python, of which `jaxhil.codegen` makes C99. Simulation, tuning, command line, export and tests go by this
+list; `PUBLISHED` are those of the literature, the rest is ours.
 """
 
 PUBLISHED = (
@@ -18,4 +18,3 @@ PUBLISHED = (
     "response_error",
 )
 LAWS = (*PUBLISHED, "impulse_ledger")
-WITHOUT_C = ("impulse_ledger",)  # has no C sources yet

@@ -20,9 +20,11 @@ zero with a given probability, Mitchell and Beauchamp, "Bayesian variable select
 model by the density at zero, Dickey, "The weighted likelihood ratio" (1971).
 """
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from math import exp, log, pi, sqrt
+from typing import Annotated
+
+from ..types import Count, Positive
 
 # Depths [s] at which the slope may change.
 KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.14, 0.2)
@@ -36,15 +38,19 @@ REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
 ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
+CONCLUDED = (DELAY, *DISSIPATIVE)  # those that change when contact is concluded
 DELAY_PARAMETERS = (0, PRELOAD, *DISSIPATIVE, DELAY)  # those that decide on the delay
 ELASTIC_ODDS = 19.0  # prior odds of contact without dissipation
 WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; mean and spread of the slope at depth 0 that decide on the delay
 SURPLUS = 1.4  # of the variance of the readings, because the misfits of one contact are alike
 EXACT = 1e18  # precision of a parameter that is known
 LEAST_VARIANCE = 1e-12  # of a dissipative parameter; below it the parameter is known
+Vector = Annotated[list[float], PARAMETERS]
+Matrix = Annotated[list[list[float]], PARAMETERS, PARAMETERS]
+Spreads = Annotated[list[float], 7]
 
 
-def features(depth: float, speed: float, deepest: float, delay_effect: float) -> list[float]:
+def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
     """Return phi, with which the force is phi.theta; zeros out of contact."""
     if not depth > 0.0:
         return [0.0] * PARAMETERS
@@ -90,28 +96,40 @@ class ContactModel:
     """
 
     __slots__ = ("_count", "_prior_mean", "_squares", "_variances", "covariance", "mean", "theta")
+    covariance: Matrix
+    mean: Vector
+    theta: Vector
 
-    def restart(self, stiffness: float, spreads: Sequence[float], delay_variance: float) -> None:
+    def restart(self, stiffness: float, spreads: Spreads, delay_variance: float) -> None:
         """Return to the prior.
 
         `stiffness` [1/s^2] is the prior mean of the slope at depth 0; `spreads` are the standard deviations
         of that slope [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
         unloading [1/s^2], friction [1/s] and preload [1/s]; `delay_variance` is in s^2.
         """
-        common, wander, *others = spreads
-        self._variances = [common * common]
-        for before, knot in pairwise(min(knot, BROAD) for knot in KNOTS):
-            self._variances.append(wander * wander * ((knot - before) / WANDER))
-        self._variances += [*(spread * spread for spread in others), delay_variance]
-        self._prior_mean = [stiffness] + [0.0] * (PARAMETERS - 1)
-        self.mean = self.theta = self._prior_mean
+        common, wander = spreads[0], spreads[1]
+        variances = [0.0] * PARAMETERS
+        variances[0] = common * common
+        for j in range(1, HINGES):
+            width = min(KNOTS[j], BROAD) - min(KNOTS[j - 1], BROAD)
+            variances[j] = wander * wander * (width / WANDER)
+        for j in range(DAMPING, DELAY):
+            spread = spreads[j - DAMPING + 2]
+            variances[j] = spread * spread
+        variances[DELAY] = delay_variance
+        prior = [0.0] * PARAMETERS
+        prior[0] = stiffness
+        self._variances = variances
+        self._prior_mean = prior
+        self.mean = prior
+        self.theta = prior
         self.covariance = [[0.0] * PARAMETERS for _ in range(PARAMETERS)]
-        for j, variance in enumerate(self._variances):
+        for j, variance in enumerate(variances):
             self.covariance[j][j] = variance
         self._squares = 0.0  # sum of squared innovations over their variances
         self._count = 0.0  # readings
 
-    def learn(self, phi: Sequence[float], force: float, variance: float) -> None:
+    def learn(self, phi: Vector, force: float, variance: float) -> None:
         """Update the estimate with one reading of the force [1/s] whose noise has this variance [1/s^2]."""
         covariance = self.covariance
         column = [dot(row, phi) for row in covariance]
@@ -129,10 +147,10 @@ class ContactModel:
 
     def conclude(self, delay: float) -> None:
         """Compute `theta` for a known delay [s]."""
-        indices = (DELAY, *DISSIPATIVE)
-        rows = [self.covariance[j] for j in indices]
-        mean, rows = observe(self.mean, rows, 0, DELAY, EXACT * delay, EXACT)
-        theta, _ = self._dissipate(mean, rows, {j: (place, j) for place, j in enumerate(indices)}, True)
+        theta = list(self.mean)
+        rows = [list(self.covariance[j]) for j in CONCLUDED]
+        observe(theta, rows, 0, DELAY, EXACT * delay, EXACT)
+        self._dissipate(theta, rows, 1, DAMPING, True)
         for j in range(DAMPING, PRELOAD):
             theta[j] = theta[j] if theta[j] > 0.0 else 0.0
         self.theta = theta
@@ -145,21 +163,23 @@ class ContactModel:
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
         # The prior that steers well pulls a stiff contact's slope down, which would look like a damper.
-        priors = (0, *WIDE_STIFFNESS), (PRELOAD, preload, preload_spread)
-        for place, (j, value, spread) in enumerate(priors):
+        for place in range(2):
+            j = DELAY_PARAMETERS[place]
+            value = WIDE_STIFFNESS[0] if place == 0 else preload
+            spread = WIDE_STIFFNESS[1] if place == 0 else preload_spread
             old, new = 1.0 / max(self._variances[j], LEAST_VARIANCE), 1.0 / (spread * spread)
             information = new * value - old * self._prior_mean[j]
-            mean, rows = observe(mean, rows, place, place, information, new - old)
+            observe(mean, rows, place, place, information, new - old)
         excess = SURPLUS * max(self._squares / max(self._count, 1.0), 1.0)
-        places = {j: (place, place) for place, j in enumerate(DELAY_PARAMETERS)}
-        other, other_rows = self._dissipate(mean, rows, places, False)
+        other = list(mean)
+        other_rows = [list(row) for row in rows]
+        self._dissipate(other, other_rows, 2, 2, False)
         evidence = 0.0
-        for j in DISSIPATIVE:
-            place, _ = places[j]
+        for place in range(2, 2 + len(DISSIPATIVE)):
             variance = max(rows[place][place], LEAST_VARIANCE)
-            ratio = max(self._variances[j], LEAST_VARIANCE) / variance
+            ratio = max(self._variances[DELAY_PARAMETERS[place]], LEAST_VARIANCE) / variance
             evidence += 0.5 * (log(ratio) - mean[place] * mean[place] / (variance * excess))
-            mean, rows = observe(mean, rows, place, place, 0.0, EXACT)
+            observe(mean, rows, place, place, 0.0, EXACT)
         odds = exp(min(max(evidence, -50.0), 50.0))  # of elastic contact by the readings alone
         share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
         apart = mean[-1] - other[-1]
@@ -174,50 +194,47 @@ class ContactModel:
         return weakened * delay / variance / (excess * excess), weakened
 
     def _dissipate(
-        self, mean: list[float], rows: list[list[float]], places: Mapping[int, tuple[int, int]], certain: bool
-    ) -> tuple[list[float], list[list[float]]]:
-        """Return mean and rows of the covariance with dissipative parameters zero or positive.
+        self, mean: list[float], rows: list[list[float]], first_row: Count, first: Count, certain: bool
+    ) -> None:
+        """Make dissipative parameters zero or positive in mean and rows of the covariance.
 
-        `places` are a parameter's row and its index in mean and rows. If `certain`, their variances are left
-        out.
+        `first_row` and `first` are the first dissipative parameter's row and its index in mean and rows; the
+        others follow. If `certain`, their variances are left out.
         """
-        for j in DISSIPATIVE:
-            place, index = places[j]
+        for j in range(len(DISSIPATIVE)):
+            place, index = first_row + j, first + j
             variance = max(rows[place][index], LEAST_VARIANCE)
-            expected, left = zero_or_positive(mean[index], variance, self._variances[j])
+            expected, left = zero_or_positive(mean[index], variance, self._variances[DAMPING + j])
             old, new = 1.0 / variance, EXACT if certain else 1.0 / max(left, 1.0 / EXACT)
             information = new * expected - old * mean[index]
-            mean, rows = observe(mean, rows, place, index, information, new - old)
-        return mean, rows
+            observe(mean, rows, place, index, information, new - old)
 
 
 def observe(
     mean: list[float],
     rows: list[list[float]],
-    place: int,
-    index: int,
+    place: Count,
+    index: Count,
     information: float,
     precision: float,
-) -> tuple[list[float], list[list[float]]]:
-    """Return mean and rows of the covariance with more information on one parameter.
+) -> None:
+    """Update mean and rows of the covariance, in place, by more information on one parameter.
 
     A value with a variance has the precision 1/variance and the information value/variance. Negative
     ones take a prior back.
     """
-    row = rows[place]
+    row = list(rows[place])
     known = 1.0 + precision * row[index]
     if not known > 0.0:
-        return mean, rows
+        return
     gain = (information - precision * mean[index]) / known
-    weights = [precision / known * other[index] for other in rows]
-    later = [value + entry * gain for value, entry in zip(mean, row, strict=True)]
-    return later, [
-        [value - weight * entry for value, entry in zip(other, row, strict=True)]
-        for weight, other in zip(weights, rows, strict=True)
-    ]
+    mean[:] = [value + entry * gain for value, entry in zip(mean, row, strict=True)]
+    for other in rows:
+        weight = precision / known * other[index]
+        other[:] = [value - weight * entry for value, entry in zip(other, row, strict=True)]
 
 
-def zero_or_positive(mean: float, variance: float, prior_variance: float) -> tuple[float, float]:
+def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
     """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
 
     `mean` and `variance` are those of the posterior without this knowledge. The tail of the normal

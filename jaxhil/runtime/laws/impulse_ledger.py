@@ -26,7 +26,7 @@ from ..bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIME
 from ..law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNEXPLAINED, UNSURE
 from ..registry import Compensator, GainSpecification, register
 from ..surfaces import deflection
-from .contact_model import HINGES, ContactModel, dot, features, slope
+from .contact_model import HINGES, ContactModel, Vector, dot, features, slope
 from .onset_detection import LEVEL, SETTLING, OnsetDetector
 from .readings import Alignment
 from .reference_trajectory import ReferenceTrajectory
@@ -74,6 +74,7 @@ class ImpulseLedger(Compensator):
         "_misfit", "_model", "_origin", "_outside", "_peak", "_period", "_readings", "_reference", "_side",
         "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
     )  # fmt: skip
+    _estimate: tuple[float, float]  # mean and variance of the delay after this contact
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", *MASSES),
@@ -180,9 +181,10 @@ class ImpulseLedger(Compensator):
         self._peak = 0.0
         self._outside = 0.0
         self._readings = 0
-        self._estimate = 0.0, self._variance  # mean and variance of the delay after this contact
-        *spreads, preload = self._spreads
-        spreads.append(sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD))
+        self._estimate = 0.0, self._variance
+        spreads = list(self._spreads)
+        preload = spreads[-1]
+        spreads[-1] = sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD)
         self._model.restart(self._stiffness, spreads, self._variance)
         self._reference.begin((side * position - self._origin) / speed, self._model.theta)
 
@@ -231,7 +233,7 @@ class ImpulseLedger(Compensator):
         depth: float,
         rate: float,
         reading: float,
-        phi: list[float],
+        phi: Vector,
         desired: float,
     ) -> float:
         """Return the scaled command [1/s], by the bridged force [1/s] and speed and the model's speed."""

@@ -1,19 +1,25 @@
 """Alignment of the measured position with the force: position and velocity as old as the force reading."""
 
+from typing import Annotated
+
 from ..filters import DelayLine
+from ..types import Positive
 
 
 class Alignment:
     """The hardware's position and velocity as old as the force, which is read this `delay` [s] late."""
 
-    __slots__ = ("_last", "_line", "_middle", "_period", "_share")
+    __slots__ = ("_is_late", "_last", "_line", "_middle", "_period", "_share")
+    _line: Annotated[DelayLine, "identification_delay"]
+    _period: Positive
 
-    def __init__(self, delay: float, period: float) -> None:
+    def __init__(self, delay: float, period: Positive) -> None:
         # The line delays by a tick less, so that the speed can be a difference about the middle.
-        whole = delay > period
+        self._is_late = delay > period
         self._period = period
-        self._line = DelayLine(delay - period, period) if whole else None
-        self._share = 1.0 if whole else delay / period
+        # Of a delay below a period the line is made, and not used.
+        self._line = DelayLine(delay - period if self._is_late else 0.5 * period, period)
+        self._share = 1.0 if self._is_late else delay / period
         self._middle = 0.0
         self._last = 0.0
 
@@ -23,7 +29,7 @@ class Alignment:
         period = self._period
         line = self._line
         newest = position
-        if line is not None:
+        if self._is_late:
             if begins:
                 line.start(position, velocity)
             newest = line.step(position)

@@ -14,7 +14,6 @@ values are scaled as in `contact_model`.
 Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 """
 
-from collections.abc import Sequence
 from math import sqrt
 
 from .contact_model import (
@@ -25,6 +24,8 @@ from .contact_model import (
     PARAMETERS,
     REACH,
     UNLOADING,
+    Matrix,
+    Vector,
     dot,
     features,
     force,
@@ -51,7 +52,7 @@ class ReferenceTrajectory:
     def __init__(self) -> None:
         self.begin(0.0, [0.0] * PARAMETERS)
 
-    def begin(self, depth: float, theta: Sequence[float]) -> None:
+    def begin(self, depth: float, theta: Vector) -> None:
         """Begin at the onset, at a depth [s] and the speed 1, with these parameters of the model."""
         self.depth = depth
         self.speed = 1.0
@@ -63,7 +64,7 @@ class ReferenceTrajectory:
         self._speeds = [0.0] * PARAMETERS  # s'
         self._losses = [0.0] * len(LOSSES)  # work of each dissipative feature
 
-    def correct(self, theta: Sequence[float]) -> None:
+    def correct(self, theta: Vector) -> None:
         """Correct the trajectory for new parameters."""
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
@@ -71,7 +72,7 @@ class ReferenceTrajectory:
             self.depth = within(self.depth + dot(self._depths, changes), FARTHEST)
         self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
 
-    def advance(self, period: float, reading: float, measured: Sequence[float]) -> None:
+    def advance(self, period: float, reading: float, measured: Vector) -> None:
         """Advance by one control period [s] (velocity Verlet) to the time of a reading [1/s] whose features
         are `measured`."""
         theta = self._theta
@@ -92,7 +93,7 @@ class ReferenceTrajectory:
         self.depth = depth
         self.force = push
 
-    def spread(self, covariance: Sequence[Sequence[float]], delay_variance: float) -> float:
+    def spread(self, covariance: Matrix, delay_variance: float) -> float:
         """Return the standard deviation of the speed, sqrt(s' P s'), for a delay of this variance [s^2]."""
         columns = [dot(row, self._speeds) for row in covariance]
         total, known = dot(self._speeds, columns), covariance[DELAY][DELAY]
@@ -103,7 +104,9 @@ class ReferenceTrajectory:
 
     def imbalance(self) -> float:
         """Return the energy that the trajectory lost and the model's dissipation does not explain [1]."""
-        dissipated = sum(self._theta[j] * loss for j, loss in zip(LOSSES, self._losses, strict=True))
+        dissipated = 0.0
+        for j, loss in zip(LOSSES, self._losses, strict=True):
+            dissipated += self._theta[j] * loss
         return 0.5 * (1.0 - self.speed * self.speed) - dissipated
 
     def bridge(self, duration: float, misfit: float) -> tuple[float, float]:
@@ -124,7 +127,7 @@ class ReferenceTrajectory:
         return push, speed
 
     def _advance_sensitivities(
-        self, period: float, depth: float, undelayed: Sequence[float], measured: Sequence[float]
+        self, period: float, depth: float, undelayed: Vector, measured: Vector
     ) -> None:
         theta = self._theta
         inside = depth > 0.0

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, shown
-from jaxhil.runtime.laws import WITHOUT_C
 from jaxhil.runtime.limits import LIMITS
 from tuning import terminal
 from tuning.cli.options_rig import Export
@@ -67,8 +66,6 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         for number, end in enumerate(document["ended"])
         if end
     ]
-    if document["compensator"] in WITHOUT_C:
-        lines.append(f"{document['compensator']} has no C99 sources yet: the bundle runs in Python.")
     if document["rates"]:
         lines += [f"Watchdog: {text}" for text in alarm_rates(document["rates"])]
     if document["bundle"]:

@@ -1,0 +1,245 @@
+"""Calls: functions of Python, `math`, methods, constructors; attributes of objects."""
+
+import ast
+import inspect
+import types
+from collections.abc import Callable
+from typing import Any
+
+from .expressions import LARGEST_FACTOR, common
+from .lists import Lists
+from .subset import ATOM, BOOL, CHOICE, FLOAT, INT, SUM, UNARY, Keys, Type, Value, implies
+
+# Functions of math: what raises, by the operands `{0}`, `{1}` and the result `{r}`.
+MATH = {
+    "sqrt": "{0} < 0.0",
+    "log": "{0} <= 0.0",
+    "exp": "isinf({r}) && isfinite({0})",
+    "sin": "isinf({0})",
+    "cos": "isinf({0})",
+    "tan": "isinf({0})",
+    "asin": "fabs({0}) > 1.0",
+    "acos": "fabs({0}) > 1.0",
+    "fmod": "isinf({0}) || {1} == 0.0",
+    **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign"), ""),
+}
+WHOLE = {"int": "{}", "floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
+TESTS = ("isfinite", "isnan", "isinf")
+LARGEST = "9223372036854774784.0"  # the largest double that an int64_t holds
+
+
+class Calls(Lists):
+    """Lowering of calls and attributes."""
+
+    share: Callable[[ast.AST, Keys, Value], None]
+    changed: Callable[[Value, bool], None]
+
+    def lower_attribute(self, node: ast.Attribute) -> Value:
+        name = getattr(node.value, "id", "")
+        module = None if name in self.names else self.function.namespace.get(name)
+        if isinstance(module, types.ModuleType) and hasattr(module, node.attr):
+            return self.program.named_constant(node.attr, vars(module)) or self.unknown(node, node.attr)
+        value = self.expression(node.value)
+        if value.type.kind not in ("object", "record"):
+            raise self.refuse(node, f".{node.attr} of a {value.type.kind}", "an attribute of an object")
+        static = inspect.getattr_static(value.type.of, node.attr, None)
+        if isinstance(static, property) and static.fget is not None:
+            return self.invoke(static.fget, value, ast.copy_location(ast.Call(node, [], []), node))
+        return self.program.field(self, value, node.attr, node)
+
+    def lower_call(self, node: ast.Call) -> Value:
+        called, target = node.func, None
+        if isinstance(called, ast.Name) and called.id not in self.names:
+            target = self.function.namespace.get(called.id, getattr(self, f"builtin_{called.id}", called.id))
+        elif isinstance(called, ast.Attribute):
+            module = self.function.namespace.get(getattr(called.value, "id", ""))
+            if isinstance(module, types.ModuleType):
+                target = getattr(module, called.attr, None)
+            else:
+                value = self.expression(called.value)
+                method = inspect.getattr_static(value.type.of, called.attr, None) if value.type.of else None
+                if value.type.kind != "object" or not inspect.isfunction(method):
+                    raise self.refuse(node, f"a call of .{called.attr}", "a method of a class with a source")
+                return self.invoke(method, value, node)
+        if inspect.ismethod(target):
+            return target(node)
+        if inspect.isfunction(target):
+            return self.invoke(target, None, node)
+        if inspect.isclass(target):
+            if issubclass(target, tuple):
+                return self._record(target, node)
+            raise self.refuse(node, f"{target.__name__}(...) here", "`self.name = Class(...)` in `__init__`")
+        name = target if isinstance(target, str) else getattr(target, "__name__", "?")
+        return (
+            self._math(node, name)
+            if not isinstance(target, str) or name == "round"
+            else self._no_call(node, name)
+        )
+
+    def _no_call(self, node: ast.Call, name: str) -> Value:
+        is_sum = name in ("sum", "fsum", "hypot", "pow")
+        wanted = "a loop or a product: its rounding is Python's own" if is_sum else "a function with a source"
+        raise self.refuse(node, f"{name}(...)", f"{wanted}, or one of math: {', '.join([*MATH, *TESTS])}")
+
+    def builtin_abs(self, node: ast.Call) -> Value:
+        (value,) = self.operands(node.args, self.number)
+        if value.type.kind == "int":
+            text = self.simple(value, "value").text
+            return Value(f"{text} < 0 ? -{text} : {text}", INT, CHOICE, value.reads, sign=">= 0")
+        sign = "> 0" if value.sign and implies(value.sign, "not 0") else ">= 0"
+        return value._replace(text=f"fabs({value.text})", rank=ATOM, sign=sign, type=FLOAT, constant=None)
+
+    def builtin_max(self, node: ast.Call, mark: str = ">") -> Value:
+        values = [self.simple(one, "value") for one in self.operands(node.args, self.number)]
+        found, signs = values[0], {one.sign for one in values}
+        if len(values) < 2 or len({one.type.kind for one in values}) > 1:
+            raise self.refuse(node, f"{ast.unparse(node)}", "two or more numbers of one type")
+        for one in values[1:]:
+            # NaN goes the way that Python's comparison sends it.
+            found = self.simple(found, "extreme") if found.rank == CHOICE else found
+            text = f"{one.at(SUM)} {mark} {found.at(SUM)} ? {one.text} : {found.text}"
+            found = Value(text, found.type._replace(sign=""), CHOICE, found.reads | one.reads)
+        largest = next((one for one in ("> 0", ">= 0") if one in signs), "")
+        return found._replace(sign=largest if mark == ">" else common([one.sign for one in values]))
+
+    def builtin_min(self, node: ast.Call) -> Value:
+        return self.builtin_max(node, "<")
+
+    def builtin_float(self, node: ast.Call) -> Value:
+        return self.as_float(self.number(node.args[0]))
+
+    def builtin_bool(self, node: ast.Call) -> Value:
+        return self.truth(node.args[0])
+
+    def builtin_list(self, node: ast.Call) -> Value:
+        return self.array(node.args[0], None)
+
+    def builtin_len(self, node: ast.Call) -> Value:
+        value = self.expression(node.args[0])
+        if value.type.kind != "list":
+            raise self.refuse(node, f"len of a {value.type.kind}", "len of a list")
+        length = value.type.length
+        return Value(value.length, INT, sign=">= 0") if length is None else self.program.known(length)
+
+    def builtin_int(self, node: ast.Call, form: str = "{}") -> Value:
+        """Lower a conversion to int: it raises for what is not finite, here beyond 2^63 too."""
+        value = self.number(node.args[0])
+        if value.type.kind == "int" or len(node.args) > 1:
+            return value if len(node.args) == 1 else self._no_call(node, "round to digits")
+        text = value.at(UNARY) if form == "{}" else form.format(value.text)
+        if not (value.span and max(map(abs, value.span)) < LARGEST_FACTOR):
+            text = self.temporary(value._replace(text=text, rank=ATOM), "whole").text
+            self.fail_if(f"!(fabs({text}) <= {LARGEST})", node, "an int of a float that may be too large")
+        return Value(f"(int64_t){text}", INT, UNARY, sign=">= 0" if value.sign in ("> 0", ">= 0") else "")
+
+    def builtin_round(self, node: ast.Call) -> Value:
+        return self.builtin_int(node, WHOLE["round"])
+
+    def _math(self, node: ast.Call, name: str) -> Value:
+        if name in WHOLE:
+            return self.builtin_int(node, WHOLE[name])
+        if (name not in MATH and name not in TESTS) or node.keywords:
+            return self._no_call(node, name)
+        values = [self.as_float(one) for one in self.operands(node.args, self.number)]
+        reads: Keys = frozenset().union(*(one.reads for one in values))
+        if name in TESTS:
+            return Value(f"{name}({values[0].text})", BOOL, reads=reads)
+        test, sign = MATH[name], values[0].sign if name in ("sqrt", "log", "fabs") else ""
+        if (name == "sqrt" and sign in ("> 0", ">= 0")) or (name == "log" and sign == "> 0"):
+            test = ""
+        values = [self.simple(one, "operand") for one in values] if test else values
+        text = f"{name}({', '.join(one.text for one in values)})"
+        positive = {"sqrt": "> 0" if sign == "> 0" else ">= 0", "fabs": ">= 0", "exp": ">= 0"}.get(name, "")
+        value = Value(text, FLOAT, reads=reads, sign=positive)
+        if test:
+            value = self.temporary(value, f"{name}_value") if "{r}" in test else value
+            condition = test.format(*(one.text for one in values), r=value.text)
+            self.fail_if(condition, node, f"{name} that may raise")
+        return value
+
+    def _arguments(self, function: Callable[..., Any], node: ast.Call) -> dict[str, Any]:
+        """Return the arguments of a call by parameter: syntax trees, or defaults."""
+        known = [one for one in inspect.signature(function).parameters.values() if one.name != "self"]
+        given: dict[str, Any] = {one.name: arg for one, arg in zip(known, node.args, strict=False)}
+        given |= {str(one.arg): one.value for one in node.keywords}
+        given |= {
+            one.name: one.default for one in known if one.name not in given and one.default is not one.empty
+        }
+        if len(node.args) > len(known) or {one.name for one in known} != {*given}:
+            raise self.refuse(node, "these arguments", "one for each parameter")
+        return given
+
+    def _lowered(self, given: dict[str, Any], node: ast.AST) -> dict[str, Value]:
+        nodes = [one for one in given.values() if isinstance(one, ast.expr)]
+        lowered = iter(self.operands(nodes))
+        return {
+            k: next(lowered) if isinstance(v, ast.expr) else self.program.known(v) for k, v in given.items()
+        }
+
+    def invoke(self, function: Callable[..., Any], receiver: Value | None, node: ast.Call) -> Value:
+        """Lower a call of a function or method that has a source."""
+        owner = receiver.type.of if receiver else None
+        types_ = self.program.parameters(function, owner)
+        given = self._arguments(function, node)
+        values = self._lowered({k: one for k, one in given.items() if types_[k].kind != "text"}, node)
+        for name, value in values.items():
+            types_[name] = self._argument(node, name, types_[name], value)
+        called = self.program.function(function, owner, types_, self)
+        texts = [self.pointer(receiver), *receiver.samples] if receiver else []
+        texts += [self.program.stored(called.parameters[name], values[name]) for name in called.parameters]
+        writes = called.writes | {key for name in called.changes for key in values[name].reads}
+        self.note(writes)
+        for name in called.changes:
+            self.changed(values[name], True)
+        for name in called.keeps:
+            self.share(node, called.keeps[name], values[name])
+        returns, array = called.returns, ""
+        if returns.kind == "list":
+            array = self.fresh(self.hint_of(node))
+            self.emit(f"{self.program.declaration(returns, array)};")
+        texts += [array] * bool(array) + [self.function.error] * called.fails
+        self.function.reason = self.function.reason or called.reason
+        self.function.fails = self.function.fails or called.fails
+        text, reads = (
+            f"{called.name}({', '.join(texts)})",
+            called.reads | (receiver.reads if receiver else frozenset()),
+        )
+        if not array:
+            return Value(text, returns._replace(sign=""), ATOM, reads, writes, called.fails, returns.sign)
+        self.emit(f"{text};")
+        self.check(Value("", returns, fails=called.fails))
+        return Value(array, returns, reads=frozenset({("local", array)}))
+
+    def _argument(self, node: ast.AST, name: str, wanted: Type, value: Value) -> Type:
+        """Return the type that a parameter has in this call."""
+        kind = value.type.kind
+        if wanted.kind == kind == "list" and wanted.length in (None, value.type.length):
+            return value.type
+        if wanted.kind != kind and not (wanted.kind == "float" and kind == "int"):
+            raise self.refuse(node, f"a {kind} for {name}", f"a {wanted.kind}")
+        if wanted.sign and not (value.sign and implies(value.sign, wanted.sign)):
+            raise self.refuse(node, f"a number of unknown sign for {name}", f"one that is {wanted.sign}")
+        return wanted
+
+    def pointer(self, value: Value) -> str:
+        """Return the C text of a pointer to an object."""
+        return value.text if value.is_pointer else f"&{value.text}"
+
+    def _record(self, target: Any, node: ast.Call) -> Value:
+        """Lower a NamedTuple into a local constant."""
+        values, record = self._lowered(self._arguments(target, node), node), Type("record", target)
+        wanted = {name: self.program.field_type(self, record, name, node) for name in target._fields}
+        texts = [self.program.stored(one, values[name]) for name, one in wanted.items() if one.kind != "text"]
+        name = self.fresh("record")
+        self.emit(f"const {self.program.c_type(record)} {name} = {{{', '.join(texts)}}};")
+        return Value(name, record)
+
+    def construct(self, target: Value, class_: type, node: ast.Call) -> None:
+        """Lower `self.name = Class(...)`: construct in place."""
+        init = inspect.getattr_static(class_, "__init__", None)
+        if inspect.isfunction(init):
+            value = self.invoke(init, target._replace(samples=()), node)
+            head, comma, tail = value.text.partition(", ")
+            samples = self.program.capacities(self, class_, target, node)
+            self.emit(f"{', '.join([head, *samples])}{comma}{tail};")
+            self.check(value)

@@ -1,0 +1,186 @@
+"""Lowering of one function: output, error flag, order of evaluation, what is known of numbers."""
+
+import ast
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .printing import plain
+from .source import comment_before
+from .subset import BOOL, EQUALITY, ORDER, TEXT, Keys, SubsetError, Value, implies
+
+if TYPE_CHECKING:
+    from .program import Function, Program
+
+WHEN_TRUE = {ast.Gt: "> 0", ast.GtE: ">= 0", ast.Lt: "not 0", ast.NotEq: "not 0"}  # of x beside 0
+WHEN_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}
+
+
+class Fact(NamedTuple):
+    """What is known of a number."""
+
+    sign: str
+    reads: Keys = frozenset()  # what it depends on
+    span: tuple[Any, Any] | None = None  # it is a number, between these
+
+
+class Core:
+    """State of the lowering of one function."""
+
+    def __init__(self, program: "Program", function: "Function") -> None:
+        self.program, self.function = program, function
+        self.names: dict[str, Value] = {}  # local names
+        self.facts: dict[str, Fact] = {}  # by the C text of a number
+        self.lines: list[str] = []
+        self.failures = 0  # tests so far that may leave the function
+        self.effects: list[Keys] = []  # what calls have changed so far
+
+    def refuse(self, node: ast.AST, found: str, expected: str) -> SubsetError:
+        """Return the error of a construct outside the subset."""
+        line = getattr(node, "lineno", self.function.node.lineno)
+        return SubsetError(f"{self.function.file}:{line}: found {found}, expected {expected}")
+
+    def emit(self, *lines: str) -> None:
+        """Add lines; `printing` indents them."""
+        self.lines += lines
+
+    @contextmanager
+    def captured(self) -> Iterator[list[str]]:
+        """Collect what is emitted in a list of its own, and forget what is learnt."""
+        before, facts, effects = self.lines, self.facts, len(self.effects)
+        self.lines, self.facts = [], dict(facts)
+        yield self.lines
+        written = frozenset().union(*self.effects[effects:])
+        self.lines, self.facts = before, {k: fact for k, fact in facts.items() if not fact.reads & written}
+
+    def fresh(self, hint: str) -> str:
+        """Return a local name that nothing else has."""
+        numbers = (f"{hint}_{number}" for number in range(2, 10_000))
+        name = next(one for one in (hint, *numbers) if one not in self.function.taken)
+        self.function.taken.add(name)
+        return name
+
+    def temporary(self, value: Value, hint: str) -> Value:
+        """Hold a value in a local constant."""
+        name = self.fresh(hint)
+        self.emit(f"const {self.program.c_type(value.type)} {name} = {value.text};")
+        self.check(value)
+        return Value(name, value.type, sign=value.sign)
+
+    def simple(self, value: Value, hint: str) -> Value:
+        """Return a value that may be written twice."""
+        is_simple = value.text.replace("->", "").replace(".", "").replace("_", "").isalnum()
+        return value if is_simple and not value.writes else self.temporary(value, hint)
+
+    def check(self, value: Value) -> None:
+        """Leave the function if the call that a value came from failed."""
+        if value.fails:
+            self.fail_if("*error", None)
+
+    def fail_if(self, condition: str, node: ast.AST | None, reason: str = "") -> None:
+        """Raise the error flag and leave the function on a condition."""
+        self.emit(f"if ({condition}) {{")
+        self.fail(node, reason)
+        self.emit("}")
+
+    def fail(self, node: ast.AST | None, reason: str) -> None:
+        """Raise the error flag, unless it is already, and leave the function."""
+        self.failures += 1
+        self.function.fails = True
+        nothing = {"float": " 0.0", "int": " 0", "bool": " false"}.get(self.function.returns.kind, "")
+        if node is not None:
+            line = getattr(node, "lineno", 0)
+            self.function.reason = self.function.reason or f"{self.function.file}:{line}: found {reason}"
+            self.emit("*error = true;")
+        self.emit(f"return{nothing};")
+
+    def expression(self, node: ast.expr) -> Value:
+        """Lower an expression."""
+        if isinstance(node, ast.JoinedStr):
+            return Value("", TEXT)
+        lower = getattr(self, f"lower_{type(node).__name__.lower()}", None)
+        if lower is None:
+            raise self.refuse(node, type(node).__name__, "an expression of numbers, lists and attributes")
+        value = lower(node)
+        fact = self.facts.get(value.text)
+        if fact is None:
+            return value
+        sign = value.sign if value.sign and implies(value.sign, fact.sign) else fact.sign
+        return value._replace(sign=sign, span=fact.span or value.span)
+
+    def number(self, node: ast.expr) -> Value:
+        """Lower an expression that has to be a number."""
+        value = self.expression(node)
+        if not value.is_number:
+            raise self.refuse(node, f"a {value.type.kind} as an operand", "a number")
+        return value
+
+    def truth(self, node: ast.expr) -> Value:
+        """Lower an expression as a condition."""
+        value = self.expression(node)
+        if value.type.kind == "bool":
+            return value
+        if not value.is_number:
+            raise self.refuse(node, f"a {value.type.kind} as a condition", "a comparison")
+        zero = "0" if value.type.kind == "int" else "0.0"
+        text = f"{value.at(ORDER)} != {zero}"
+        return value._replace(text=text, rank=EQUALITY, type=BOOL, sign="", constant=None)
+
+    def operands(self, nodes: Sequence[ast.expr], lower: Callable[..., Value] | None = None) -> list[Value]:
+        """Lower expressions that Python evaluates from left to right."""
+        values: list[Value] = []
+        for node in nodes:
+            position, before = len(self.lines), len(self.effects)
+            value = (lower or self.expression)(node)
+            is_held = (value.writes and node is not nodes[-1]) or value.fails
+            if is_held and len(nodes) > 1 and value.type.kind not in ("none", "list"):
+                value = self.temporary(value, self.hint_of(node))
+            written = frozenset().union(*self.effects[before:])
+            for place, earlier in enumerate(values):
+                if earlier.reads & written and earlier.is_number:
+                    later, self.lines = self.lines[position:], self.lines[:position]
+                    values[place] = self.temporary(earlier, "earlier")
+                    position = len(self.lines)
+                    self.lines += later
+            values.append(value)
+        return values
+
+    def hint_of(self, node: ast.expr) -> str:
+        """Return a name for the value of a call."""
+        called = node.func if isinstance(node, ast.Call) else node
+        name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "value")
+        return name.lstrip("_")
+
+    def note(self, writes: Keys) -> None:
+        """Take note of what an assignment or a call changes."""
+        if writes:
+            self.effects.append(writes)
+            self.function.writes |= writes
+            self.facts = {key: fact for key, fact in self.facts.items() if not fact.reads & writes}
+
+    def explain(self, statement: ast.stmt) -> None:
+        """Print the comment above a statement."""
+        if text := comment_before(self.function.file, statement):
+            self.emit(f"/* {plain(text)} */")
+
+    def facts_of(self, node: ast.expr, truth: bool) -> dict[str, Fact]:
+        """Return what a condition tells of numbers if it is true, or false."""
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            return self.facts_of(node.operand, not truth)
+        if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And) == truth:
+            return {key: fact for one in node.values for key, fact in self.facts_of(one, truth).items()}
+        if not isinstance(node, ast.Compare) or len(node.ops) != 1:
+            return {}
+        operator, left = type(node.ops[0]), node.left
+        sign = (WHEN_TRUE if truth else WHEN_FALSE).get(operator, "")
+        is_below = truth and operator in (ast.Lt, ast.LtE)
+        if not (sign or is_below) or not isinstance(left, (ast.Name, ast.Attribute)):
+            return {}
+        with self.captured():
+            value, limit = self.expression(left), self.expression(node.comparators[0]).constant
+        if not isinstance(limit, (int, float)) or not value.is_number:
+            return {}
+        if is_below and value.sign in ("> 0", ">= 0"):
+            return {value.text: Fact(value.sign, value.reads, (0, limit))}
+        is_far = sign in ("> 0", ">= 0") and limit > 0
+        return {value.text: Fact("> 0" if is_far else sign, value.reads)} if limit == 0 or is_far else {}

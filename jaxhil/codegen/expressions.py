@@ -1,0 +1,276 @@
+"""Expressions: arithmetic, comparisons, conditions, names."""
+
+import ast
+import operator
+from typing import Any
+
+from .core import Core, Fact
+from .subset import (
+    AND,
+    ATOM,
+    BITS,
+    BOOL,
+    CHOICE,
+    EQUALITY,
+    FLOAT,
+    INT,
+    OR,
+    ORDER,
+    PRODUCT,
+    SUM,
+    UNARY,
+    Value,
+    implies,
+    sign_of,
+)
+from .subset import common_sign as common
+
+ARITHMETIC = {
+    ast.Add: ("+", SUM, operator.add),
+    ast.Sub: ("-", SUM, operator.sub),
+    ast.Mult: ("*", PRODUCT, operator.mul),
+    ast.Div: ("/", PRODUCT, operator.truediv),
+}
+BIT_MARKS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
+COMPARISONS = {
+    ast.Lt: ("<", operator.lt),
+    ast.LtE: ("<=", operator.le),
+    ast.Gt: (">", operator.gt),
+    ast.GtE: (">=", operator.ge),
+    ast.Eq: ("==", operator.eq),
+    ast.NotEq: ("!=", operator.ne),
+}
+HELPED = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
+LARGEST_FACTOR = 3037000499  # its square is the largest that an int64_t holds
+
+
+class Expressions(Core):
+    """Lowering of expressions; what has to happen before them is emitted."""
+
+    def lower_constant(self, node: ast.Constant) -> Value:
+        return self.program.constant(node.value) or self.unknown(node, repr(node.value))
+
+    def unknown(self, node: ast.AST, what: str) -> Value:
+        """Raise the error of a name or constant without a C."""
+        raise self.refuse(node, what, "a number, a bool, a list of them, a class or a function with a source")
+
+    def lower_name(self, node: ast.Name) -> Value:
+        if node.id in self.names:
+            self.function.reads |= self.names[node.id].reads
+            return self.names[node.id]
+        if node.id in self.function.places or node.id not in self.function.namespace:
+            raise self.refuse(node, f"the name {node.id}", "one that is assigned before, here or above")
+        return self.program.named_constant(node.id, self.function.namespace) or self.unknown(node, node.id)
+
+    def as_float(self, value: Value) -> Value:
+        """Convert an int to a double."""
+        if value.type.kind != "int":
+            return value
+        if value.constant is not None and value.text.lstrip("-").isdigit():
+            return value._replace(text=f"{value.text}.0", type=FLOAT, constant=float(value.constant))
+        return value._replace(text=f"(double){value.at(UNARY)}", type=FLOAT, rank=UNARY)
+
+    def lower_binop(self, node: ast.BinOp) -> Value:
+        if isinstance(node.left, (ast.List, ast.Tuple)):
+            return self.expression(ast.copy_location(ast.Call(ast.Name("list"), [node], []), node))
+        left, right = self.operands([node.left, node.right], self.number)
+        kind, reads, op = "int", left.reads | right.reads, type(node.op)
+        if op in BIT_MARKS and left.type.kind == right.type.kind == "int":
+            mark = f" {BIT_MARKS[op]} "
+            first = left.text if left.rank == BITS and left.text.count(mark) else left.at(UNARY)
+            writes = left.writes | right.writes
+            return Value(f"{first}{mark}{right.at(UNARY)}", INT, BITS, reads, writes)
+        if "float" in (left.type.kind, right.type.kind) or op in (ast.Div, ast.Pow):
+            left, right, kind = self.as_float(left), self.as_float(right), "float"
+        if op in HELPED:
+            return self._helped(node, left, right, kind)
+        if op not in ARITHMETIC:
+            raise self.refuse(node, op.__name__, "+, -, *, /, //, % or ** of numbers, &, | or ^ of ints")
+        mark, rank, compute = ARITHMETIC[op]
+        if op is ast.Div:
+            right = self._divisor(node, right)
+        if op is ast.Mult and kind == "int" and not (left.span and right.span):
+            left, right = self.simple(left, "factor"), self.simple(right, "factor")
+            for one in (left, right):
+                if one.constant is None:
+                    large = f"{one.text} > {LARGEST_FACTOR} || {one.text} < -{LARGEST_FACTOR}"
+                    self.fail_if(large, node, "a product of ints that may be beyond 2^63")
+        constants, span, constant = (left.constant, right.constant), None, None
+        if op is not ast.Div and all(isinstance(one, (int, float)) for one in constants):
+            constant = compute(*constants)
+            span = (constant, constant)
+        elif op is not ast.Div and left.span and right.span:
+            ends = [compute(one, other) for one in left.span for other in right.span]
+            span = (min(ends), max(ends))
+        sign = sign_of(constant) or self._sign(node.op, left, right)
+        text = f"{left.at(rank)} {mark} {right.at(rank + 1)}"
+        type_ = FLOAT if kind == "float" else INT
+        return Value(text, type_, rank, reads, left.writes | right.writes, False, sign, span, "", constant)
+
+    def _sign(self, op: ast.operator, left: Value, right: Value) -> str:
+        if not {left.sign, right.sign} <= {"> 0", ">= 0"}:
+            return ">= 0" if isinstance(op, ast.Mult) and left.text == right.text else ""
+        is_one_positive = "> 0" in (left.sign, right.sign)
+        # A product of positive floats may underflow to 0, but not by a factor of 1 or more.
+        is_large = any(one.constant is not None and one.constant >= 1 for one in (left, right))
+        if isinstance(op, ast.Mult) and left.sign == right.sign == "> 0" and is_large:
+            return "> 0"
+        if isinstance(op, ast.Add):
+            return "> 0" if is_one_positive else ">= 0"
+        return ">= 0" if isinstance(op, (ast.Mult, ast.Div)) else ""
+
+    def _divisor(self, node: ast.AST, value: Value) -> Value:
+        """Test a divisor, unless it cannot be 0."""
+        if value.sign and implies(value.sign, "not 0"):
+            return value
+        value = self.simple(value, "divisor")
+        zero = "0.0" if value.type.kind == "float" else "0"
+        self.fail_if(f"{value.text} == {zero}", node, "a division whose divisor may be 0")
+        self.facts[value.text] = Fact("> 0" if value.sign else "not 0", value.reads)
+        return value
+
+    def _helped(self, node: ast.BinOp, left: Value, right: Value, kind: str) -> Value:
+        """Return a floor division, a remainder or a power."""
+        name = HELPED[type(node.op)] + ("_int" if kind == "int" else "")
+        if name != "power":
+            right = self._divisor(node, right)
+            sign = right.sign if name.startswith("modulo") and right.sign in ("> 0", ">= 0") else ""
+            text = self.program.helper(name, left.text, right.text)
+            return Value(
+                text, left.type._replace(sign=""), reads=left.reads | right.reads, sign=sign and ">= 0"
+            )
+        left, right = self.simple(left, "base"), self.simple(right, "exponent")
+        value = self.temporary(Value(self.program.helper(name, left.text, right.text), FLOAT), "power")
+        base, exponent = left.text, right.text
+        tests = [f"(isinf({value.text}) && isfinite({base}) && isfinite({exponent}))"]
+        if not (isinstance(right.constant, float) and right.constant.is_integer() and right.constant > 0.0):
+            is_whole = f"isfinite({exponent}) && floor({exponent}) == {exponent}"
+            tests += [f"({base} == 0.0 && {exponent} < 0.0)", f"({base} < 0.0 && !({is_whole}))"]
+        self.fail_if(" || ".join(tests), node, "a power that may raise")
+        return value
+
+    def lower_unaryop(self, node: ast.UnaryOp) -> Value:
+        if isinstance(node.op, ast.Not):
+            value = self.truth(node.operand)
+            if value.constant is not None:
+                return self.program.known(not value.constant)
+            if value.rank == EQUALITY and value.text.endswith(" != 0"):
+                return value._replace(text=value.text.removesuffix("!= 0") + "== 0")
+            return value._replace(text=f"!{value.at(UNARY)}", rank=UNARY)
+        value = self.number(node.operand)
+        if isinstance(node.op, ast.UAdd):
+            return value
+        if isinstance(node.op, ast.Invert):
+            wide = f"~(int64_t){value.text}" if value.constant is not None else f"~{value.at(UNARY)}"
+            return Value(wide, INT, UNARY, value.reads, value.writes)
+        constant = None if value.constant is None else -value.constant
+        span = value.span and (-value.span[1], -value.span[0])
+        sign = "not 0" if value.sign and implies(value.sign, "not 0") else ""
+        text = f"-{value.at(UNARY + 1)}"
+        return value._replace(text=text, rank=UNARY, sign=sign, span=span, constant=constant)
+
+    def lower_compare(self, node: ast.Compare) -> Value:
+        op, other = type(node.ops[0]), node.comparators[0]
+        if len(node.ops) == 1 and op in (ast.Is, ast.IsNot):
+            return self._identity(node, op is ast.Is, other)
+        if len(node.ops) == 1 and op in (ast.In, ast.NotIn) and isinstance(other, (ast.Tuple, ast.List)):
+            value = self.simple(self.number(node.left), "value")
+            kind, joint = (ast.Eq, ast.Or) if op is ast.In else (ast.NotEq, ast.And)
+            self.names["in"] = value
+            parts: list[ast.expr] = [ast.Compare(ast.Name("in"), [kind()], [one]) for one in other.elts]
+            return self.expression(ast.fix_missing_locations(ast.BoolOp(joint(), parts)))
+        values = self.operands([node.left, *node.comparators])
+        if len(values) > 2:
+            values[1:-1] = [self.simple(one, "middle") for one in values[1:-1]]
+        parts_: list[Value] = []
+        for mark, left, right in zip(node.ops, values, values[1:], strict=False):
+            kinds = {left.type.kind, right.type.kind}
+            if type(mark) not in COMPARISONS or not (kinds == {"bool"} or kinds <= {"int", "float"}):
+                raise self.refuse(
+                    node, f"{type(mark).__name__} of {left.type.kind}", "a comparison of numbers"
+                )
+            text, compare = COMPARISONS[type(mark)]
+            if left.constant is not None and right.constant is not None:
+                parts_.append(self.program.known(compare(left.constant, right.constant)))
+                continue
+            if len(kinds) > 1:
+                left, right = self.as_float(left), self.as_float(right)
+            rank = EQUALITY if text in ("==", "!=") else ORDER
+            writes = left.writes | right.writes
+            text = f"{left.at(SUM)} {text} {right.at(SUM)}"
+            parts_.append(Value(text, BOOL, rank, left.reads | right.reads, writes))
+        return self._together(parts_, True)
+
+    def _identity(self, node: ast.Compare, is_same: bool, other: ast.expr) -> Value:
+        value = node.left
+        if isinstance(value, ast.Call) and getattr(value.func, "id", "") == "type":
+            # Types are known here: `type(x) is float` spares Python a conversion that C does not need.
+            kind = self.expression(value.args[0]).type.kind
+            return self.program.known((kind == getattr(other, "id", "")) == is_same)
+        found = self.names.get(getattr(value, "id", ""))
+        if found is None or found.length != "optional" or getattr(other, "value", 0) is not None:
+            raise self.refuse(node, "`is`", "`is None` of a parameter `float | None`")
+        return Value(f"{found.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
+
+    def _together(self, parts: list[Value], is_and: bool) -> Value:
+        """Join conditions by `and` or `or`."""
+        if any(one.constant is not None and one.constant != is_and for one in parts):
+            place = next(
+                p for p, one in enumerate(parts) if one.constant is not None and one.constant != is_and
+            )
+            parts = parts[: place + 1] if any(one.writes for one in parts[:place]) else [parts[place]]
+        parts = [one for one in parts if one.constant is None or len(parts) == 1]
+        if len(parts) < 2:
+            return parts[0] if parts else self.program.known(is_and)
+        mark, rank = ("&&", AND) if is_and else ("||", OR)
+        text = f" {mark} ".join(one.at(rank if one.rank != AND else AND + 1 - is_and) for one in parts)
+        reads: Any = frozenset().union(*(one.reads for one in parts))
+        return Value(text, BOOL, rank, reads, frozenset().union(*(one.writes for one in parts)))
+
+    def lower_boolop(self, node: ast.BoolOp) -> Value:
+        is_and, parts, learnt = isinstance(node.op, ast.And), [], {}
+        for one in node.values:
+            with self.captured() as lines:
+                self.facts |= learnt
+                value = self.truth(one)
+            if lines and parts:
+                held = self.fresh("holds")
+                self.emit(f"bool {held} = {self._together(parts, is_and).text};")
+                self.emit(f"if ({held if is_and else f'!{held}'}) {{", *lines, f"{held} = {value.text};", "}")
+                parts = [Value(held, BOOL)]
+            else:
+                self.emit(*lines)
+                parts.append(value)
+            learnt |= self.facts_of(one, is_and)
+        return self._together(parts, is_and)
+
+    def lower_ifexp(self, node: ast.IfExp) -> Value:
+        test = self.truth(node.test)
+        if test.constant is not None:
+            return self.expression(node.body if test.constant else node.orelse)
+        branches = []
+        for branch, truth in ((node.body, True), (node.orelse, False)):
+            learnt = self.facts_of(node.test, truth)
+            with self.captured() as lines:
+                self.facts |= learnt
+                branches.append((self.expression(branch), lines))
+        (body, first), (other, second) = branches
+        if body.type.kind == "text":
+            return body
+        if {body.type.kind, other.type.kind} == {"int", "float"}:
+            body, other = self.as_float(body), self.as_float(other)
+        if body.type.kind != other.type.kind or body.type.kind not in ("int", "float", "bool"):
+            raise self.refuse(node, f"{body.type.kind} or {other.type.kind}", "two numbers of one type")
+        sign = common([body.sign, other.sign])
+        type_ = body.type._replace(sign="", c_int="int64_t", is_index=False)
+        if not (first or second or body.fails or other.fails):
+            reads = test.reads | body.reads | other.reads
+            text = f"{test.at(OR)} ? {body.at(CHOICE + 1)} : {other.at(CHOICE)}"
+            return Value(text, type_, CHOICE, reads, test.writes | body.writes | other.writes, sign=sign)
+        name = self.fresh("choice")
+        self.emit(f"{self.program.c_type(type_)} {name};", f"if ({test.text}) {{")
+        for value, lines, last in ((body, first, "} else {"), (other, second, "}")):
+            self.emit(*lines, f"{name} = {value.text};")
+            self.check(value)
+            self.emit(last)
+        return Value(name, type_, ATOM, sign=sign)

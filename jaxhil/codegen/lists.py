@@ -1,0 +1,261 @@
+"""Lists and loops: arrays of fixed length, views of them, samples of run-time length, indices."""
+
+import ast
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from .core import Fact
+from .expressions import Expressions
+from .subset import ATOM, FLOAT, INT, SUM, TEXT, Type, Value, implies
+
+
+class Loop(NamedTuple):
+    """What a loop goes through."""
+
+    start: str
+    stop: str
+    values: Callable[[str], list[Value]]  # of a pass, by its index
+    count: int | None = None  # passes, if the export knows them
+    step: int = 1
+    constants: tuple[Any, ...] = ()  # what it goes through, if the export knows it
+
+
+def is_text(values: tuple[Any, ...]) -> bool:
+    """Return whether constants are something else than numbers."""
+    return not all(isinstance(one, (int, float)) for one in values)
+
+
+class Lists(Expressions):
+    """Lowering of lists and loops."""
+
+    def lower_list(self, node: ast.expr) -> Value:
+        return self.array(node, None)
+
+    lower_listcomp = lower_list
+    lower_tuple = lower_list
+
+    def is_display(self, node: ast.expr) -> bool:
+        """Return whether an expression makes a new list."""
+        called = getattr(node.func, "id", "") if isinstance(node, ast.Call) else ""
+        is_product = isinstance(node, ast.BinOp) and isinstance(node.left, ast.List)
+        return isinstance(node, (ast.List, ast.Tuple, ast.ListComp)) or is_product or called == "list"
+
+    def array(self, node: ast.expr, target: Value | None, named: str = "") -> Value:
+        """Lower a list into an array, a new local one unless there is a target."""
+        if target is not None and target.type.length is None:
+            self._fill(target.text, node, target.type)
+            return target
+        name, known, failures = named or self.fresh("list"), self.function.reads, self.failures
+        self.function.reads = frozenset()
+        with self.captured() as lines:
+            found = self._fill(name, node, target and target.type)
+        reads, self.function.reads = self.function.reads, self.function.reads | known
+        if target is not None and target.type.length != found.length:
+            raise self.refuse(node, f"{found.length} elements", f"a list of {target.type.length}")
+        if target is not None and self.failures == failures and not target.reads & reads:
+            # Nothing reads the old list, or leaves a new one half done.
+            self.emit(*(re.sub(rf"\b{name}\b", target.text, line) for line in lines))
+            self.function.taken.discard(name)
+            return target
+        self.emit(f"{self.program.declaration(found, name)};", *lines)
+        made = Value(name, found, reads=frozenset({("local", name)}))
+        if target is not None:
+            self.copy(target, made, node)
+        return made
+
+    def copy(self, target: Value, source: Value, node: ast.AST) -> None:
+        """Copy a list into another one."""
+        length = source.type.length
+        if length is None or target.type.length != length:
+            raise self.refuse(
+                node, f"{length or 'any number of'} elements", f"a list of {target.type.length}"
+            )
+        with self._each(str(length)) as index:
+            left, right = (Value(f"{one.text}[{index}]", one.type.of) for one in (target, source))
+            if left.type.kind == "list":
+                self.copy(left, right, node)
+            else:
+                self.emit(f"{left.text} = {self.program.stored(left.type, right)};")
+
+    @contextmanager
+    def _each(self, stop: str) -> Iterator[str]:
+        """Emit a loop about what is emitted in the context, and give its index."""
+        index = self.fresh("i")
+        self.emit(f"for (int64_t {index} = 0; {index} < {stop}; {index}++) {{")
+        with self.captured() as lines:
+            self.facts = {}
+            yield index
+        self.emit(*lines, "}")
+        self.function.taken.discard(index)
+
+    def _fill(self, target: str, node: ast.expr, wanted: Type | None) -> Type:
+        """Fill the array `target` with the elements of a list; return its type."""
+        if isinstance(node, (ast.List, ast.Tuple)):
+            element, length = wanted and wanted.of, 0
+            for one in node.elts:
+                if isinstance(one, ast.Starred):
+                    part = self.expression(one.value)
+                    self.copy(Value(f"({target} + {length})", part.type), part, one)
+                    element, length = part.type.of, length + (part.type.length or 0)
+                else:
+                    element, length = self._put(f"{target}[{length}]", one, element), length + 1
+            return Type("list", element or FLOAT, length)
+        if isinstance(node, ast.ListComp):
+            return self._comprehension(target, node, wanted)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "list" and len(node.args) == 1:
+            return self._fill(target, node.args[0], wanted)
+        if isinstance(node, ast.BinOp) and isinstance(node.left, ast.List) and len(node.left.elts) == 1:
+            count = self.number(node.right)
+            stop = count.text if count.constant is not None else self.program.length_of(self, target, node)
+            with self._each(stop) as index:
+                element = self._put(f"{target}[{index}]", node.left.elts[0], wanted and wanted.of)
+            return Type("list", element, count.constant)
+        value = self.expression(node)
+        if value.type.kind != "list":
+            raise self.refuse(node, f"a {value.type.kind}", "a list")
+        self.copy(Value(target, value.type), value, node)
+        return value.type
+
+    def _put(self, target: str, node: ast.expr, wanted: Type | None) -> Type:
+        """Fill one element; return its type."""
+        if self.is_display(node) or (wanted is not None and wanted.kind == "list"):
+            return self._fill(target, node, wanted)
+        value = self.expression(node)
+        element = wanted or value.type._replace(sign="", is_index=False, c_int="int64_t")
+        self.emit(f"{target} = {self.program.stored(element, value)};")
+        self.check(value)
+        return element
+
+    def _comprehension(self, target: str, node: ast.ListComp, wanted: Type | None) -> Type:
+        one, loop = node.generators[0], self.loop(node.generators[0].iter)
+        if len(node.generators) > 1 or one.ifs or loop.count is None:
+            raise self.refuse(node, "this comprehension", "one `for` of known length without `if`")
+        element, hidden = wanted and wanted.of, dict(self.names)
+        if is_text(loop.constants):
+            for place, value in enumerate(loop.constants):
+                self.names[getattr(one.target, "id", "")] = self.program.known(value)
+                element = self._put(f"{target}[{place}]", node.elt, element)
+        else:
+            with self._each(str(loop.count)) as index:
+                values = loop.values(index if loop.start == "0" else f"{index} + {loop.start}")
+                self.names |= dict(zip(self.targets(one.target, len(values)), values, strict=True))
+                element = self._put(f"{target}[{index}]", node.elt, element)
+        self.names = hidden
+        return Type("list", element or FLOAT, loop.count)
+
+    def targets(self, node: ast.expr, count: int) -> list[str]:
+        """Return the names that a loop binds."""
+        targets = node.elts if isinstance(node, ast.Tuple) else [node]
+        if len(targets) != count or not all(isinstance(one, ast.Name) for one in targets):
+            raise self.refuse(node, "this target", f"{count} names")
+        return [one.id for one in targets if isinstance(one, ast.Name)]
+
+    def loop(self, node: ast.expr) -> Loop:
+        """Return what `for ... in` goes through."""
+        called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
+        if called == "range" and isinstance(node, ast.Call):
+            return self._range(node)
+        if called in ("zip", "enumerate") and isinstance(node, ast.Call):
+            loops = [self.loop(one) for one in node.args]
+            counts = {one.count for one in loops}
+            strict = any(one.arg == "strict" and getattr(one.value, "value", 0) for one in node.keywords)
+            if None in counts or (strict and len(counts) > 1):
+                raise self.refuse(
+                    node, f"{called} of lists of {counts} elements", "lists of one fixed length"
+                )
+            count = min(one for one in counts if one is not None)
+            parts = [one.values for one in loops]
+            if called == "enumerate":
+                parts.insert(0, lambda index: [Value(index, INT, sign=">= 0", span=(0, count - 1))])
+            return Loop("0", str(count), lambda i: [value for part in parts for value in part(i)], count)
+        if isinstance(node, ast.Tuple) and all(isinstance(one, ast.Constant) for one in node.elts):
+            value = Value("", TEXT, constant=ast.literal_eval(node))
+        else:
+            value = self.expression(node)
+        constants = value.constant if isinstance(value.constant, tuple) else ()
+        if is_text(constants):
+            return Loop("0", "", lambda index: [], len(constants), constants=constants)
+        if value.type.kind != "list":
+            raise self.refuse(node, f"a loop through a {value.type.kind}", "a list, range, zip or enumerate")
+        count = value.type.length
+        return Loop(
+            "0", str(count or value.length), lambda i: [self.at(value, i)], count, constants=constants
+        )
+
+    def _range(self, node: ast.Call) -> Loop:
+        bounds = self.operands(node.args, self.number)
+        start = bounds[0] if len(bounds) > 1 else self.program.known(0)
+        stop, step = bounds[min(1, len(bounds) - 1)], bounds[2].constant if len(bounds) > 2 else 1
+        if step not in (1, -1) or any(one.type.kind != "int" for one in bounds):
+            raise self.refuse(node, "this range", "a range of ints with the step 1 or -1")
+        span, count = None, None
+        if start.span and stop.span:
+            span = (start.span[0], stop.span[1] - 1) if step == 1 else (stop.span[0] + 1, start.span[1])
+        if start.constant is not None and stop.constant is not None:
+            count = max(0, (stop.constant - start.constant) * step)
+        is_up = step == 1 and start.sign in ("> 0", ">= 0")
+        sign = ">= 0" if is_up or (span and span[0] >= 0) else ""
+
+        def values(index: str) -> list[Value]:
+            return [Value(index, INT, SUM if " " in index else ATOM, sign=sign, span=span, below=stop.text)]
+
+        return Loop(start.text, stop.text, values, count, step)
+
+    def at(self, value: Value, index: str) -> Value:
+        """Return the element of a list at an index that is in it."""
+        of, known = value.type.of, value.constant
+        span = (min(known), max(known)) if isinstance(known, tuple) and of.kind == "int" else None
+        sign = ">= 0" if span and span[0] >= 0 else of.sign
+        return Value(f"{value.text}[{index}]", of, reads=value.reads, sign=sign, span=span)
+
+    def lower_subscript(self, node: ast.Subscript) -> Value:
+        value = self.expression(node.value)
+        if value.type.kind == "struct":
+            return self._field(node, value)
+        if value.type.kind == "list" and isinstance(node.slice, ast.Slice):
+            return self._slice(node, value, node.slice)
+        index = self.number(node.slice)
+        if isinstance(value.constant, tuple) and index.constant is not None:
+            return self.program.known(value.constant[index.constant])
+        if value.type.kind != "list" or index.type.kind != "int":
+            raise self.refuse(node, f"[...] of a {value.type.kind}", "an int index into a list")
+        return self.at(value, self._index(node, value, index))
+
+    def _index(self, node: ast.AST, value: Value, index: Value) -> str:
+        """Return the C text of an index; test it where it may be outside the list."""
+        size, is_above = value.type.length, implies(index.sign, ">= 0") and index.sign != ""
+        length = str(size or value.length)
+        if index.constant is not None and size and -size <= index.constant < size:
+            return str(index.constant % size) if index.constant < 0 else index.text
+        is_inside = index.span and size and index.span[0] >= 0 and index.span[1] < size
+        if is_inside or (is_above and (index.below == length or index.type.is_index)):
+            return index.text
+        trusted, index = index.type.is_index, self.simple(index, "index")
+        if not trusted:
+            low = "" if is_above else f"{index.text} < -{length} || "
+            self.fail_if(f"{low}{index.text} >= {length}", node, "an index that may be outside its list")
+            if is_above and size:
+                self.facts[index.text] = Fact(index.sign, index.reads, (0, size - 1))
+        return index.text if is_above else f"{index.text} < 0 ? {index.text} + {length} : {index.text}"
+
+    def _field(self, node: ast.Subscript, value: Value) -> Value:
+        texts = {name: one.constant for name, one in self.names.items() if one.type.kind == "text"}
+        try:
+            code = compile(ast.Expression(node.slice), self.function.file, "eval")
+            key = eval(code, {"__builtins__": {}}, texts)
+            sign = self.program.struct_signs[value.type.of][key]
+        except Exception:
+            raise self.refuse(node, f"{ast.unparse(node)}", "a gain or limit by its own name") from None
+        return Value(f"{value.text}->{key}", FLOAT, sign=sign)
+
+    def _slice(self, node: ast.Subscript, value: Value, part: ast.Slice) -> Value:
+        length, ends = value.type.length, (part.lower, part.upper)
+        bounds = [None if one is None else self.number(one).constant for one in ends]
+        is_known = all(end is None or bound is not None for end, bound in zip(ends, bounds, strict=True))
+        if length is None or part.step is not None or not is_known:
+            raise self.refuse(node, "this slice", "constant bounds, of a list of fixed length")
+        start, stop, _ = slice(*bounds).indices(length)
+        text = value.text if start == 0 else f"({value.text} + {start})"
+        return value._replace(text=text, type=value.type._replace(length=stop - start), constant=None)

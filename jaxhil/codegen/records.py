@@ -1,0 +1,196 @@
+"""Classes as structs: names, attributes and their types, lists of run-time length."""
+
+import ast
+import inspect
+import re
+import typing
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from .printing import comment, indented
+from .source import definition_of
+from .subset import FLOAT, INT, RESERVED, SubsetError, Type, Value, type_of_hint
+
+if TYPE_CHECKING:
+    from .core import Core
+
+
+class Records:
+    """Structs of a program."""
+
+    known: Callable[[Any], Value]
+
+    def __init__(self, prefix: str, names: Mapping[type, str], bindings: Mapping[type, type]) -> None:
+        self.prefix, self.names, self.bindings = prefix, names, bindings
+        self.fields: dict[type, dict[str, Type]] = {}
+        self.samples: dict[type, list[str]] = {}  # lists of run-time length
+        self.owned: dict[
+            type, dict[str, str]
+        ] = {}  # samples that a class keeps for its parts, and their keys
+        self.changed_in_place: frozenset[Any] = frozenset()
+        self.shared: list[tuple[frozenset[Any], SubsetError]] = []  # lists that two attributes share
+        self.enumerators: Mapping[str, int] = {}
+
+    def class_name(self, class_: type) -> str:
+        """Return the name of a class in C."""
+        snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", class_.__name__).lower()
+        return self.prefix + self.names.get(class_, snake)
+
+    def c_type(self, type_: Type) -> str:
+        """Return the C type of a number or a struct."""
+        simple = {"float": "double", "int": type_.c_int, "bool": "bool", "none": "void", "list": "void"}
+        if type_.kind == "struct":
+            return f"{self.prefix}{type_.of}"
+        return simple[type_.kind] if type_.kind in simple else self.class_name(type_.of)
+
+    def declaration(self, type_: Type, name: str) -> str:
+        """Return the declaration of a name, without the semicolon."""
+        while type_.kind == "list":
+            name, type_ = f"{name}[{type_.length}]", type_.of
+        return f"{self.c_type(type_)} {name}"
+
+    def local(self, name: str) -> str:
+        """Return a local name in C."""
+        return f"{name}_" if name in RESERVED else name
+
+    def class_of(self, function: Any, node: ast.expr) -> type | None:
+        """Return the class that a call constructs in place, None if it constructs none."""
+        called = node.func if isinstance(node, ast.Call) else None
+        found = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
+        is_own = inspect.isclass(found) and not issubclass(found, tuple) and found.__module__ != "builtins"
+        return found if is_own else None
+
+    def field(self, body: "Core", value: Value, name: str, node: ast.AST) -> Value:
+        """Return an attribute of an object."""
+        class_, plain = value.type.of, name.lstrip("_")
+        keys = frozenset({(class_, name)})
+        body.function.reads |= keys
+        if name in self.samples.get(class_, ()):
+            text = value.samples[self.samples[class_].index(name)]
+            return Value(text, Type("list", FLOAT), reads=keys, length=self._access(value, f"{plain}_length"))
+        type_ = self.fields.get(class_, {}).get(name)
+        if type_ is None and (constant := self._class_constant(class_, name)) is not None:
+            return constant
+        type_ = type_ or self.field_type(body, value.type, name, node)
+        parts = self.samples_in(type_.of) if type_.kind == "object" else ()
+        samples = tuple(self._access(value, f"{plain}_{one}") for one in parts)
+        text = self._access(value, self._field_name(class_, name))
+        return Value(text, type_, reads=value.reads | keys, sign=type_.sign, samples=samples)
+
+    def _access(self, value: Value, name: str) -> str:
+        return f"{value.text}->{name}" if value.is_pointer else f"{value.text}.{name}"
+
+    def _field_name(self, class_: type, name: str) -> str:
+        plain = name.lstrip("_")
+        others = {*self.fields.get(class_, {}), *getattr(class_, "__slots__", ())}
+        return self.local(plain if plain == name or plain not in others else f"{plain}_")
+
+    def _class_constant(self, class_: type, name: str) -> Value | None:
+        """Return an attribute that only the class has."""
+        static = inspect.getattr_static(class_, name, None)
+        if not isinstance(static, (bool, int, float)):
+            return None
+        owners = [one for one in class_.__mro__ if one.__module__ not in ("builtins", "typing")]
+        methods = [one for owner in owners for one in vars(owner).values() if inspect.isfunction(one)]
+        nodes = (node for one in methods for node in ast.walk(definition_of(one)[0]))
+        if any(
+            isinstance(one, ast.Attribute) and one.attr == name and isinstance(one.ctx, ast.Store)
+            for one in nodes
+        ):
+            return None
+        try:
+            source = inspect.getsource(next(one for one in owners if name in vars(one)))
+        except (OSError, TypeError):
+            source = ""
+        named = re.search(rf"^    {name}\b.*= ([A-Z_]+)$", source, re.MULTILINE)
+        if named and self.enumerators.get(named[1]) == static:
+            return Value(f"{self.prefix}{named[1]}".upper(), INT, constant=static)
+        return self.known(static)
+
+    def field_type(self, body: "Core", type_: Type, name: str, node: ast.AST) -> Type:
+        """Return the annotated type of an attribute. Raise SubsetError if there is none."""
+        found = type_of_hint(self._hints(type_.of).get(name, ...), self.bindings)
+        if found is None:
+            what = f"{name} of {type_.of.__name__}, whose type is not known here"
+            raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
+        return self.fields.setdefault(type_.of, {}).setdefault(name, found)
+
+    def _hints(self, class_: type) -> dict[str, Any]:
+        return typing.get_type_hints(class_, include_extras=True)
+
+    def known_field(self, body: "Core", owner: Value, target: ast.Attribute) -> Value | None:
+        """Return an attribute whose type is known already."""
+        class_, name = owner.type.of, target.attr
+        if owner.type.kind != "object":
+            raise body.refuse(target, f"an attribute of a {owner.type.kind}", "an object")
+        known = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *self._hints(class_)}
+        return self.field(body, owner, name, target) if name in known else None
+
+    def new_field(self, body: "Core", owner: Value, target: ast.Attribute, type_: Type) -> Value:
+        """Return an attribute, which has this type if no annotation says more."""
+        known = self.known_field(body, owner, target)
+        if known is not None:
+            return known
+        plain = type_._replace(sign="", is_index=False, c_int="int64_t")
+        self.fields.setdefault(owner.type.of, {})[target.attr] = plain
+        return self.field(body, owner, target.attr, target)
+
+    def new_samples(self, body: "Core", owner: Value, target: ast.Attribute, count: Value) -> None:
+        """Take note of a list whose length only run time knows; test that it fits."""
+        class_, name, plain = owner.type.of, target.attr, target.attr.lstrip("_")
+        if body.function.node.name != "__init__" or owner.text != "self":
+            raise body.refuse(target, "a list of a computed length", "one in `__init__`, or of fixed length")
+        if name not in self.samples.setdefault(class_, []):
+            self.samples[class_].append(name)
+            self.fields.setdefault(class_, {})[f"{plain}_length"] = INT
+        body.names["self"] = body.names["self"]._replace(samples=self.samples_in(class_))
+        condition = f"{count.text} < 0 || {count.text} > {plain}_capacity"
+        body.fail_if(condition, target, "a list longer than its capacity")
+        body.emit(f"self->{plain}_length = {count.text};")
+
+    def length_of(self, body: "Core", target: str, node: ast.AST) -> str:
+        """Return the C text of the length of a list that `new_samples` knows."""
+        if body.function.owner is None or target not in self.samples_in(body.function.owner):
+            raise body.refuse(node, "a list of a computed length", "a constant length")
+        return f"self->{target}_length"
+
+    def samples_in(self, class_: Any) -> tuple[str, ...]:
+        """Return the parameters for the lists of run-time length of a class."""
+        return tuple(name.lstrip("_") for name in self.samples.get(class_, ()))
+
+    def capacities(self, body: "Core", class_: type, target: Value, node: ast.Call) -> list[str]:
+        """Return a constructor's arguments for its lists: the array that the owner keeps, its capacity."""
+        first, key, found = node.args[0] if node.args else None, target.type.key, []
+        if isinstance(first, ast.Subscript) and isinstance(first.slice, ast.Constant) and not key:
+            key = str(first.slice.value)
+        for name in self.samples_in(class_):
+            if not key or body.function.owner is None or not target.text.startswith("self->"):
+                raise body.refuse(
+                    node, "a line of unknown length", "`Annotated[DelayLine, 'name of the gain']`"
+                )
+            kept = f"{target.text}_{name}"
+            self.owned.setdefault(body.function.owner, {})[kept.removeprefix("self->")] = key
+            found += [kept, f"{self.prefix}{key}_samples".upper()]
+        return found
+
+    def structs(self, owners: list[type]) -> str:
+        """Return the structs of all classes, each after those that it contains."""
+        texts: dict[type, str] = {}
+
+        def visit(class_: type) -> None:
+            lines, name = [], self.class_name(class_)
+            for field, type_ in self.fields.get(class_, {}).items():
+                if type_.kind in ("object", "record") and type_.of not in texts:
+                    visit(type_.of)
+                if type_.kind != "text":
+                    lines.append(f"{self.declaration(type_, self._field_name(class_, field))};")
+            for field, key in self.owned.get(class_, {}).items():
+                lines.append(f"double {field}[{self.prefix.upper()}{key.upper()}_SAMPLES];")
+            lines = lines or ["char nothing; /* C has no empty structs */"]
+            text = indented([f"typedef struct {name} {{", *lines, f"}} {name};"])
+            texts[class_] = f"\n{comment(inspect.getdoc(class_))}{text}"
+
+        for class_ in dict.fromkeys([*self.fields, *owners]):
+            if class_ not in texts:
+                visit(class_)
+        return "".join(texts.values())

@@ -1,0 +1,369 @@
+"""Statements: assignments, branches, loops, exceptions."""
+
+import ast
+from typing import TYPE_CHECKING
+
+from .calls import Calls
+from .core import Fact
+from .lists import is_text
+from .subset import ATOM, FLOAT, INT, TEXT, UNARY, Keys, Type, Value, implies
+
+if TYPE_CHECKING:
+    from .program import Function, Program
+
+
+class Body(Calls):
+    """Lowering of the statements of one function."""
+
+    def __init__(self, program: "Program", function: "Function") -> None:
+        super().__init__(program, function)
+        self.span = (0, 0)  # lines of the block
+        self.hoisted: list[str] = []  # declarations at the function's top
+        for name, type_ in function.parameters.items():
+            text, is_list = program.local(name), type_.kind == "list"
+            reads: Keys = frozenset({("parameter", name)}) if is_list else frozenset()
+            value = Value(text, type_, reads=reads, sign=type_.sign, is_pointer=type_.kind == "object")
+            if type_.kind == "optional":
+                value = value._replace(text=f"*{text}", type=FLOAT, rank=UNARY, length="optional")
+            self.names[name] = value
+        self.names |= dict.fromkeys(function.texts, Value("", TEXT))
+        if function.owner is not None:
+            owner, samples = Type("object", function.owner), program.samples_in(function.owner)
+            self.names["self"] = Value("self", owner, is_pointer=True, samples=samples)
+
+    def run(self) -> list[str]:
+        """Lower the whole function."""
+        self.block(self.function.node.body)
+        lines = self.lines[:-1] if self.lines[-1:] == ["return;"] else self.lines
+        return [*self.hoisted, *lines]
+
+    def block(self, body: list[ast.stmt]) -> bool:
+        """Lower the statements of a block; return whether its end is never reached."""
+        leaves, outer = False, self.span
+        self.span = (body[0].lineno, body[-1].end_lineno or 0) if body else outer
+        for statement in body:
+            is_constant = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+            if not is_constant and not isinstance(statement, ast.Pass):
+                self.explain(statement)
+                lower = getattr(self, f"do_{type(statement).__name__.lower()}", None)
+                if lower is None:
+                    raise self.refuse(
+                        statement, type(statement).__name__, "assignments, if, for, while, return"
+                    )
+                leaves = bool(lower(statement)) or leaves
+        self.span = outer
+        return leaves
+
+    def do_assign(self, node: ast.Assign) -> None:
+        is_simple = isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
+        if len(node.targets) > 1 and not is_simple:
+            raise self.refuse(node, "several targets of an expression", "one assignment each")
+        for target in reversed(node.targets):
+            if isinstance(target, ast.Tuple):
+                self._unpack(node, target)
+            else:
+                self._assign(node, target, node.value)
+
+    def do_annassign(self, node: ast.AnnAssign) -> None:
+        wanted = self.program.local_type(self.function, node.annotation)
+        if node.value is None or wanted is None:
+            raise self.refuse(node, "this type or no value", "a float, int, bool or class, and a value")
+        self._assign(node, node.target, node.value, wanted)
+
+    def do_augassign(self, node: ast.AugAssign) -> None:
+        value = ast.copy_location(ast.BinOp(node.target, node.op, node.value), node)
+        self._store(node, node.target, self.number(value))
+
+    def _unpack(self, node: ast.Assign, target: ast.Tuple) -> None:
+        if isinstance(node.value, ast.Tuple):
+            values = [self.expression(one) for one in node.value.elts]
+            stored = {getattr(one, "id", getattr(one, "attr", "")) for one in target.elts}
+            used = {getattr(one, "id", getattr(one, "attr", "")) for one in ast.walk(node.value)}
+            if stored & used or any(one.writes for one in values):
+                values = [self.temporary(one, "value") if one.is_number else one for one in values]
+        else:
+            value = self.expression(node.value)
+            if value.type.kind != "list" or value.type.length is None:
+                raise self.refuse(node, f"names for a {value.type.kind}", "a list of fixed length")
+            values = [self.at(value, str(index)) for index in range(value.type.length)]
+        if len(values) != len(target.elts):
+            raise self.refuse(node, f"{len(target.elts)} targets for {len(values)} values", "as many")
+        for one, value in zip(target.elts, values, strict=True):
+            if value.type.kind in ("object", "list") and isinstance(one, ast.Name):
+                self._alias(node, one, value)
+            else:
+                self._store(node, one, value)
+
+    def _assign(self, node: ast.stmt, target: ast.expr, source: ast.expr, wanted: Type | None = None) -> None:
+        class_ = self.program.class_of(self.function, source)
+        if isinstance(target, ast.Attribute) and isinstance(source, ast.Call) and class_ is not None:
+            owner = self.expression(target.value)
+            field = self.program.new_field(self, owner, target, Type("object", class_))
+            self.construct(field, class_, source)
+        elif self.is_display(source):
+            self._assign_list(node, target, source)
+        else:
+            value = self.expression(source)
+            if value.type.kind in ("object", "list") and isinstance(target, ast.Name):
+                self._alias(node, target, value)
+            elif value.type.kind != "text":
+                self._store(node, target, value, wanted)
+
+    def _alias(self, node: ast.stmt, target: ast.Name, value: Value) -> None:
+        """Let a local name stand for an object or a list."""
+        places = self.function.places[target.id]
+        is_local = all(self.span[0] <= line <= self.span[1] for line, _ in places)
+        if target.id in self.names or sum(is_store for _, is_store in places) > 1 or not is_local:
+            raise self.refuse(
+                node, f"{target.id} assigned twice", "one name for each list or object, in a block"
+            )
+        name, type_ = self.program.local(target.id), value.type
+        is_own = type_.kind == "list" and any(key[0] == "local" for key in value.reads)
+        if not is_own and not (type_.kind == "list" and type_.of.kind == "list"):
+            text = value.text if type_.kind == "list" else self.pointer(value)
+            if text != name:
+                base = self.program.c_type(type_.of if type_.kind == "list" else type_)
+                self.emit(f"@const@{base} *const {name} = {text};")
+            value = value._replace(text=name, is_pointer=True, rank=ATOM)
+        self.names[target.id] = value
+
+    def _assign_list(self, node: ast.stmt, target: ast.expr, source: ast.expr) -> None:
+        if isinstance(target, ast.Name):
+            self._alias(node, target, self.array(source, None, self.program.local(target.id)))
+            return
+        field = None if isinstance(target, ast.Attribute) else self.expression(target)
+        if isinstance(target, ast.Attribute):
+            owner = self.expression(target.value)
+            if isinstance(source, ast.BinOp) and (count := self.number(source.right)).constant is None:
+                self.program.new_samples(self, owner, target, count)
+                owner = self.expression(target.value)
+            field = self.program.known_field(self, owner, target)
+            if field is None:
+                with self.captured():
+                    found = self.array(source, None).type
+                field = self.program.new_field(self, owner, target, found)
+        if field is None or field.type.kind != "list":
+            raise self.refuse(node, "a list for an element", "a number")
+        self.array(source, field)
+        self.changed(field, isinstance(target, ast.Subscript))
+
+    def _store(self, node: ast.stmt, target: ast.expr, value: Value, wanted: Type | None = None) -> None:
+        """Assign a value to a name, an attribute or an element."""
+        if isinstance(target, ast.Name):
+            self._store_name(node, target.id, value, wanted)
+            return
+        if value.fails:
+            value = self.temporary(value, self.hint_of(target))
+        if isinstance(target, ast.Attribute):
+            owner = self.expression(target.value)
+            known = self.program.known_field(self, owner, target)
+            field = known or self.program.new_field(self, owner, target, value.type)
+        elif isinstance(target, ast.Subscript):
+            field = self.expression(target)
+        else:
+            raise self.refuse(node, "this target", "a name, an attribute or an element")
+        if field.type.kind == "list":
+            self.copy(field, value, node)
+            self.share(node, field.reads, value)
+        elif field.type.kind != "text":
+            self._emit_store(node, field, value)
+        self.changed(field, isinstance(target, ast.Subscript))
+        if value.sign:
+            self.facts[field.text] = Fact(value.sign, field.reads)
+
+    def _emit_store(self, node: ast.stmt, field: Value, value: Value) -> None:
+        wanted, found = field.type, value.type
+        if (wanted.kind, wanted.of) != (found.kind, found.of) and not (
+            wanted.kind == "float" and value.is_number
+        ):
+            raise self.refuse(node, f"a {found.kind} for a {wanted.kind}", "one type for each name")
+        if wanted.sign and not (value.sign and implies(value.sign, wanted.sign)):
+            raise self.refuse(node, "a number of unknown sign", f"one that is {wanted.sign}")
+        text = self.program.stored(wanted, value)
+        if text[: len(field.text) + 1] == f"{field.text} " and text[len(field.text) + 1 :][1:2] == " ":
+            rest = text[len(field.text) + 1 :]
+            if rest[0] in "+-*/&|^" and isinstance(node, ast.AugAssign):
+                self.emit(f"{field.text} {rest[0]}= {rest[2:]};")
+                return
+        if text != field.text:
+            self.emit(f"{field.text} = {text};")
+
+    def _store_name(self, node: ast.stmt, name: str, value: Value, wanted: Type | None) -> None:
+        text, known = self.program.local(name), self.names.get(name)
+        if known is None:
+            places = self.function.places[name]
+            type_ = wanted or value.type._replace(c_int="int64_t", sign="")
+            declared = f"{self.program.c_type(type_)} {text}"
+            is_once = sum(is_store for _, is_store in places) == 1
+            is_here = places[0][0] >= node.lineno and all(
+                self.span[0] <= line <= self.span[1] for line, _ in places
+            )
+            zero = {"float": " = 0.0", "int": " = 0", "bool": " = false"}.get(type_.kind, "")
+            if is_here:
+                head = "const " if is_once else ""
+                self.emit(f"{head}{declared} = {self.program.stored(type_, value)};")
+            else:
+                self.hoisted.append(f"{declared}{zero};")
+                self.emit(f"{text} = {self.program.stored(type_, value)};")
+            self.names[name] = Value(text, type_, sign=type_.sign, span=value.span if is_once else None)
+        else:
+            self._emit_store(node, known._replace(text=text), value)
+        self.check(value)
+        self.facts.pop(text, None)
+        if value.sign:
+            self.facts[text] = Fact(value.sign)
+
+    def changed(self, field: Value, in_place: bool) -> None:
+        """Take note of an assignment to an attribute or an element."""
+        self.note(field.reads)
+        self.function.changes |= {name for kind, name in field.reads if kind == "parameter"}
+        if in_place:
+            self.program.changed_in_place |= field.reads
+            for key in field.reads & self.function.shared.keys():
+                raise self.function.shared[key]
+
+    def share(self, node: ast.AST, target: Keys, value: Value) -> None:
+        """Take note of a list that an attribute shares with another name: none may change it in place."""
+        error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
+        for key in value.reads:
+            if key[0] == "parameter":
+                self.function.keeps[key[1]] = target
+            elif key[0] == "local":
+                self.function.shared[key] = error
+            else:
+                self.program.shared.append((target | value.reads, error))
+
+    def do_expr(self, node: ast.Expr) -> None:
+        value = self.expression(node.value)
+        if not isinstance(node.value, ast.Call):
+            raise self.refuse(node, "an expression without effect", "a call")
+        if value.type.kind != "list":
+            self.emit(f"{value.text};" if value.type.kind == "none" else f"(void){value.text};")
+            self.check(value)
+
+    def do_return(self, node: ast.Return) -> bool:
+        returns = self.function.returns
+        if node.value is None or returns.kind == "none":
+            self.emit("return;")
+        elif returns.kind == "list":
+            self.array(node.value, Value("result", returns))
+            self.emit("return;")
+        else:
+            self._return(node, self.expression(node.value))
+        return True
+
+    def _return(self, node: ast.stmt, value: Value) -> None:
+        self.emit(f"return {self.program.stored(self.function.returns, value)};")
+        returns = self.function.returns
+        if (returns.kind, returns.of) != (value.type.kind, value.type.of) and not (
+            returns.kind == "float" and value.is_number
+        ):
+            raise self.refuse(node, f"a {value.type.kind} returned", f"a {returns.kind}")
+        if returns.sign and not (value.sign and implies(value.sign, returns.sign)):
+            raise self.refuse(node, "a number of unknown sign", f"one that is {returns.sign}")
+
+    def do_raise(self, node: ast.Raise) -> bool:
+        self.fail(node, "a raise")
+        return True
+
+    def do_if(self, node: ast.If) -> bool:
+        test = self.truth(node.test)
+        if test.constant is not None:
+            return self.block(node.body if test.constant else node.orelse)
+        self.emit(f"if ({test.text}) {{")
+        before, outcomes = self.facts, []
+        for body, truth in ((node.body, True), (node.orelse, False)):
+            self.facts = before | self.facts_of(node.test, truth)
+            outer, self.lines = self.lines, []
+            leaves = self.block(body)
+            inner, self.lines = self.lines, outer
+            if (
+                not truth
+                and inner
+                and inner[0].startswith("if (")
+                and isinstance(body[0], ast.If)
+                and len(body) == 1
+            ):
+                self.emit(f"}} else {inner[0]}", *inner[1:-1])
+            else:
+                self.emit(*["} else {"] * bool(inner and not truth), *inner)
+            outcomes.append((leaves, self.facts))
+        self.emit("}")
+        (first, left), (second, right) = outcomes
+        self.facts = right if first else left if second else dict(left.items() & right.items())
+        return first and second
+
+    def do_for(self, node: ast.For) -> None:
+        loop = self.loop(node.iter)
+        if node.orelse or not loop.stop or is_text(loop.constants):
+            raise self.refuse(node, "a loop through text, or with else", "a loop through numbers, and a flag")
+        names = self.targets(node.target, len(loop.values("")))
+        is_range = loop.values("i")[0].text == "i" and len(names) == 1 and names[0] != "_"
+        index = self.program.local(names[0]) if is_range else self.fresh("i")
+        stop = loop.stop
+        if loop.count is None and not stop.replace("->", "").isidentifier():
+            stop = self.temporary(Value(stop, INT), "stop").text
+        test, step = ("<", "++") if loop.step == 1 else (">", "--")
+        self.emit(f"for (int64_t {index} = {loop.start}; {index} {test} {stop}; {index}{step}) {{")
+        hidden, self.facts = dict(self.names), {}
+        for name, value in zip(names, loop.values(index), strict=True):
+            if value.text != index and name != "_" and value.type.kind != "list":
+                text = self.program.local(name)
+                constant = "" if name in self.function.places else "const "
+                self.emit(f"{constant}{self.program.c_type(value.type)} {text} = {value.text};")
+                value = value._replace(text=text, reads=frozenset(), rank=ATOM)
+            self.names[name] = value
+        self.block(node.body)
+        self.emit("}")
+        self.names = {k: one for k, one in self.names.items() if k not in names} | {
+            name: hidden[name] for name in names if name in hidden
+        }
+        self.facts = {}
+
+    def do_while(self, node: ast.While) -> None:
+        self.facts = {}
+        with self.captured() as lines:
+            test = self.truth(node.test)
+        leave = [f"if (!{test.at(UNARY)}) {{", "break;", "}"]
+        self.emit(f"while ({'true' if lines else test.text}) {{", *lines, *leave * bool(lines))
+        self.block(node.body)
+        self.emit("}")
+        self.facts = {}
+
+    def do_break(self, node: ast.Break) -> bool:
+        self.emit("break;")
+        return True
+
+    def do_continue(self, node: ast.Continue) -> bool:
+        self.emit("continue;")
+        return True
+
+    def do_try(self, node: ast.Try) -> bool:
+        """Lower one call whose exceptions are caught."""
+        statement = node.body[0]
+        if len(node.body + node.handlers) != 2 or node.orelse or node.finalbody:
+            raise self.refuse(node, "this try", "one call in it and one `except Exception`")
+        if not isinstance(statement, (ast.Assign, ast.Return)) or not isinstance(statement.value, ast.Call):
+            raise self.refuse(node, "this try", "`name = call(...)` or `return call(...)` in it")
+        function, failures, place = self.function, self.failures, len(self.lines)
+        before = function.error, function.fails, function.reason
+        flag = self.fresh("failed")
+        function.error = f"&{flag}"
+        value = self.expression(statement.value)
+        if self.failures > failures:
+            raise self.refuse(node, "an operation in try that may raise", "one call alone")
+        function.error, function.fails, function.reason = before
+        fails, value = value.fails, value._replace(fails=False)
+        if fails:
+            self.lines.insert(place, f"bool {flag} = false;")
+            if isinstance(statement, ast.Return):
+                value = self.temporary(value, "value")
+        if isinstance(statement, ast.Assign):
+            self._store(statement, statement.targets[0], value)
+        if fails:
+            self.emit(f"if ({flag}) {{")
+            self.block(node.handlers[0].body)
+            self.emit("}")
+        if isinstance(statement, ast.Return):
+            self._return(statement, value)
+        return isinstance(statement, ast.Return)

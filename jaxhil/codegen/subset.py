@@ -1,0 +1,131 @@
+"""Types of the subset of Python, values of expressions, refusals.
+
+A float is a `double`, an int an `int64_t`; a list has a fixed length, or a capacity that its owner states; a
+class is a struct. Text (`str`) is for readers of Python: what has that type does not exist in C. Annotations:
+
+    Annotated[float, ">= 0"]            never below 0, checked wherever it is assigned (also "> 0")
+    Annotated[int, "index"]             trusted as an index: not tested against the length of the list
+    Annotated[int, "uint32_t"]          the type in C
+    Annotated[list[float], 18]          a list of 18 numbers; two lengths for a list of lists
+    Annotated[DelayLine, "lag"]         its samples have the capacity JAXHIL_LAG_SAMPLES
+
+Exceptions of Python become an error flag: a function that may raise tests the operands (divisors, square
+roots, indices, conversions to int) and returns at once. Sums of ints are not tested: counting does not reach
+2^63.
+"""
+
+import types
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, NamedTuple, get_args, get_origin
+
+ATOM, UNARY, PRODUCT, SUM, ORDER, EQUALITY, BITS, AND, OR, CHOICE = 16, 14, 13, 12, 10, 9, 8, 5, 4, 3
+RESERVED = frozenset(
+    "auto bool break case catch char class const continue default delete do double else enum explicit export "
+    "extern false float for friend goto if inline int long mutable namespace new operator private protected "
+    "public register restrict return short signed sizeof static struct switch template this throw true try "
+    "typedef typename union unsigned using virtual void volatile while acos asin atan ceil cos exp fabs "
+    "floor fmod isfinite isinf isnan log pow sin sqrt tan tanh copysign error result".split()
+)
+
+
+class SubsetError(ValueError):
+    """A construct that has no C: one line with file, line, what was found and what to write instead."""
+
+
+class Type(NamedTuple):
+    """Type of a value."""
+
+    kind: str  # float, int, bool, text, none, list, object, record, struct (of gains or limits), optional
+    of: Any = None  # element type of a list, class of an object or record, name of a struct
+    length: int | None = None  # of a list; None if only run time knows it
+    sign: str = ""  # of a number: "> 0", ">= 0", "not 0" (what is not a number has every sign), or unknown
+    c_int: str = "int64_t"  # type of an int in C
+    key: str = ""  # of an object with samples: the gain or limit that sizes them
+    is_index: bool = False  # of an int: trusted as an index
+
+
+FLOAT, INT, BOOL, TEXT, NONE = (Type(kind) for kind in ("float", "int", "bool", "text", "none"))
+Keys = frozenset[tuple[Any, str]]  # attributes, local lists and parameters: owner and name
+
+
+class Value(NamedTuple):
+    """An expression in C."""
+
+    text: str
+    type: Type
+    rank: int = ATOM  # precedence of its operator in C
+    reads: Keys = frozenset()
+    writes: Keys = frozenset()  # what evaluating it changes
+    fails: bool = False  # whether the error flag has to be looked at afterwards
+    sign: str = ""
+    span: tuple[Any, Any] | None = None  # least and largest value, if the export knows them
+    below: str = ""  # C text of the length that a loop's index stays below
+    constant: Any = None  # the value, if the export knows it
+    is_pointer: bool = False  # of an object: the text is a pointer
+    samples: tuple[str, ...] = ()  # of an object: C texts of its lists of run-time length
+    length: str = ""  # of a list of run-time length: C text of it
+
+    def at(self, rank: int) -> str:
+        """Return the text, in parentheses if its operator binds less than `rank`."""
+        return self.text if self.rank >= rank else f"({self.text})"
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a float or an int."""
+        return self.type.kind in ("float", "int")
+
+
+def type_of_hint(hint: Any, bindings: Mapping[Any, Any]) -> Type | None:
+    """Return the type of an annotation, None if it has no meaning in C."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        found = type_of_hint(arguments[0], bindings)
+        return found and _noted(found, arguments[1:])
+    hint = bindings.get(hint, hint) if isinstance(hint, type) else hint
+    simple = {float: FLOAT, int: INT, bool: BOOL, str: TEXT, None: NONE, type(None): NONE}
+    if hint is None or (isinstance(hint, type) and hint in simple):
+        return simple[hint]
+    if origin is tuple and arguments and all(one is float for one in arguments):
+        return Type("list", FLOAT, len(arguments))
+    if origin in (list, Sequence):
+        element = type_of_hint(arguments[0], bindings)
+        return element and Type("list", element)
+    if origin is Mapping:
+        return Type("struct", "gains")
+    if origin is types.UnionType and arguments == (float, type(None)):
+        return Type("optional", FLOAT)
+    if isinstance(hint, type) and hint.__module__ != "builtins":
+        return Type("record" if issubclass(hint, tuple) else "object", hint)
+    return None
+
+
+def _noted(found: Type, notes: Sequence[Any]) -> Type:
+    for place, note in enumerate(notes):
+        if isinstance(note, int):
+            inner = found.of if place + 1 == len(notes) else _noted(found.of, notes[place + 1 :])
+            return found._replace(length=note, of=inner)
+        if note in (">= 0", "> 0"):
+            found = found._replace(sign=note)
+        elif note == "index":
+            found = found._replace(is_index=True)
+        else:
+            name = {"int": "c_int", "object": "key", "struct": "of"}[found.kind]
+            found = found._replace(**{name: note})
+    return found
+
+
+def sign_of(value: Any) -> str:
+    """Return the sign of a constant."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return ""
+    return "> 0" if value > 0 else ">= 0" if value == 0 else "not 0" if value < 0 else ""
+
+
+def implies(sign: str, wanted: str) -> bool:
+    """Return whether a number of one sign has the other one too."""
+    return wanted in ("", sign) or sign == "> 0"
+
+
+def common_sign(signs: Sequence[str]) -> str:
+    """Return the sign that follows from each of these."""
+    return next((s for s in ("> 0", ">= 0", "not 0") if all(one and implies(one, s) for one in signs)), "")

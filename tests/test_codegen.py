@@ -1,0 +1,337 @@
+"""The C99 generator on small programs: the same bits as Python's, or a refusal with file and line."""
+
+import ctypes
+import inspect
+import itertools
+import math
+import struct
+from math import exp, floor, inf, log, nan, sqrt
+from typing import Annotated, NamedTuple
+
+import c99_cases
+import pytest
+
+from jaxhil.codegen import Program, SubsetError
+from jaxhil.runtime.filters import DelayLine
+from jaxhil.runtime.types import Positive
+
+needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
+NUMBERS = (0.0, -0.0, 0.5, 1.0, -1.0, 1.5, -2.5, 2.5, 7.0, -7.3, 1e-320, 1e300, -1e300, inf, -inf, nan)
+FAILED = 12345.0
+WEIGHTS = (0.5, -2.0, 3.0)  # of a reading
+HEADER = "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n"
+STRICT = ("-O2", "-Wconversion", "-Wshadow", "-Wno-unused-function", "-shared", "-fPIC")
+
+
+def divide(a: float, b: float) -> float:
+    return (a - 1.0) / (b - 1.0) + a / 3.0
+
+
+def root(a: float, b: float) -> float:
+    return sqrt(a) + sqrt(a * a + b * b) + (sqrt(b) if b > 0.0 else 0.0)
+
+
+def powers(a: float, b: float) -> float:
+    return exp(a) + log(b) + a**2 + b**a
+
+
+def extremes(a: float, b: float) -> float:
+    return max(a, b, 1.0) - min(b, a) + abs(min(a, 0.5))
+
+
+def whole(a: float, b: float) -> float:
+    return int(a) * 1000.0 + round(b) + floor(a)
+
+
+def product_of_ints(a: float, b: float) -> float:
+    return float(int(a) * int(b))
+
+
+def remainders(a: float, b: float) -> float:
+    return a // b + a % b
+
+
+def remainders_of_ints(a: float, b: float) -> float:
+    first, second = int(a), int(b)
+    return float(first // second + 100 * (first % second))
+
+
+def early_return(a: float, b: float) -> float:
+    """Return from within loops and branches."""
+    total = 0.0
+    for place, weight in enumerate(WEIGHTS):
+        if weight * a > 10.0:
+            return total
+        elif not a <= b:
+            continue
+        total += weight * (a + place)
+    passes = 0
+    while total > 1.0:
+        total = 0.5 * total - b
+        passes += 1
+        if total < -3.0 or passes > 20:
+            break
+    return total
+
+
+def conditions(a: float, b: float) -> float:
+    between = 0.0 <= a < b or (a != b and not b)
+    first = a if between else (b if a == 1.0 else -a)
+    return first / a if between and b / a > 1.0 else first
+
+
+class Pair(NamedTuple):
+    """Two numbers and a count."""
+
+    first: float
+    second: float
+    count: int
+
+
+class Inner:
+    """A sum of numbers and their last values."""
+
+    __slots__ = ("_last", "_sum", "calls")
+
+    def __init__(self, start: float) -> None:
+        self._sum = start
+        self._last = [0.0] * 3
+        self.calls = 0
+
+    def add(self, value: float) -> float:
+        """Add a value."""
+        last = self._last
+        last[self.calls % 3] = value
+        self.calls += 1
+        self._sum += value / last[2] if value > 1.0 else last[1]
+        return self._sum
+
+    def pair(self) -> Pair:
+        return Pair(self._sum, self._last[-1], self.calls)
+
+
+class Outer:
+    """Objects, lists of lists, a line of run-time length."""
+
+    inner: Inner
+    matrix: Annotated[list[list[float]], 3, 2]
+    _line: Annotated[DelayLine, "lag"]
+
+    def __init__(self, scale: float, period: Positive) -> None:
+        self.inner = Inner(scale)
+        self._line = DelayLine(2.5 * period, period)
+        self.matrix = [[scale, 1.0 + scale] for _ in range(3)]
+        self.pair = Pair(0.0, 0.0, 0)
+
+    def step(self, a: float, b: float) -> float:
+        before = self.inner.calls + self.inner.add(a) + self.inner.calls
+        self._turn(b)
+        self.pair = self.inner.pair()
+        rows = [list(row) for row in self.matrix]
+        rows[1][0] = self._line.step(b)
+        sums = [dot(row, self.matrix[0]) for row in rows]
+        return before + self.pair.second + sums[0] * sums[-1] + self.pair.count
+
+    def _turn(self, b: float) -> None:
+        for j, row in enumerate(self.matrix):
+            row[:] = [row[1 - k] * 0.5 + b + j for k in range(2)]
+
+
+def dot(left: list[float], right: list[float]) -> float:
+    total = 0.0
+    for one, other in zip(left, right, strict=True):
+        total += one * other
+    return total
+
+
+def caught(function):
+    """A function that returns `FAILED` where `function` raises."""
+
+    def guarded(a: float, b: float) -> float:
+        try:
+            value = function(a, b)
+        except Exception:
+            value = FAILED
+        return value
+
+    return guarded
+
+
+FUNCTIONS = (
+    divide,
+    root,
+    powers,
+    extremes,
+    whole,
+    product_of_ints,
+    remainders,
+    remainders_of_ints,
+    early_return,
+    conditions,
+)
+OF_INTS = (whole, product_of_ints, remainders_of_ints)
+
+
+def compiled(tmp_path, program: Program, more: str = "") -> ctypes.CDLL:
+    """The program as a shared library, compiled as strictly as the controller."""
+    output = program.output()
+    text = f"{HEADER}#define T_LAG_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
+    (tmp_path / "program.c").write_text(text)
+    return ctypes.CDLL(str(c99_cases.compiled(tmp_path, "program.c", "program.so", *STRICT)))
+
+
+def same(found: float, expected: float) -> bool:
+    return struct.pack("d", found) == struct.pack("d", expected) or (found != found and expected != expected)
+
+
+@needs_compiler
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda one: one.__name__)
+def test_function_gives_the_same_bits_or_fails_where_python_raises(function, tmp_path):
+    guarded = caught(function)
+    program = Program("t_", public={guarded: "t_guarded"})
+    program.add(guarded)
+    in_c = compiled(tmp_path, program).t_guarded
+    in_c.restype, in_c.argtypes = ctypes.c_double, (ctypes.c_double, ctypes.c_double)
+    results = set()
+    for a, b in itertools.product(NUMBERS, repeat=2):
+        expected = guarded(a, b)
+        # An int of C ends at 2^63, and no power is complex.
+        is_beyond = function in OF_INTS and max(abs(a), abs(b)) > 2.0**63
+        assert same(in_c(a, b), FAILED if is_beyond or isinstance(expected, complex) else expected), (a, b)
+        results.add(str(expected))
+    assert len(results) > 5
+
+
+STATEFUL = f"""
+static t_outer outer;
+bool begin(double scale) {{
+    bool error = false;
+    t_outer_init(&outer, scale, 0.5, &error);
+    return !error;
+}}
+double step(double a, double b) {{
+    bool error = false;
+    const double result = t_outer_step(&outer, a, b, &error);
+    return error ? {FAILED} : result;
+}}
+"""
+
+
+@needs_compiler
+def test_classes_records_and_lists_give_the_same_bits(tmp_path):
+    """State that a failed tick leaves half done, too."""
+    program = Program("t_")
+    program.add(Outer.__init__, Outer)
+    program.add(Outer.step, Outer)
+    library = compiled(tmp_path, program, f"bool begin(double);\ndouble step(double, double);\n{STATEFUL}")
+    library.begin.argtypes, library.step.argtypes = [ctypes.c_double], [ctypes.c_double] * 2
+    library.begin.restype, library.step.restype = ctypes.c_bool, ctypes.c_double
+    assert library.begin(0.25)
+    outer, failures = Outer(0.25, 0.5), 0
+    for a, b in [
+        *itertools.product((3.0, 0.5, 1.7), (0.0, -0.3, 2.0)),
+        *itertools.product((3.0, nan), (1.0,)),
+    ]:
+        try:
+            expected = outer.step(a, b)
+        except ZeroDivisionError:
+            expected, failures = FAILED, failures + 1
+        assert same(library.step(a, b), expected), (a, b)
+    assert 0 < failures < 9
+
+
+def uses_sum(a: float, b: float) -> float:
+    return sum([a, b])
+
+
+def has_two_types(a: float, b: float) -> float:
+    value = 1
+    value = a + b
+    return value
+
+
+def shares_a_list(a: float, b: float) -> float:
+    shared = Sharing(a)
+    return shared.first[0] + b
+
+
+def has_no_annotation(a, b):
+    return a + b
+
+
+def uses_text(a: float, b: float) -> float:
+    return a + len("ab") + b
+
+
+def calls_itself(a: float, b: float) -> float:
+    return a if b > 0.0 else calls_itself(a, b + 1.0)
+
+
+def has_a_dictionary(a: float, b: float) -> float:
+    return {1: a}[1] + b
+
+
+def hides_a_branch(a: float, b: float) -> float:
+    with open("file") as file:
+        return a + b + len(file.name)
+
+
+class Sharing:
+    """Two attributes with one list, which changes in place."""
+
+    def __init__(self, start: float) -> None:
+        self.first = [start] * 2
+        self.second = self.first
+        self.first[0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("function", "line", "found"),
+    [
+        (uses_sum, 1, "found sum(...), expected a loop"),
+        (has_two_types, 2, "found a float for a int, expected one type for each name"),
+        (shares_a_list, 1, "found Sharing(...) here, expected `self.name = Class(...)`"),
+        (has_no_annotation, 0, "found no type in C for a of has_no_annotation, expected an annotation"),
+        (uses_text, 1, "found len of a text, expected len of a list"),
+        (calls_itself, 0, "found calls_itself calling itself, expected a loop"),
+        (has_a_dictionary, 1, "found Dict, expected an expression of numbers"),
+        (hides_a_branch, 1, "found With, expected assignments, if, for"),
+        (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
+    ],
+    ids=lambda one: getattr(one, "__name__", ""),
+)
+def test_construct_outside_the_subset_is_refused_with_file_and_line(function, line, found):
+    program = Program("t_")
+    with pytest.raises(SubsetError) as error:
+        program.add(function, Sharing if function is Sharing.__init__ else None)
+        program.output()
+    place = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
+    assert str(error.value).startswith(place + found), error.value
+
+
+def test_public_function_that_may_raise_is_refused():
+    program = Program("t_", public={divide: "t_divide"})
+    program.add(divide)
+    with pytest.raises(SubsetError, match=r"found a division whose divisor may be 0 within t_divide"):
+        program.output()
+
+
+def test_divisors_that_cannot_be_zero_are_not_tested():
+    def safe(a: float, b: float) -> float:
+        if not b > 0.0:
+            return a / 3.0
+        return a / b + a / (1.0 + b * b) + sqrt(a * a) / sqrt(b)
+
+    program = Program("t_", public={safe: "t_safe"})
+    program.add(safe)
+    assert "error" not in program.output().definitions
+
+
+def test_output_is_the_same_every_time():
+    def text() -> tuple[str, str]:
+        program = Program("t_")
+        program.add(Outer.__init__, Outer)
+        program.add(Outer.step, Outer)
+        return tuple(program.output())
+
+    assert text() == text() and math.isfinite(len(text()[1]))
