@@ -83,14 +83,16 @@ def with_noise(name):
 
 
 GOOD, TRIED = 40, 80
+LIMIT = 0.01  # error that gains on the file are tuned to
 HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds of which some files are called good
 
 
 def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
     """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
 
-    No estimate of these touches tells the force's age better than to some 50 us, which e - e* takes for
-    0.0015: gains lose no more than the verdict said that the numbers' uncertainty can do."""
+    The quietest gains within the limit on the file are taken. On the true rig they err by up to that limit,
+    where those tuned on the truth may err by less: these touches tell the force's age to 50 to 100 us at
+    best, which e - e* takes for 0.0015 to 0.003."""
     best, losses = {}, []
     for number in range(TRIED):
         name = HARDLY_TOLD[number % len(HARDLY_TOLD)]
@@ -104,16 +106,16 @@ def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
             gains = tuning.tune(with_noise(name), "response_error", validation=32).gains
             best[name] = error(truth, "response_error", gains)
         gains = tuning.tune(written, "response_error", validation=32).gains
-        losses.append((name, error(truth, "response_error", gains), best[name], result.effect_on_error))
+        losses.append((name, error(truth, "response_error", gains), best[name]))
         if len(losses) == GOOD:
             break
     for name in best:
         rows = np.array([loss[1:] for loss in losses if loss[0] == name])
-        after, before, _ = rows.T
+        after, before = rows.T
         within = np.mean(after <= 1.10 * before + 0.0005)
         print(
             f"{name}: {len(rows)} files, rms e - e* {after.mean():.5f}, at most {after.max():.5f},", end=" "
         )
         print(f"of gains tuned on the truth {before[0]:.5f}; {within:.0%} within 10 %")
     assert len(losses) == GOOD
-    assert all(after <= 1.10 * before + 0.0005 + stated for _, after, before, stated in losses)
+    assert all(after <= max(1.10 * before + 0.0005, LIMIT) for _, after, before in losses)
