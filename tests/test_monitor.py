@@ -178,7 +178,7 @@ def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
     (["nowhere.toml", "LOG"], "nowhere"),
     (["TWO", "LOG"], "contact.clearance: found 0.02, allowed inf"),
     (["FAR", "LOG"], "rig.contact_plane: found 0.05 m, which none of the contacts in the logs goes beyond"),
-    (["OTHER", "LOG"], "contact.law: found 'elastoplastic', allowed linear, kelvin_voigt"),
+    (["OTHER", "LOG"], "contact.law: found 'elastoplastic', expected linear, kelvin_voigt"),
 ))  # fmt: skip
 def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, words):
     campaign = contacts(CLEAN, speeds=SPEEDS[:1])

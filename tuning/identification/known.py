@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxhil.contact import laws
+from jaxhil.contact.base import ContactLaw
+from jaxhil.errors import InputError, shown
 from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
 from tuning.identification.contact_laws import Law
 from tuning.identification.rational import Model, Structure
@@ -47,6 +49,9 @@ def contact_law(contact: Contact) -> Law:
     """Return the law with its shape; every entry of the lists has all coefficients of its own.
 
     Raise `InputError` for a law whose force is no sum of known functions of depth and rate."""
+    fitted = [name for name, law in laws.LAWS.items() if type(law).regression is not ContactLaw.regression]
+    if contact.law not in fitted:
+        raise InputError(f"contact.law: found {shown(contact.law)}, expected {', '.join(fitted)}")
     law = laws.contact_law(contact.law).regression(contact)
 
     def every(depth, rate):
