@@ -92,7 +92,9 @@ def test_laws_from_outside_go_all_the_way(tmp_path):
     result.save(tmp_path / "gains.json")
     study = tuning.sweep(tmp_path / "gains.json", scenarios=32, chunk=32)
     assert study.table.num_rows == 32
-    board = tuning.compare(mechanism, ["scaled_lead"], scenarios=4, judged=8)
+    with pytest.raises(jaxhil.InputError, match=r"found 'squared_spring', .*perturb_damping"):
+        tuning.compare(mechanism, ["scaled_lead"], scenarios=4, judged=8)
+    board = tuning.compare("rig-300kg", ["scaled_lead"], scenarios=4, judged=8)
     figures = board.figures["scaled_lead"]
     assert figures["tuned"].rms < figures["literature"].rms.low
     for refused in (lambda: tuning.export(result, tmp_path / "bundle"), lambda: tuning.verify(result)):
@@ -109,7 +111,7 @@ def test_laws_from_outside_go_all_the_way(tmp_path):
 
     jaxhil.register(ScaledLead(), runtime=Other)
     found = tuning.verify(tmp_path / "bundle")
-    assert not found.good and found.reasons[0] == "jaxhil_runtime.py: is not what this version exports"
+    assert not found.good and "jaxhil_runtime.py: is not what this version exports" in found.reasons
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ taken. With fewer than four touches the criterion alone judges.
 
 A law without damping is taken only where it is named. To first order a contact shows damping less stiffness
 times the age of the force: without damping the delay would take its place, with an interval that is far too
-narrow. Kelvin and Voigt's law contains the linear one.
+narrow. Kelvin and Voigt's law contains the linear one. For the same reason a law whose
+damping begins with the depth is taken only where the touches rule damping at the onset out.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from tuning.identification.motion import Motion
 
 FEWEST = 4  # touches for judging on others than those fitted
 ERRORS = 2.0  # standard errors within which laws are as good
+CLEAR = 4.0  # standard errors beyond which damping that acts at the onset is ruled out
 ONSET = 1e-3  # s, before and after a touch's begin, by which laws are not judged
 
 
@@ -63,10 +65,21 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
     preferred = min(results, key=lambda one: one.misfit + rows * one.law.complexity)
     # The delay takes the place of a damping that a law lacks: such a law is taken only where it is named.
     damped = [one for one in results if "damping" in one.law.names] or results
+    # So it would of a damping that begins with the depth, for one that acts at the onset.
+    least = min(one.misfit for one in results)
+    at_once = [one for one in damped if acts_at_onset(one.law)]
+    if any(one.short[0] <= CLEAR * one.short[1] + 1e-9 and one.misfit <= least + CLEAR**2 for one in at_once):
+        damped = at_once
     good = [one for one in damped if one is preferred or one.short[0] <= ERRORS * one.short[1] + 1e-9]
     good = good or [min(damped, key=lambda one: one.short[0])]
     taken = min(good, key=lambda one: (one.law.complexity, one.misfit))
     return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
+
+
+def acts_at_onset(law: Law) -> bool:
+    """Return whether the law has a force at the surface that is proportional to the rate."""
+    surface, rate = np.zeros(1), np.ones(1)
+    return any(np.any(value != 0.0) for value in (*law.own(surface, rate), *law.shared(surface, rate)))
 
 
 Fitted = tuple[float, float, float]  # delay, plane, misfit
