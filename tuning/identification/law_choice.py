@@ -72,7 +72,8 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
         damped = at_once
     good = [one for one in damped if one is preferred or one.short[0] <= ERRORS * one.short[1] + 1e-9]
     good = good or [min(damped, key=lambda one: one.short[0])]
-    taken = min(good, key=lambda one: (one.law.complexity, one.misfit))
+    # Of laws with as many numbers the first in the list: by misfit, noise would choose.
+    taken = min(good, key=lambda one: one.law.complexity)
     return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
 
 
