@@ -148,7 +148,7 @@ def copied(tmp_path_factory):
 
 
 def run(copied, folder, script):
-    """What a script prints, in a process that sees the copy alone."""
+    """Return what a script prints, in a process that sees the copy alone."""
     environment = {**os.environ, "PYTHONPATH": str(copied)}
     ran = subprocess.run(
         [sys.executable, "-c", script],

@@ -17,7 +17,7 @@ WHEN_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}
 
 
 class Fact(NamedTuple):
-    """What is known of a number."""
+    """Facts about a number that hold at a place in the code."""
 
     sign: str
     reads: Keys = frozenset()  # what it depends on

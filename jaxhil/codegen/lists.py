@@ -12,7 +12,7 @@ from .subset import ATOM, FLOAT, INT, SUM, TEXT, Type, Value, implies
 
 
 class Loop(NamedTuple):
-    """What a loop goes through."""
+    """Values that a loop goes through."""
 
     start: str
     stop: str

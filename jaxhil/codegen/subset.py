@@ -71,7 +71,7 @@ class Value(NamedTuple):
 
     @property
     def is_number(self) -> bool:
-        """Whether it is a float or an int."""
+        """Return whether it is a float or an int."""
         return self.type.kind in ("float", "int")
 
 

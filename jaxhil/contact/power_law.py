@@ -1,4 +1,4 @@
-"""What contact laws with a power of the depth have in common, F = k d^n without damping."""
+"""Common part of contact laws with a power of the depth, F = k d^n without damping."""
 
 from typing import ClassVar
 

@@ -34,7 +34,7 @@ INWARD, OUTWARD, FREE, OVER = range(4)  # phases of the motion, the last but one
 
 @runtime_checkable
 class ForceLaw(Protocol):
-    """What the integration needs of a contact law (`jaxhil.contact.base.ContactLaw`)."""
+    """Part of a contact law that the integration needs (`jaxhil.contact.base.ContactLaw`)."""
 
     def init(self, penetration: Any) -> tuple[Any, ...]: ...
 

@@ -57,7 +57,7 @@ STATUS_NAMES = {status.number: status.name for status in STATUSES}
 
 
 class ContactCount(NamedTuple):
-    """What the law said of one contact: the number of ticks with each status, and the status that counts."""
+    """Statuses of one contact: the number of ticks with each, and the one that counts."""
 
     number: int  # of the contact; 0 before the first
     ticks: int  # on which the law acted
@@ -70,7 +70,7 @@ class ContactCount(NamedTuple):
 
 
 class ContactRecord(NamedTuple):
-    """What the law said of one contact, as a reader sees it."""
+    """Statuses of one contact, by name."""
 
     number: int = 0  # of the contact; 0 before the first
     status: str = STATUS_NAMES[UNSTATED]  # what counts, one of `STATUSES` by name
