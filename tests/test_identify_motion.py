@@ -4,7 +4,7 @@ import campaigns
 import numpy as np
 import pytest
 
-from tuning.identification import free_motion, frf, hold
+from tuning.identification import free_motion, frf, hold, rational
 from tuning.identification.order import choose
 from tuning.identification.rational import STRUCTURES, Lines, Model, fit
 
@@ -148,3 +148,16 @@ def test_nonlinearity_shows_at_lines_that_were_not_excited():
         found = frf.spectrum(run.position_desired, bent, run.valid, 0.001, 500)
         flagged, other = (found.excess[0], found.excess[1]) if which == "odd" else found.excess[::-1]
         assert flagged > 20.0 and other < 2.0
+
+
+@pytest.mark.parametrize("logarithms", [(4.3, -0.2), (4.3, 1.1), (156.8, 153.0)])
+def test_poles_beyond_all_lines_are_moved_to_the_fastest_one(logarithms):
+    """A pole of 1e134 rad/s made the motion overflow; at frequencies of lines nothing changes."""
+    structure = rational.STRUCTURES[2]
+    asked = np.array([*logarithms, 0.001])
+    bounded = rational._with_slow_poles(structure, asked)
+    s = 2j * np.pi * np.array([0.5, 5.0, 50.0])
+    responses = [rational.Model(structure, values).response(s) for values in (bounded, asked)]
+    np.testing.assert_allclose(*responses, rtol=1e-3)
+    fastest = np.abs(np.roots(rational.Model(structure, bounded).fraction[1])).max()
+    assert fastest <= 1.001 / rational.SHORTEST
