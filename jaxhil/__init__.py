@@ -7,17 +7,17 @@
 
 Numbers are in SI units; arrays are NumPy's, float64 whatever jax is set to. Whatever is wrong with an
 argument raises `InputError`, one line. Nothing is imported before it is used: the rig's controller,
-`jaxhil.runtime`, needs neither jax nor NumPy.
+`jaxhil.rig`, needs neither jax nor NumPy.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxhil.compensators.base import Compensator, Gain
     from jaxhil.contact.base import ContactLaw
     from jaxhil.errors import InputError
     from jaxhil.front_door import simulate
+    from jaxhil.laws.simulation_base import Compensator, Gain
     from jaxhil.mechanism.loading import load
     from jaxhil.mechanism.structs import Mechanism
     from jaxhil.simulation.jacobian import jacobian
@@ -39,9 +39,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Compensator": "jaxhil.compensators.base",
+    "Compensator": "jaxhil.laws.simulation_base",
     "ContactLaw": "jaxhil.contact.base",
-    "Gain": "jaxhil.compensators.base",
+    "Gain": "jaxhil.laws.simulation_base",
     "InputError": "jaxhil.errors",
     "Mechanism": "jaxhil.mechanism.structs",
     "jacobian": "jaxhil.simulation.jacobian",

@@ -5,7 +5,7 @@ import functools
 import io
 from typing import Any
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from tuning.bundle import selftest
 from tuning.bundle.bundle import build_bundle

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from gain_documents import GAINS, gain_document, sign
 
-from jaxhil.runtime import COMPENSATORS, Controller
-from jaxhil.runtime.bounds import CONTROL_PERIODS
-from jaxhil.runtime.filters import DelayLine
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.law_status import STATUSES
-from jaxhil.runtime.limits import LIMITS, NO_LIMITS, complete
+from jaxhil.rig import COMPENSATORS, Controller
+from jaxhil.rig.bounds import CONTROL_PERIODS
+from jaxhil.rig.filters import DelayLine
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.law_status import STATUSES
+from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete
 from tuning.bundle.c99 import FLAGS, c99_texts
 
 COMPILER = shutil.which("cc")

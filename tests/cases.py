@@ -26,9 +26,9 @@ from lanes import (
 )
 from oracle import simulate
 
-from jaxhil.compensators.estimates import force_delay
 from jaxhil.contact.laws import LAWS
-from jaxhil.runtime import COMPENSATORS as RIG_COMPENSATORS
+from jaxhil.laws.shared.estimates import force_delay
+from jaxhil.rig import COMPENSATORS as RIG_COMPENSATORS
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import Metrics

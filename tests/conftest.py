@@ -65,11 +65,11 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="module", autouse=True)
 def _laws_of_the_package_alone():
     """What a module registers is gone when it is done."""
-    import jaxhil.runtime
-    from jaxhil.compensators import COMPENSATORS
+    import jaxhil.rig
     from jaxhil.contact.laws import LAWS
+    from jaxhil.laws.compensators import COMPENSATORS
 
-    tables = (COMPENSATORS, LAWS, jaxhil.runtime.COMPENSATORS)
+    tables = (COMPENSATORS, LAWS, jaxhil.rig.COMPENSATORS)
     before = [dict(table) for table in tables]
     yield
     for table, entries in zip(tables, before, strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 from c99_cases import RESET, TICK
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime.faults import (
+from jaxhil.rig.faults import (
     CLOCK,
     EARLY_TICK,
     FORCE_IN_FLIGHT,
@@ -31,7 +31,7 @@ from jaxhil.runtime.faults import (
     STROKE,
     VELOCITY_LIMIT,
 )
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 
 PERIOD = 1e-3
 CYCLE = 800  # ticks, of which the contact takes a quarter

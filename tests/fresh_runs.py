@@ -26,9 +26,9 @@ from c99_cases import (
 )
 
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import digest
-from jaxhil.runtime.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION, names
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.rig import digest
+from jaxhil.rig.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION, names
+from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.metrics import OK

@@ -3,9 +3,9 @@
 import copy
 from typing import Any
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import from_builtins
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 
 MECHANISM: dict[str, Any] = {
     "schema": "jaxhil/mechanism/1",

@@ -9,9 +9,9 @@ from typing import Any
 from gain_documents import GAINS, gain_document
 from guarded import LIMITED
 
-from jaxhil.runtime import COMPENSATORS, digest
-from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS, digest
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES
+from jaxhil.rig.limits import LIMITS
 
 EXTREMES = (
     *(0.0, -0.0, 5e-324, -5e-324, 1e-310, 2.3e-308, 1e-12, 1e-6, 1e-5, 0.1, 0.5, 1.0, -1.0, 2.0, 50.0),

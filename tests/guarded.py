@@ -2,8 +2,8 @@
 
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime import Controller
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import Controller
+from jaxhil.rig.limits import LIMITS
 
 PERIOD = 1e-3
 LIMITED = {

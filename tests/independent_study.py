@@ -62,7 +62,7 @@ def run_command(*arguments):
 def errors_of(file, campaign):
     """Return the true e, and by how much the file's e and e - e* are off it, at the literature's gains."""
     import jaxhil
-    from jaxhil.runtime import COMPENSATORS
+    from jaxhil.rig import COMPENSATORS
 
     approach = {"approach.velocity": campaign.speed, "approach.contacts": 1}
     mechanism = jaxhil.load(str(file), {**SILENT, **approach, "rig.force_sensor.bias": 0.0})

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from compiling import QUICK
 
-from jaxhil.compensators import COMPENSATORS, Gains
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Gains
 from jaxhil.mechanism.file import from_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop

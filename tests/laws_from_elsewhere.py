@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 import jaxhil
-from jaxhil.runtime.registry import Compensator, GainSpecification
+from jaxhil.rig.registry import Compensator, GainSpecification
 
 
 class ScaledLead(jaxhil.Compensator):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from jaxhil.runtime import Controller, digest
+from jaxhil.rig import Controller, digest
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.watchdog.recorded import Signals
 

@@ -9,8 +9,9 @@ import numpy as np
 from lanes import QUICK
 from scipy.signal import bilinear, lfilter
 
-from jaxhil.compensators import COMPENSATORS, Constants
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Constants
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 
 LONG = 4000  # ticks: every filter has died out
 

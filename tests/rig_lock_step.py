@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import Controller
-from jaxhil.runtime.gain_file import GainFile
+from jaxhil.rig import Controller
+from jaxhil.rig.gain_file import GainFile
 from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.hardware import RigTask
 from tuning.rig.plant import Plant

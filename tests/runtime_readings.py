@@ -3,7 +3,7 @@
 import math
 import random
 
-from jaxhil.runtime import Controller
+from jaxhil.rig import Controller
 
 Reading = tuple[float, float, float, float]
 

@@ -25,11 +25,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from jax import lax
 
-from jaxhil.compensators import COMPENSATORS, Constants, Signals
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Constants, Signals
 from jaxhil.mechanism.file import builtin_names, load
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.gain_file import build_document

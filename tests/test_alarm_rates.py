@@ -11,7 +11,7 @@ import pytest
 from c99_cases import COMPILER
 from fresh_runs import counted, export, gains
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import builtin_names, load, suite_names
 from jaxhil.simulation.metrics import OK
 from tuning.statistics.intervals import binomial_interval

@@ -27,12 +27,12 @@ from gain_documents import gain_document, sign
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
-from jaxhil.runtime import COMPENSATORS, GainFileError
-from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES
-from jaxhil.runtime.faults import FAULTS, LAW_IN_DOUBT, names
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from jaxhil.runtime.law_status import STATUS_NAMES, STATUSES
-from jaxhil.runtime.limits import LIMITS, complete
+from jaxhil.rig import COMPENSATORS, GainFileError
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES
+from jaxhil.rig.faults import FAULTS, LAW_IN_DOUBT, names
+from jaxhil.rig.gain_file import GainFile, check_gain_document
+from jaxhil.rig.law_status import STATUS_NAMES, STATUSES
+from jaxhil.rig.limits import LIMITS, complete
 from tuning.bundle.c99 import c99_texts
 from tuning.bundle.c99_tables import UNUSABLE, decimal
 

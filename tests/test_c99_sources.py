@@ -17,9 +17,9 @@ from c99_cases import (
 from gain_documents import gain_document, sign
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import COMPENSATORS, GainFileError
-from jaxhil.runtime.gain_file import check_gain_document
-from jaxhil.runtime.registry import Compensator, GainSpecification
+from jaxhil.rig import COMPENSATORS, GainFileError
+from jaxhil.rig.gain_file import check_gain_document
+from jaxhil.rig.registry import Compensator, GainSpecification
 from tuning.bundle.c99 import c99_texts
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")

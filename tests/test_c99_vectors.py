@@ -13,9 +13,9 @@ from c99_cases import (
 )
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime import COMPENSATORS
-from jaxhil.runtime.gain_file import check_gain_document
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS
+from jaxhil.rig.gain_file import check_gain_document
+from jaxhil.rig.limits import LIMITS
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)

@@ -46,7 +46,7 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
         (["simulate", "rig-300"], ["did you mean rig-300kg"]),
         (["simulate", "--set", "approach.velocity=-1"], ["approach.velocity", "-1", "> 0"]),
         (["simulate", "--set", "approach.speed=1"], ["approach.speed", "unknown key"]),
-        (["simulate", "--compensator", "magic"], ["magic", "none, phase_lead, multi_parameter_lead"]),
+        (["simulate", "--compensator", "magic"], ["magic", "none, dead_zone_observer, impulse_ledger"]),
         (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
         (
             ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],

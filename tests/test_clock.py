@@ -10,9 +10,9 @@ from c99_cases import NEXT_CONTACT, RESULT, ROW, assert_same, controller_in_pyth
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxhil.runtime.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.limits import NO_LIMITS, complete
+from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.limits import NO_LIMITS, complete
 
 OK = 0
 BRIDGED = {"missed_in_a_row": 3.0}

@@ -12,8 +12,8 @@ import c99_cases
 import pytest
 
 from jaxhil.codegen import Program, SubsetError
-from jaxhil.runtime.filters import DelayLine
-from jaxhil.runtime.types import Positive
+from jaxhil.rig.filters import DelayLine
+from jaxhil.rig.types import Positive
 
 needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 NUMBERS = (0.0, -0.0, 0.5, 1.0, -1.0, 1.5, -2.5, 2.5, 7.0, -7.3, 1e-320, 1e300, -1e300, inf, -inf, nan)

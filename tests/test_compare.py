@@ -121,7 +121,7 @@ def test_cost_is_a_time():
 
 
 def literature(law):
-    from jaxhil.compensators import literature_gains
+    from jaxhil.laws.compensators import literature_gains
     from jaxhil.mechanism.file import load
 
     return literature_gains(load("rig-300kg").mechanism, law)
@@ -130,7 +130,7 @@ def literature(law):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--compensators", "magic"], "--compensators: found 'magic', allowed none, phase_lead"),
+        (["--compensators", "magic"], "--compensators: found 'magic', allowed none, dead_zone_observer"),
         (["no-such-file"], "no-such-file"),
         (["varying", "varying"], "name: found varying, allowed a name other than that of varying"),
         (["--judged", "1"], "--judged: found 1, allowed an integer >= 2"),

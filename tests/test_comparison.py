@@ -10,9 +10,9 @@ from continuous import delayed_restitution
 from jaxtyping import Array
 from lanes import IDEAL, QUICK, mechanism, validated
 
-from jaxhil import compensators
-from jaxhil.compensators.base import Compensator, Gain
 from jaxhil.contact.laws import LAWS
+from jaxhil.laws import compensators
+from jaxhil.laws.simulation_base import Compensator, Gain
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop

@@ -23,9 +23,9 @@ from lanes import (
     validated,
 )
 
-from jaxhil.compensators.base import Compensator
-from jaxhil.compensators.phase_lead import PhaseLead
-from jaxhil.compensators.response_error import ResponseError
+from jaxhil.laws.phase_lead.simulation import PhaseLead
+from jaxhil.laws.response_error.simulation import ResponseError
+from jaxhil.laws.simulation_base import Compensator
 from jaxhil.simulation.building import build_loop
 
 PHASES = (np.arange(8) + 0.5) / 8

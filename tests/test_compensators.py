@@ -14,11 +14,12 @@ import pytest
 from gain_documents import GAINS, gain_document, sign
 from lanes import QUICK
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Constants, Signals
-from jaxhil.compensators import estimates as known
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.shared import estimates as known
+from jaxhil.laws.simulation_base import Compensator, Constants, Signals
 from jaxhil.mechanism.file import load
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime import Controller, GainFileError
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig import Controller, GainFileError
 
 LAWS = tuple(COMPENSATORS)
 WITH_GAINS = tuple(name for name, law in COMPENSATORS.items() if law.gains)

@@ -20,7 +20,8 @@ from lanes import mechanism, nominal_gains, per_lane, run_rollout, spread, valid
 from rig_lock_step import closed_loop, controller
 
 import jaxhil
-from jaxhil.compensators import COMPENSATORS, Constants
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Constants
 from jaxhil.mechanism.file import builtin_names, to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop

@@ -7,7 +7,7 @@ import pytest
 from lanes import IDEAL, STIFFNESS, first_contact, mechanism, nominal_gains, spread, validated
 
 from jaxhil.mechanism.file import load
-from jaxhil.runtime import COMPENSATORS
+from jaxhil.rig import COMPENSATORS
 
 DEAD_ZONE, DELAY, PERIOD = 12.0, 0.008, 1e-3
 MECHANISM = validated(mechanism({}, IDEAL, DELAY, period=PERIOD, force_sensor={"dead_zone": DEAD_ZONE}))

@@ -12,11 +12,11 @@ from bundles import document, run_selftest, signed, small_files
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.errors import InputError
 from jaxhil.files import TEMPORARY
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime.faults import FAULTS
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig.faults import FAULTS
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, with_limits, write_bundle
 from tuning.bundle.checking import check_bundle

@@ -13,10 +13,10 @@ import pytest
 from family import LAWS, NUMBER, RANGES, family, texts, write
 from lanes import QUICK
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS as CONTACT_LAWS
 from jaxhil.contact.laws import ContactParameters
 from jaxhil.contact.reference import Reference
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 
 

@@ -8,9 +8,9 @@ import pytest
 from c99_cases import RESULT, controller_in_python, loaded, packed
 from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
 
-from jaxhil.runtime import COMPENSATORS
-from jaxhil.runtime.faults import FAULTS, names
-from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.rig import COMPENSATORS
+from jaxhil.rig.faults import FAULTS, names
+from jaxhil.rig.gain_file import check_gain_document
 
 BLOCK = 500_000
 # What needs a closed loop, a law gone wrong or a call: the tests of guards and watchdog have these.

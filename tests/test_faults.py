@@ -18,7 +18,7 @@ from faults import COMPILER, HANGS, Ran, Runner, without_times
 from sweep_cases import case
 
 from jaxhil.files import is_temporary, read_sealed
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.caches.pieces import FOLDER as PIECES
 from tuning.gain_file import write_gain_file
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from c99_cases import RESULT, ROW, TARE, assert_same, controller_in_python, packed
 
-from jaxhil.runtime.faults import FORCE_STUCK
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.limits import complete
+from jaxhil.rig.faults import FORCE_STUCK
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.limits import complete
 
 PERIOD, MASS, STIFFNESS, SPEED = 1e-3, 350.0, 1.2e5, 0.02
 TRAVEL = 6e-5

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from lanes import as_arrays, nominal_gains, run_record, run_rollout
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.compensators.none import NoCompensator
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop

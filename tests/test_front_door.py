@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxhil
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.structs import value_at
 from tuning.gain_file import build_document
 
@@ -63,8 +63,8 @@ def test_all_names_are_offered_and_listed():
 
 
 def test_the_controller_is_imported_without_jax_and_numpy():
-    imports = "import sys; sys.modules['jax'] = None; import jaxhil, jaxhil.runtime"
-    assert plain_process(f"{imports}\nprint(jaxhil.runtime.Controller.__name__)") == "Controller\n"
+    imports = "import sys; sys.modules['jax'] = None; import jaxhil, jaxhil.rig"
+    assert plain_process(f"{imports}\nprint(jaxhil.rig.Controller.__name__)") == "Controller\n"
     loaded = "print([name for name in ('jax', 'numpy', 'scipy', 'msgspec') if name in sys.modules])"
     assert plain_process(f"import sys, jaxhil\n{loaded}") == "[]\n"
 
@@ -216,7 +216,7 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
 @pytest.mark.parametrize(
     ("compensator", "gains", "said"),
     [
-        ("phase_led", None, "compensator: found 'phase_led', allowed one of none, phase_lead"),
+        ("phase_led", None, "compensator: found 'phase_led', allowed one of none, dead_zone_observer"),
         ("phase_led", None, "did you mean phase_lead"),
         (
             "phase_lead",

@@ -16,11 +16,11 @@ from laws_from_elsewhere import SquaredSpring
 from scipy import optimize
 
 import jaxhil
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.compensators.response_error import typical_stiffness
 from jaxhil.errors import InputError
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.response_error.simulation import typical_stiffness
 from jaxhil.mechanism.file import builtin_names, load
-from jaxhil.runtime import Controller, GainFileError, digest
+from jaxhil.rig import Controller, GainFileError, digest
 from jaxhil.simulation.gain_file import check_document, load_gain_file
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import build_document, plain, validity_envelope, write_gain_file

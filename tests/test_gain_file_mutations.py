@@ -8,9 +8,9 @@ import pytest
 from gain_documents import gain_document, sign
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import GainFileError
-from jaxhil.runtime.gain_file import GainFile, check_gain_document, read_gain_document
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import GainFileError
+from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_document
+from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.gain_file import load_gain_file
 
 ALPHABET = b'0123456789.-+eE,:{}[]" \n\ttruefalsnINaity\\/\x00\xff'

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxhil.compensators.gates import gate, share_beyond
 from jaxhil.contact.laws import deflection
-from jaxhil.runtime.laws import gates as on_the_rig
+from jaxhil.laws.shared.gates import rig as on_the_rig
+from jaxhil.laws.shared.gates.simulation import gate, share_beyond
 
 CLEARANCE = 3.0
 TICKS = np.arange(-4, 40)

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from lanes import QUICK, join, run_record
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.runtime.filters import DelayLine
+from jaxhil.rig.filters import DelayLine
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import rollout

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
-from jaxhil.runtime.law_status import STATUSES
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.rig.law_status import STATUSES
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDE = ROOT / "notebooks" / "guide"

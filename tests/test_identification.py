@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhil.compensators.identification import Identified, update
-from jaxhil.runtime.laws.identification import ContactIdentification
+from jaxhil.laws.shared.recursive_least_squares.rig import ContactIdentification
+from jaxhil.laws.shared.recursive_least_squares.simulation import Identified, update
 
 INITIAL = (2.0, -1.0)
 VARIANCES = (5.0, 0.5)

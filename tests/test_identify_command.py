@@ -8,7 +8,7 @@ import pytest
 from campaign_logs import logs, write
 
 import jaxhil as package
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.identification.logs.campaign import read_campaign
 from tuning.identification.logs.mapping import load_mapping
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import optimize
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.gain_choice import choose_gains
 from tuning.identification import contact, free_motion
 from tuning.identification.design import powers, waveform

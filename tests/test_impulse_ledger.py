@@ -9,10 +9,10 @@ from c99_cases import ROW
 from rig_lock_step import controller
 from test_law_status import run
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
+from jaxhil.laws.impulse_ledger.contact_model.rig import DELAY, PARAMETERS, ContactModel, features, slope
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.runtime.laws.contact_model import DELAY, PARAMETERS, ContactModel, features, slope
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.scenario import build_scenarios

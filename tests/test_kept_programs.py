@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from compiling import programs_of
 
-from jaxhil.compensators import literature_gains
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
 from jaxhil.files import read_sealed
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation, kept_programs, sources

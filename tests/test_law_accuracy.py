@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import export
 
-from jaxhil.compensators import COMPENSATORS, SIX_AXES, literature_gains
+from jaxhil.laws.compensators import COMPENSATORS, SIX_AXES, literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation import environment
 from jaxhil.simulation.environment import ROLLOUT, flags, known_options

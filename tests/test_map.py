@@ -12,7 +12,7 @@ from continuous import delayed_restitution
 
 import jaxhil
 import tuning
-from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.reporting import map_grid
 from tuning.reporting.closed_forms import characteristic_root, critical_delay, series

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
 
-from jaxhil.compensators import Signals
+from jaxhil.laws.simulation_base import Signals
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.metrics import collect, empty_metrics

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.simulation.gain_file import check_document
 from tuning.bundle.summary import alarm_rates

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.simulation.motion import nominal_motion
 

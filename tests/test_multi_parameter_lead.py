@@ -11,9 +11,10 @@ from endless import OMEGA, STIFFNESS, without_period
 from lanes import IDEAL, first_contact, grid, mechanism, spread, validated
 from noise_cases import check_amplification
 
-from jaxhil.compensators import COMPENSATORS, Constants, literature_gains
-from jaxhil.compensators.multi_parameter_lead import pole_placement
 from jaxhil.errors import InputError
+from jaxhil.laws.compensators import COMPENSATORS, literature_gains
+from jaxhil.laws.multi_parameter_lead.simulation import pole_placement
+from jaxhil.laws.simulation_base import Constants
 from jaxhil.mechanism.file import builtin_names, load
 
 FREQUENCIES = [0.5, 6.0, 18.8, 300.0]

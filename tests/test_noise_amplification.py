@@ -10,7 +10,8 @@ from lanes import QUICK, mechanism, nominal_gains, per_lane, run_record, spread,
 from noise_cases import amplification
 from scipy.signal import bilinear, lfilter
 
-from jaxhil.compensators import COMPENSATORS, Constants
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Constants
 from jaxhil.simulation.building import build_loop
 
 NAMES = ("phase_lead", "lead_filter")

@@ -19,7 +19,7 @@ NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\btune\(")
 IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
 # Beside the front door: the rig's controller, and intervals of many sweeps at once.
-ALSO_PUBLIC = {"jaxhil.runtime", "tuning.statistics.intervals"}
+ALSO_PUBLIC = {"jaxhil.rig", "tuning.statistics.intervals"}
 MACHINE_PATH = re.compile(r"(?:/(?:home|root|tmp|work|Users|usr|opt)/|[A-Z]:\\\\)[\w.-]")
 
 

@@ -21,8 +21,8 @@ from lanes import (
     validated,
 )
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.simulation.building import build_loop
 
 LAW = COMPENSATORS["passivity"]

@@ -9,9 +9,9 @@ from cases import CASES, oracle_contacts
 from lanes import as_arrays, join, nominal_gains, run_rollout, validated
 from rig_lock_step import closed_loop
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import builtin_names, from_builtins, load
-from jaxhil.runtime import COMPENSATORS
+from jaxhil.rig import COMPENSATORS
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios

@@ -25,8 +25,8 @@ from guarded import LIMITED, limited
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from jaxhil.runtime import COMPENSATORS, Controller
-from jaxhil.runtime.faults import (
+from jaxhil.rig import COMPENSATORS, Controller
+from jaxhil.rig.faults import (
     COMMAND_NOT_FINITE,
     ENERGY_BALANCE,
     MODEL_NOT_FINITE,
@@ -35,9 +35,9 @@ from jaxhil.runtime.faults import (
     STROKE,
     VELOCITY_LIMIT,
 )
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.limits import LIMITS, complete
-from jaxhil.runtime.surfaces import deflection
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.limits import LIMITS, complete
+from jaxhil.rig.surfaces import deflection
 
 LAWS = ("none", "position_lead", "response_error")
 STEP = LIMITED["velocity_limit"] * PERIOD

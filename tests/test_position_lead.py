@@ -23,10 +23,10 @@ from lanes import (
     validated,
 )
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.compensators.estimates import simulator_inverse
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.shared.estimates import simulator_inverse
 from jaxhil.mechanism.file import builtin_names, load
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes

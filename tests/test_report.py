@@ -10,7 +10,7 @@ from browser import LAYOUT
 
 import jaxhil
 import tuning
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.cli.commands.identify import SCHEMA
 
 SCRIPT = "<script>window.hurt = 1</script>"

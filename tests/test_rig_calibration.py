@@ -10,13 +10,13 @@ from limited_replay import limited_controller, replay_lane
 from sweep_cases import NOISY, UNCERTAIN, case
 from sweep_cases import manifest as sweep_manifest
 
-from jaxhil.compensators import literature_gains
 from jaxhil.errors import InputError
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from jaxhil.runtime.faults import CONTACT_TOO_LONG
-from jaxhil.runtime.law_status import UNSTATED
-from jaxhil.runtime.limits import LIMITS, complete
-from jaxhil.runtime.watchdog import Watchdog
+from jaxhil.rig.faults import CONTACT_TOO_LONG
+from jaxhil.rig.law_status import UNSTATED
+from jaxhil.rig.limits import LIMITS, complete
+from jaxhil.rig.watchdog import Watchdog
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
 from tuning.bundle.bundle import limits_section

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxhil.compensators.ring_buffer import depend_on, look_back, write, write_in_turn
+from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write, write_in_turn
 
 SAMPLES, LANES = 8, 3
 

@@ -11,10 +11,10 @@ import pytest
 from gain_documents import GAINS, gain_document, sign
 from runtime_readings import readings, run
 
-import jaxhil.runtime
-from jaxhil.runtime import Controller
+import jaxhil.rig
+from jaxhil.rig import Controller
 
-RUNTIME = Path(jaxhil.runtime.__file__).parent
+RUNTIME = Path(jaxhil.rig.__file__).parent
 
 
 @pytest.mark.parametrize("name", sorted(GAINS))
@@ -139,7 +139,7 @@ class Blocker:
             raise ImportError("blocked: " + name)
 sys.meta_path.insert(0, Blocker())
 sys.path.insert(0, {str(RUNTIME.parents[1])!r})
-from jaxhil.runtime import Controller
+from jaxhil.rig import Controller
 controller = Controller.from_file({str(path)!r})
 print(repr(controller.step(100.0, 1e-3, 0.0, 1e-3)))
 """
@@ -152,3 +152,13 @@ print(repr(controller.step(100.0, 1e-3, 0.0, 1e-3)))
     expected = Controller.from_dict(gain_document()).step(100.0, 1e-3, 0.0, 1e-3)
     assert float(shown.stdout) == expected
     assert shown.stderr == ""
+
+
+def test_former_name_of_the_package_is_still_imported():
+    program = (
+        "import warnings\nwarnings.simplefilter('ignore')\n"
+        "import jaxhil.runtime, jaxhil.rig\nfrom jaxhil.runtime import Controller\n"
+        "from jaxhil.runtime.registry import COMPENSATORS\n"
+        "assert Controller is jaxhil.rig.Controller and COMPENSATORS is jaxhil.rig.COMPENSATORS\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mechanism_table import changed
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import builtin_names, from_builtins, load, suite_names
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime.bounds import CONTROL_PERIODS, FORCES
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig.bounds import CONTROL_PERIODS, FORCES
+from jaxhil.rig.limits import LIMITS
 
 
 def beyond(mechanism: Mechanism) -> list[tuple]:

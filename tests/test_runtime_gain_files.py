@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_readings import readings, run
 
-from jaxhil.runtime import Controller, GainFileError, digest
+from jaxhil.rig import Controller, GainFileError, digest
 
 
 def refused(document: Any, *words: str) -> str:

@@ -8,8 +8,8 @@ import pytest
 from gain_documents import gain_document, sign
 from guarded import LIMITED, PERIOD, limited
 
-from jaxhil.runtime import Controller, GainFileError
-from jaxhil.runtime.faults import (
+from jaxhil.rig import Controller, GainFileError
+from jaxhil.rig.faults import (
     CLOCK,
     EMERGENCY_STOP,
     FAULTS,
@@ -29,7 +29,7 @@ from jaxhil.runtime.faults import (
     VELOCITY_LIMIT,
     names,
 )
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 
 
 def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_readings import Reading, readings, run
 
-from jaxhil.runtime import Controller
-from jaxhil.runtime.filters import DelayLine, LeadFilter, VelocityFilter
-from jaxhil.runtime.laws.identification import ContactIdentification
+from jaxhil.laws.shared.recursive_least_squares.rig import ContactIdentification
+from jaxhil.rig import Controller
+from jaxhil.rig.filters import DelayLine, LeadFilter, VelocityFilter
 
 
 def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndarray, np.ndarray]:

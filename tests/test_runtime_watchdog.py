@@ -6,10 +6,10 @@ import math
 import pytest
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime import Controller
-from jaxhil.runtime.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
-from jaxhil.runtime.limits import LIMITS
-from jaxhil.runtime.watchdog import Expectation
+from jaxhil.rig import Controller
+from jaxhil.rig.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION
+from jaxhil.rig.limits import LIMITS
+from jaxhil.rig.watchdog import Expectation
 
 PERIOD, MASS, STIFFNESS, SPEED = 1e-3, 300.0, 1e5, 5e-3
 WATCHED = {

@@ -13,7 +13,7 @@ import pytest
 from cases import Case
 from lanes import SECOND_ORDER, VELOCITY, mechanism, run_rollout
 
-from jaxhil.compensators.none import NoCompensator
+from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.metrics import NOT_REACHED, OK
 from jaxhil.simulation.rollout import start

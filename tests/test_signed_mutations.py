@@ -27,11 +27,11 @@ from gain_documents import gain_document, sign
 from gain_mutations import anything_changed, numbers_changed, text_of
 from guarded import LIMITED
 
-from jaxhil.runtime import COMPENSATORS, GainFileError, digest
-from jaxhil.runtime.bounds import CONTROL_PERIODS, FORCES, POSITIONS, SPEEDS
-from jaxhil.runtime.controller import Controller
-from jaxhil.runtime.gain_file import GainFile, check_gain_document, read_gain_document
-from jaxhil.runtime.limits import LIMITS, NO_LIMITS
+from jaxhil.rig import COMPENSATORS, GainFileError, digest
+from jaxhil.rig.bounds import CONTROL_PERIODS, FORCES, POSITIONS, SPEEDS
+from jaxhil.rig.controller import Controller
+from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_document
+from jaxhil.rig.limits import LIMITS, NO_LIMITS
 
 TICKS = 12
 COMPILED = "phase_lead", "response_error"  # every day: compiling takes its time

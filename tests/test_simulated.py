@@ -9,7 +9,7 @@ import numpy as np
 from cases import CASES
 from lanes import spread, validated
 
-from jaxhil.compensators.none import NoCompensator
+from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.simulation.building import build_loop
 from tuning.gains.simulated import outcome, prepared, with_compensator
 

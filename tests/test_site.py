@@ -18,7 +18,7 @@ import yaml
 from browser import LAYOUT
 
 import jaxhil
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.keys import tables
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism

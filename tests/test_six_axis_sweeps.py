@@ -8,7 +8,7 @@ from clusters import killed_meanwhile, started
 
 import jaxhil as package
 import tuning
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.environment import computing
 from tuning.caches.cluster import Workers

@@ -8,8 +8,8 @@ import pytest
 
 import jaxhil as package
 import tuning
-from jaxhil.compensators import SIX_AXES, literature_gains
 from jaxhil.errors import InputError
+from jaxhil.laws.compensators import SIX_AXES, literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.gain_file import load_gain_file
 from tuning.front_door import arguments
@@ -119,7 +119,7 @@ def test_equal_leads_of_all_axes_are_one_lead():
 
 @pytest.mark.slow
 def test_gains_of_six_axes_do_not_reach_a_controller_of_one(tuned, jaxhil, tmp_path):
-    from jaxhil.runtime import Controller, GainFileError
+    from jaxhil.rig import Controller, GainFileError
 
     _, path = tuned
     with pytest.raises(GainFileError, match="axes: found 6, allowed 1"):

@@ -6,7 +6,7 @@ from endless import OMEGA, STIFFNESS, characteristic_root, decay, without_period
 from lanes import IDEAL, first_contact, grid, mechanism, spread, validated
 from noise_cases import check_amplification
 
-from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
 from tuning.gains.pareto_search import amplification as pareto_amplification
 

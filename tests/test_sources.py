@@ -6,8 +6,8 @@ import sys
 import jax
 import numpy
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import LAWS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.simulation.sources import sources_sha256, versions
 
 LAW = """

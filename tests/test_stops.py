@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from jaxhil.runtime import digest
-from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.rig import digest
+from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle.bundle import build_bundle, limits_section

@@ -11,7 +11,7 @@ import pytest
 from bundles import document
 from matplotlib import image
 
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 from tuning.bundle.bundle import with_limits
 from tuning.bundle.summary import COLOURS, picture_png, summary_html
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from sweep_cases import case
 
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
 from tuning.sweeps.store import read_part, read_store, write_part

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.sweeps.manifest import decode, differences, encode, other_code, rounding_flags, unlike_here
 
 GOOD = manifest()

@@ -9,7 +9,7 @@ import pytest
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.sweeps.columns import OUTCOMES, STATUSES, contact_slots, judge
 from tuning.sweeps.manifest import unlike_here
 from tuning.sweeps.parts import decode_part, encode_part, same_rows

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.chunks import build_sweep
 from tuning.sweeps.store import Store, open_store, write_verdict

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxhil.compensators import COMPENSATORS, literature_gains
+from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.simulation.evaluation import evaluate
 from tuning.gains import tune_all

@@ -8,7 +8,7 @@ import pytest
 from lanes import IDEAL, mechanism, validated
 from scipy.integrate import solve_ivp
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop

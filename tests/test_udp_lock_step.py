@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig_lock_step import ANY, FINITE, a_reading, closed_loop, controller, packets, prepared, same
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load, to_builtins
-from jaxhil.runtime import faults
+from jaxhil.rig import faults
 from tuning.rig import udp_protocol
 from tuning.rig.udp_protocol import (
     MISSED_TICK,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rig_lock_step import a_reading, prepared
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from tuning.rig.contact_watch import ContactResult
 from tuning.rig.hardware import BRIDGED

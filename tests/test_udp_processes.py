@@ -13,7 +13,7 @@ import pytest
 from bundles import document, signed
 from gain_documents import gain_document, sign
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from tuning.bundle.bundle import build_bundle, write_bundle
 from tuning.gain_file import build_document, write_gain_file
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 def gain_file(folder, compensator="response_error", limits=None, **values):
     document = gain_document(compensator, **values)
     if limits is not None:
-        from jaxhil.runtime.limits import LIMITS
+        from jaxhil.rig.limits import LIMITS
 
         document["limits"] = {name: {"value": v, "unit": LIMITS[name].unit} for name, v in limits.items()}
     path = folder / "gains.json"

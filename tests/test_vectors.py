@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from bundles import document
 
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime import Controller
-from jaxhil.runtime.gain_file import check_gain_document
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig import Controller
+from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle import selftest

@@ -5,11 +5,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from jaxhil.compensators import COMPENSATORS, Signals
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Signals
 from jaxhil.mechanism.file import load
-from jaxhil.runtime import COMPENSATORS as ON_THE_RIG
-from jaxhil.runtime import Controller
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.rig import COMPENSATORS as ON_THE_RIG
+from jaxhil.rig import Controller
+from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes

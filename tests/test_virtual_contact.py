@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lanes import MASS
 
-from jaxhil.compensators import literature_gains
-from jaxhil.compensators.virtual_contact import damping_at_the_limit
+from jaxhil.laws.compensators import literature_gains
+from jaxhil.laws.virtual_contact.simulation import damping_at_the_limit
 from jaxhil.mechanism.file import load
 
 

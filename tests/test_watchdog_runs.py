@@ -11,10 +11,10 @@ from cases import SECOND_ORDER, mechanism, nominal_gains, validated
 from fresh_runs import counted, export, gains
 from sweep_cases import NOISY, UNCERTAIN
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import DEFAULT, load
-from jaxhil.runtime.faults import RESTITUTION, names
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.faults import RESTITUTION, names
+from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import LIMIT, WITHOUT_STORE

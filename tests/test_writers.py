@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 from scipy.io import loadmat
 
 from jaxhil.errors import InputError
-from jaxhil.runtime import COMPENSATORS
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS
+from jaxhil.rig.limits import LIMITS
 from tuning.bundle.writers import csv_table, gain_entries, limit_entries, matlab, ros2_yaml
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

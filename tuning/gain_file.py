@@ -16,15 +16,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxhil.compensators import Gain
 from jaxhil.contact.laws import contact_law
 from jaxhil.errors import InputError, shown
 from jaxhil.files import write_whole, writing
+from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism, to_builtins
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import digest
-from jaxhil.runtime.gain_file import SCHEMA
+from jaxhil.rig import digest
+from jaxhil.rig.gain_file import SCHEMA
 from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sources import versions

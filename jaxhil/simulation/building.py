@@ -7,8 +7,8 @@ like delays share one compiled program.
 import jax
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS
 from jaxhil.contact.laws import contact_law
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Gains
+from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.loop import Loop, RigConstants, enter
 from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import read, steady_state

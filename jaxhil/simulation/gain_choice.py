@@ -5,8 +5,9 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.compensators import Compensator, literature_gains
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.laws.compensators import literature_gains
+from jaxhil.laws.simulation_base import Compensator
 from jaxhil.mechanism.conversion import close_match
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism

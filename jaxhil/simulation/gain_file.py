@@ -1,6 +1,6 @@
 """Reading a gain file: the gains of a compensator, with the mechanism and the rig that they were tuned for.
 
-First the checks that the rig makes too (`jaxhil.runtime.gain_file`), then those that need the mechanism and
+First the checks that the rig makes too (`jaxhil.rig.gain_file`), then those that need the mechanism and
 the registry of compensators. A file is refused as a whole, in one line that says what is wrong.
 """
 
@@ -10,14 +10,15 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from jaxhil.compensators import COMPENSATORS, SIX_AXES, Compensator, Gain, compensator_of
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.laws.compensators import COMPENSATORS, SIX_AXES, compensator_of
+from jaxhil.laws.simulation_base import Compensator, Gain
 from jaxhil.mechanism.conversion import close_match
 from jaxhil.mechanism.file import AnyMechanism, any_from_builtins, from_builtins
-from jaxhil.runtime import GainFileError
-from jaxhil.runtime.gain_file import check_gain_document, read_gain_document
-from jaxhil.runtime.registry import COMPENSATORS as RUNTIME_COMPENSATORS
-from jaxhil.runtime.registry import GainSpecification
+from jaxhil.rig import GainFileError
+from jaxhil.rig.gain_file import check_gain_document, read_gain_document
+from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
+from jaxhil.rig.registry import GainSpecification
 
 ROUNDING = 1e-9  # by which a bound worked out elsewhere may differ
 

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Gains
 from jaxhil.errors import InputError, shown
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Compensator, Gains
 from jaxhil.mechanism.conversion import close_match, dotted
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.overrides import KeyProblem, parse_key

@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxhil.compensators.base import Compensator, Constants, Gains
 from jaxhil.contact.laws import ContactLaw
+from jaxhil.laws.simulation_base import Compensator, Constants, Gains
 from jaxhil.simulation.cells import CellCounts, Cells, build_cells
 from jaxhil.simulation.contact_force import no_contact
 from jaxhil.simulation.loop_state import LoopState, Plant

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxhil.compensators.base import Constants, Signals
 from jaxhil.contact.laws import deflection
+from jaxhil.laws.simulation_base import Constants, Signals
 from jaxhil.simulation.contact_force import Contact, Motion
 from jaxhil.simulation.loop import RigConstants
 from jaxhil.simulation.loop_state import LoopState

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxhil.compensators import Gains, Signals
+from jaxhil.laws.simulation_base import Gains, Signals
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import kept_programs

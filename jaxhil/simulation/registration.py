@@ -10,12 +10,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Gain
 from jaxhil.contact.laws import KEYS, LAWS, ContactLaw
 from jaxhil.errors import InputError, one_line, shown
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Compensator, Gain
 from jaxhil.mechanism.file import DEFAULT, load
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime.registry import COMPENSATORS as RUNTIME_COMPENSATORS
+from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,59}")
 _RUNTIME_METHODS = ("step", "reset", "position_command", "next_contact")
@@ -25,7 +26,7 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
     """Enter a compensator or a contact law under its `name`: simulation, tuning and gain files then know it.
 
     `runtime` is the compensator's class for the rig, in plain Python, with gains of the same names and units
-    (`jaxhil.runtime.registry.Compensator`): what exports a controller needs it. The law's own class may be
+    (`jaxhil.rig.registry.Compensator`): what exports a controller needs it. The law's own class may be
     defined and registered again, as a notebook's cell that runs twice does; another name taken is refused.
 
     Raises `InputError`, one line, for what is no law's instance, a name that is taken or not a word of
@@ -107,7 +108,7 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
     if not inspect.isclass(runtime):
-        raise _refusal(law, "runtime", shown(runtime), "a class, as of jaxhil.runtime.registry.Compensator")
+        raise _refusal(law, "runtime", shown(runtime), "a class, as of jaxhil.rig.registry.Compensator")
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
         raise _refusal(law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method")

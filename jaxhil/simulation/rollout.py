@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxhil.compensators.base import Gains
+from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.cells import Course
 from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
 from jaxhil.simulation.free_flight import arrival, begin_approach

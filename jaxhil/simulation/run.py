@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS, Compensator
 from jaxhil.errors import InputError, shown
 from jaxhil.files import as_path, follow, write_csv, writing
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Compensator
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Gains, Signals
-from jaxhil.compensators.ring_buffer import depend_on, look_back, write_in_turn
+from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_in_turn
+from jaxhil.laws.simulation_base import Gains, Signals
 from jaxhil.simulation.cells import INSTANT, Course, power_series
 from jaxhil.simulation.contact_force import (
     Contact,

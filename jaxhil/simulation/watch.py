@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.compensators.base import Signals
 from jaxhil.contact.laws import deflection
+from jaxhil.laws.simulation_base import Signals
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, no_deviation

@@ -15,9 +15,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
-from jaxhil.compensators import SIX_AXES
-from jaxhil.compensators.base import Constants, Gains, Signals
-from jaxhil.compensators.phase_lead_per_axis import PhaseLeadPerAxis
+from jaxhil.laws.compensators import SIX_AXES
+from jaxhil.laws.phase_lead_per_axis.simulation import PhaseLeadPerAxis
+from jaxhil.laws.simulation_base import Constants, Gains, Signals
 from jaxhil.simulation.sensors import lag, white_noise
 from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES

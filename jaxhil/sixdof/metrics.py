@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Gains
+from jaxhil.laws.simulation_base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.equations import square_root
 from jaxhil.sixdof.loop import Loop

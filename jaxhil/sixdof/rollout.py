@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.compensators.base import Gains
+from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.watch import FADED, LONGEST_FADING, RUNAWAY
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import deepest

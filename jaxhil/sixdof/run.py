@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.compensators import SIX_AXES
 from jaxhil.errors import InputError, shown
 from jaxhil.files import write_csv
+from jaxhil.laws.compensators import SIX_AXES
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains

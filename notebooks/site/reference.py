@@ -18,8 +18,9 @@ from tyro.conf import FlagCreatePairsOff, Positional
 
 import jaxhil
 import tuning
-from jaxhil.compensators import COMPENSATORS, Gain
-from jaxhil.compensators import SIX_AXES as SIX_AXIS_LAWS
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.compensators import SIX_AXES as SIX_AXIS_LAWS
+from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import builtin_names, load, load_any, six_axis_names, suite_names
 from jaxhil.mechanism.json_schema import json_schema
 from jaxhil.mechanism.keys import Key, Table, tables

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators.response_error import ResponseError
 from jaxhil.contact.laws import KelvinVoigt
+from jaxhil.laws.response_error.simulation import ResponseError
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.metrics import NOT_REACHED
 from jaxhil.simulation.scenario import Scenario

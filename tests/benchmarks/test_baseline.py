@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from baseline import FLAGS, KINDS, RESULTS, SOURCE, compile_baseline
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from gain_documents import gain_document, sign
 
-from jaxhil.runtime import COMPENSATORS
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS
+from jaxhil.rig.limits import LIMITS
 
 pytestmark = [
     pytest.mark.benchmark,

@@ -12,8 +12,8 @@ from c99_cases import contact_rows
 from gain_documents import gain_document, sign
 from test_c_tick import CONTACTS, WIDE
 
-from jaxhil.runtime import COMPENSATORS, Controller
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import COMPENSATORS, Controller
+from jaxhil.rig.limits import LIMITS
 
 pytestmark = pytest.mark.benchmark
 TICKS = 200_000

@@ -18,7 +18,7 @@ from clusters import ROOT
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from test_throughput import PROCESSOR, best, case
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.simulation.environment import TICKS, known_options
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import run_contacts

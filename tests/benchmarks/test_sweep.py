@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from baseline import compile_baseline
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.loop import build_rig_constants

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from baseline import compile_baseline
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation

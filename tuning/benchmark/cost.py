@@ -5,7 +5,7 @@ import statistics
 import time
 from collections.abc import Mapping
 
-from jaxhil.runtime import COMPENSATORS
+from jaxhil.rig import COMPENSATORS
 
 TICKS = 2000
 APPROACH, CONTACT = 0.02, 0.2  # s

@@ -207,7 +207,7 @@ def _in_processes(
 
 def _gains(law: str) -> int:
     """How many there are: the more, the longer it takes."""
-    from jaxhil.runtime import COMPENSATORS
+    from jaxhil.rig import COMPENSATORS
 
     return len(COMPENSATORS[law].gains)
 
@@ -229,7 +229,7 @@ def judge_law(
 ) -> list[LawFigures]:
     """All figures of one law on mechanisms of one program, tuned together. `tell` is called with what is
     going on and the share that is done."""
-    from jaxhil.compensators import COMPENSATORS, literature_gains
+    from jaxhil.laws.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains, lanes_judged
     from tuning.gains.settings import TuneSettings
     from tuning.gains.tune_all import tune_all

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
-from jaxhil.runtime import GainFileError, digest
-from jaxhil.runtime.gain_file import read_gain_document
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig import GainFileError, digest
+from jaxhil.rig.gain_file import read_gain_document
+from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
 from tuning.bundle.manifest import is_bundle

@@ -3,7 +3,7 @@
 `jaxhil.codegen` makes them of the rig's Python: controller, guards and the law of the gain document. What is
 no Python stands here and in `c99_tables`: the header's checks of the compiler, the tables of gains, limits,
 faults and statuses, and `jaxhil_init`, which admits gains and limits. The test program is
-`jaxhil/c99/test_vectors.c`. Where the generated code sizes an array by `JAXHIL_<NAME>_SAMPLES`, that constant
+`test_vectors.c`. Where the generated code sizes an array by `JAXHIL_<NAME>_SAMPLES`, that constant
 is the length of a line which delays by the gain or limit of that name.
 """
 
@@ -16,13 +16,13 @@ from typing import Any
 
 from jaxhil.codegen import Program, SubsetError
 from jaxhil.errors import InputError, one_line
-from jaxhil.runtime.controller import Controller
-from jaxhil.runtime.faults import FAULTS
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from jaxhil.runtime.inputs import Tare
-from jaxhil.runtime.law_status import STATUSES, ContactCount
-from jaxhil.runtime.limits import LIMITS
-from jaxhil.runtime.registry import COMPENSATORS, Compensator
+from jaxhil.rig.controller import Controller
+from jaxhil.rig.faults import FAULTS
+from jaxhil.rig.gain_file import GainFile, check_gain_document
+from jaxhil.rig.inputs import Tare
+from jaxhil.rig.law_status import STATUSES, ContactCount
+from jaxhil.rig.limits import LIMITS
+from jaxhil.rig.registry import COMPENSATORS, Compensator
 from tuning.bundle.c99_tables import (
     UNUSABLE,
     constants,
@@ -35,7 +35,7 @@ from tuning.bundle.c99_tables import (
 HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS, TEST = "jaxhil_gains.h", "test_vectors.c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-FOLDER = resources.files("jaxhil") / "c99"
+FOLDER = resources.files("tuning") / "bundle"
 # Methods and properties that are the interface in C, in the header's order.
 PUBLIC = {
     "tare": "tare",

@@ -10,12 +10,12 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from jaxhil.runtime.bounds import CONTROL_PERIODS, DISTANCES, span
-from jaxhil.runtime.faults import FAULTS, UNUSABLE
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.law_status import STATUSES
-from jaxhil.runtime.limits import LIMITS
-from jaxhil.runtime.registry import COMPENSATORS
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, span
+from jaxhil.rig.faults import FAULTS, UNUSABLE
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.law_status import STATUSES
+from jaxhil.rig.limits import LIMITS
+from jaxhil.rig.registry import COMPENSATORS
 
 WIDTH = 110
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.manifest import manifest_text
 

@@ -1,7 +1,7 @@
 """A law from outside the package on the rig: the source of its runtime class, for the runtime in one file.
 
 It is the class with what it uses of its own module: imports of the standard library, of NumPy and of
-`jaxhil.runtime`, and the statements at the module's top that bind the other names.
+`jaxhil.rig`, and the statements at the module's top that bind the other names.
 """
 
 import ast
@@ -10,7 +10,7 @@ import sys
 
 from jaxhil.errors import InputError, one_line
 
-PACKAGE = "jaxhil.runtime"
+FORMER, PACKAGE = "jaxhil.runtime.", "jaxhil.rig."
 
 
 def module_text(law: type, name: str) -> str:
@@ -36,7 +36,7 @@ def module_text(law: type, name: str) -> str:
         ast.unparse(one) if _is_import(one) else ast.get_source_segment(text, one) or "" for one in parts
     ]
     entered = f'register("{name}")({law.__name__})'
-    return "\n\n\n".join(["from ..registry import register", *texts, entered])
+    return "\n\n\n".join(["from jaxhil.rig.registry import register", *texts, entered])
 
 
 def _class_text(law: type) -> str:
@@ -62,11 +62,12 @@ def _bound(statement: ast.stmt) -> list[str]:
 
 
 def _only(statement: ast.stmt, wanted: set[str]) -> ast.stmt:
-    """An import of the names wanted alone; one of the runtime is relative, as in its own modules."""
+    """Return an import of the names wanted alone; the rig's package has its present name."""
     assert isinstance(statement, (ast.Import, ast.ImportFrom))
     names = [one for one in statement.names if (one.asname or one.name.partition(".")[0]) in wanted]
     if isinstance(statement, ast.Import):
         return ast.Import(names)
-    if (statement.module or "").startswith(f"{PACKAGE}."):
-        return ast.ImportFrom(str(statement.module).removeprefix(f"{PACKAGE}."), names, 2)
-    return ast.ImportFrom(statement.module, names, statement.level)
+    module = statement.module or ""
+    if module.startswith(FORMER):
+        module = PACKAGE + module.removeprefix(FORMER)
+    return ast.ImportFrom(module, names, statement.level)

@@ -8,9 +8,9 @@ from string import Template
 from typing import Any
 
 from jaxhil.errors import one_line
-from jaxhil.runtime.bounds import FORCES, POSITIONS, SPEEDS
-from jaxhil.runtime.faults import FAULTS
-from jaxhil.runtime.law_status import STATUSES
+from jaxhil.rig.bounds import FORCES, POSITIONS, SPEEDS
+from jaxhil.rig.faults import FAULTS
+from jaxhil.rig.law_status import STATUSES
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 

@@ -1,8 +1,8 @@
-"""The runtime as one source file, with the exported law and what it imports, and no other.
+"""The rig's controller as one source file, with the exported compensator and no other.
 
-What the package's `__init__` offers in `__all__`, the law, and what their relative imports lead to: each
-module's text follows those that it imports, comments and all, without its own docstring and imports. Imports
-from outside come first, once each. So no two of the modules may bind one name: that is checked, and refused.
+It has what `jaxhil.rig` offers in `__all__`, the compensator, and the modules of `jaxhil` that these import.
+Each module's text follows those that it imports, comments and all, without its own docstring and imports.
+Imports from outside come first, once each. Two modules that bind the same name are refused.
 """
 
 import ast
@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-import jaxhil.runtime
+import jaxhil.rig
 from tuning.bundle.foreign_law import module_text
 
 OUTSIDE = {*sys.stdlib_module_names, "numpy"}
@@ -23,30 +23,29 @@ OUTSIDE = {*sys.stdlib_module_names, "numpy"}
 class Source(NamedTuple):
     """A module of the package."""
 
-    name: str  # its dotted name below the package, "" for the package itself
+    name: str  # its full name
     text: str  # all of it
     tree: ast.Module  # its syntax tree
-    # module and name of what it imports from the package, by the name that it has here
-    inside: dict[str, str]
+    inside: dict[str, str]  # module of the package from which each imported name is
     outside: tuple[str, ...]  # the import lines that it needs from elsewhere
     # the statements that are of no use in one file: docstring, imports, `__all__`
     dropped: tuple[ast.stmt, ...]
 
 
-def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> str:
-    """The text of `jaxhil_runtime.py` for one compensator: all that `package` offers, but for other laws.
+def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
+    """Return the text of `jaxhil_runtime.py`: all that `package` offers, with one compensator.
 
-    Raises KeyError for a compensator that the runtime does not know, ValueError for a package that cannot be
-    put into one file: an import that is within a function, circular, renamed, or neither of the standard
-    library nor of NumPy; a name that two modules bind.
+    Raise KeyError for a compensator that the rig does not know, and ValueError for modules that cannot be put
+    into one file: an import within a function, circular, relative, renamed, or of another package than this,
+    the standard library and NumPy; a name that two modules bind.
     """
-    laws = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS
-    law, own = laws[compensator].__module__.removeprefix(f"{package.__name__}."), {}
-    if law == laws[compensator].__module__:
-        law = f"laws.{compensator}"
-        own[law] = source_of(module_text(laws[compensator], compensator), law, f"{compensator}.py")
-    offered = read_source(Path(str(package.__file__)), "")
-    sources = _in_order(Path(str(package.__file__)).parent, [law, *_offering(offered)], own)
+    root = package.__name__.partition(".")[0]
+    class_ = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS[compensator]
+    law, own = class_.__module__, {}
+    if law.partition(".")[0] != root:
+        own[law] = source_of(module_text(class_, compensator), law, f"{compensator}.py", root)
+    offered = read_source(f"{package.__name__}.__init__")
+    sources = _in_order([law, *_offering(offered)], own)
     _check_unique(sources)
     public = [name for name in _public(offered) if name in offered.inside]
     imports = {line for source in sources for line in source.outside}
@@ -73,13 +72,17 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.runtime) -> st
     return text
 
 
-def read_source(path: Path, name: str) -> Source:
-    """A module of the package, its docstring, imports and `__all__` apart from what it does."""
-    return source_of(path.read_text(encoding="utf-8"), name, path.name)
+def read_source(name: str) -> Source:
+    """Return a module by its full name, its docstring, imports and `__all__` apart from what it does."""
+    root, _, below = name.partition(".")
+    path = Path(str(sys.modules[root].__file__)).parent / f"{below.replace('.', '/')}.py"
+    if not path.is_file():
+        raise ValueError(f"{name}: found no module's file, expected imports of names from modules")
+    return source_of(path.read_text(encoding="utf-8"), name, path.name, root)
 
 
-def source_of(text: str, name: str, file: str) -> Source:
-    """The same of a module's text; errors name the `file`."""
+def source_of(text: str, name: str, file: str, root: str) -> Source:
+    """Return the same of a module's text, of which imports from the package `root` are inside."""
     tree = ast.parse(text, file)
     inside: dict[str, str] = {}
     outside: list[str] = []
@@ -89,10 +92,10 @@ def source_of(text: str, name: str, file: str) -> Source:
         if not isinstance(node, (ast.Import, ast.ImportFrom)):
             continue
         where = f"{file}, line {node.lineno}"
-        if isinstance(node, ast.ImportFrom) and node.level:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{root}."):
             if node not in tree.body:
                 raise ValueError(f"{where}: an import of the package within a block")
-            inside.update(_from_inside(node, name, where))
+            inside.update(_from_inside(node, where))
         elif node in tree.body:
             outside.extend(_from_outside(node, where))
         if node in tree.body:
@@ -100,28 +103,31 @@ def source_of(text: str, name: str, file: str) -> Source:
     return Source(name, text, tree, inside, tuple(outside), tuple(dropped))
 
 
-def _from_inside(node: ast.ImportFrom, name: str, where: str) -> Iterator[tuple[str, str]]:
-    """Each name that a relative import binds, and the module that it is from."""
-    above = name.split(".")[: -node.level] if name else []
+def _from_inside(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
+    """Yield each name that an import of the package binds, and the module that it is from."""
     for alias in node.names:
-        if node.module is None or alias.asname is not None:
-            raise ValueError(f"{where}: imports {alias.name}, allowed names of a module, under no other name")
-        yield alias.name, ".".join([*above, node.module])
+        if alias.asname is not None:
+            raise ValueError(f"{where}: imports {alias.name} under another name, allowed its own")
+        yield alias.name, str(node.module)
 
 
 def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
     """One import line for each name."""
     for alias in node.names:
         module = node.module or "" if isinstance(node, ast.ImportFrom) else alias.name
+        if isinstance(node, ast.ImportFrom) and node.level:
+            raise ValueError(f"{where}: a relative import, allowed imports by a module's full name")
         if module.partition(".")[0] not in OUTSIDE:
             raise ValueError(f"{where}: imports {module}, allowed the standard library and NumPy")
         named = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
         yield f"from {module} {named}" if isinstance(node, ast.ImportFrom) else named
 
 
-def _in_order(folder: Path, wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
-    """The modules wanted and what they import, directly or not, each after those that it imports itself;
-    those of the `own` sources are not read from the folder."""
+def _in_order(wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
+    """Return the modules wanted and all that they import, each after its own imports.
+
+    The `own` sources are not read from files.
+    """
     ordered: dict[str, Source] = {}
 
     def visit(name: str, above: tuple[str, ...]) -> None:
@@ -129,7 +135,7 @@ def _in_order(folder: Path, wanted: Iterable[str], own: dict[str, Source]) -> li
             raise ValueError(f"modules that import each other: {' -> '.join([*above, name])}")
         if name in ordered:
             return
-        source = own.get(name) or read_source(folder / f"{name.replace('.', '/')}.py", name)
+        source = own.get(name) or read_source(name)
         for needed in dict.fromkeys(source.inside.values()):
             visit(needed, (*above, name))
         ordered[name] = source

@@ -17,9 +17,9 @@ import numpy as np
 
 from jaxhil.mechanism.correlation import certain
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import Controller
-from jaxhil.runtime.faults import LAW_IN_DOUBT, names
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
+from jaxhil.rig import Controller
+from jaxhil.rig.faults import LAW_IN_DOUBT, names
+from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, shown
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 
 NODE = "/jaxhil_controller"
 LONGEST_MATLAB_NAME = 63

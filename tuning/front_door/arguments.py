@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import open_input
+from jaxhil.laws import names
 from jaxhil.mechanism.file import AnyMechanism, LoadedAny, LoadedMechanism, source_sha256
 from jaxhil.mechanism.loading import as_any_mechanism, as_mechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime.laws import LAWS
 
 if TYPE_CHECKING:
     from jaxhil.simulation.gain_file import LoadedGains
@@ -26,7 +26,7 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-SIX_AXES = ("none", "phase_lead", "phase_lead_per_axis")  # compensators of six axes
+SIX_AXES = names(6)
 
 
 class ArgumentError(InputError):
@@ -117,15 +117,15 @@ def not_in_six_axes(mechanism: AnyMechanism, **given: Any) -> None:
 
 def compensator_names() -> tuple[str, ...]:
     """Of all compensators, the registered ones last. Starts no jax where there are none."""
-    loaded = sys.modules.get("jaxhil.compensators")
-    return tuple(dict.fromkeys([*LAWS, *(loaded.COMPENSATORS if loaded else ())]))
+    loaded = sys.modules.get("jaxhil.laws.compensators")
+    return tuple(dict.fromkeys([*names(), *(loaded.COMPENSATORS if loaded else ())]))
 
 
 def setting(compensator: str, value: Any) -> None:
     """The compensator has a setting of that name, if one is given. Imports jax then."""
     if value is None:
         return
-    from jaxhil.compensators import compensator_of
+    from jaxhil.laws.compensators import compensator_of
 
     names = compensator_of(compensator).settings
     if value not in names:
@@ -200,7 +200,7 @@ def readable_gain_file(given: Any, argument: str = "gains") -> Path:
 
 def runtime(compensator: str) -> None:
     """The law can run on the rig. Raises `InputError` for one that was registered without a runtime."""
-    from jaxhil.runtime import COMPENSATORS
+    from jaxhil.rig import COMPENSATORS
 
     if compensator not in COMPENSATORS:
         raise InputError(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff, arg
 
 from jaxhil.errors import InputError, shown
+from jaxhil.laws import names
 from jaxhil.mechanism.file import LoadedMechanism
-from jaxhil.runtime.laws import PUBLISHED
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning
@@ -18,9 +18,6 @@ from tuning.front_door.options import Allowed, AnyLimit, Scheduler, Seed, check_
 if TYPE_CHECKING:
     from tuning.benchmark.study import LawFigures
     from tuning.caches.pieces import Pieces
-
-
-OURS = "impulse_ledger"
 
 
 class Estimated(float):
@@ -84,8 +81,8 @@ class CompareOptions:
 
     @property
     def laws(self) -> tuple[str, ...]:
-        """The compensators to compare, each once; if none is named, all that are published and our own."""
-        return tuple(dict.fromkeys(self.compensators or (*PUBLISHED, OURS)))
+        """Return the compensators to compare, each once; all built-in ones if none is named."""
+        return tuple(dict.fromkeys(self.compensators or names()))
 
 
 @arguments.entry
@@ -168,7 +165,7 @@ def check_names(loaded: Sequence[LoadedMechanism]) -> None:
 
 def board(one: LoadedMechanism, options: CompareOptions, found: "Mapping[str, LawFigures]") -> Board:
     """What is said of one mechanism, of the laws that are done."""
-    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.laws.compensators import COMPENSATORS
     from tuning.benchmark.tables import winners
 
     laws = [found[law] for law in options.laws if law in found]

@@ -10,7 +10,7 @@ from msgspec import to_builtins
 from tyro.conf import arg
 
 from jaxhil.errors import shown
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.bundle.selftest import SIGNATURE

@@ -13,7 +13,7 @@ from jaxhil.errors import InputError
 from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning
@@ -112,7 +112,7 @@ def map(
         raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
     checked, target = as_mechanism(mechanism), None if folder is None else arguments.folder("folder", folder)
     with computing():
-        from jaxhil.compensators import COMPENSATORS
+        from jaxhil.laws.compensators import COMPENSATORS
         from jaxhil.simulation.gain_choice import choose_gains
         from tuning.caches.pieces import FOLDER, Pieces
         from tuning.reporting.map_axes import check_axes, parse_axis

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
 from tuning.front_door import arguments, meaning, sweep_studies

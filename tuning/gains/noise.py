@@ -5,7 +5,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jaxhil.compensators import COMPENSATORS, Compensator, Constants
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Compensator, Constants
 
 
 def has_trade_off(compensator: str) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from tuning.gains.multistart import choose_starts
 from tuning.gains.noise import amplification, has_trade_off
 from tuning.gains.objective import FAILED, Objective

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxhil.compensators import COMPENSATORS
-from jaxhil.compensators.base import Constants, Gains
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Constants, Gains
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.building import build_loop

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
-from jaxhil.compensators import Gain, compensator_of, literature_gains
 from jaxhil.contact.laws import ContactLaw
+from jaxhil.laws.compensators import compensator_of, literature_gains
+from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import quasi_random

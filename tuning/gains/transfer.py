@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import COMPENSATORS, literature_gains
 from jaxhil.contact.laws import contact_law
+from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import build_scenarios

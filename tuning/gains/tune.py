@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import compensator_of
+from jaxhil.laws.compensators import compensator_of
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome

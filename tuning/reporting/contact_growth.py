@@ -21,9 +21,9 @@ import numpy as np
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
 
-from jaxhil.compensators import COMPENSATORS, Gains
-from jaxhil.compensators.base import Compensator, Constants, Signals
 from jaxhil.contact.laws import contact_law
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.simulation_base import Compensator, Constants, Gains, Signals
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.scenario import Scenario

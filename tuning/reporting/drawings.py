@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from jaxhil.compensators import literature_gains
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.contact_plot import BLACK, SKY, VERMILION, contact_plot, finish, new_figure
 from jaxhil.simulation.gain_file import LoadedGains

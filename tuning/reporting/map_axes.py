@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.compensators import Compensator
 from jaxhil.errors import InputError, shown
+from jaxhil.laws.simulation_base import Compensator
 from jaxhil.mechanism.conversion import close_match, dotted
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from jaxhil.mechanism.overrides import KeyProblem, parse_key

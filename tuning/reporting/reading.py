@@ -13,7 +13,7 @@ import msgspec
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import open_plain
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from tuning.bundle import selftest
 from tuning.reporting.documents import (

@@ -48,7 +48,7 @@ else:
     # Not in a bundle but in the source tree.
     if not __package__:
         sys.path.insert(0, str(HERE.parents[1]))
-    from jaxhil.runtime import Controller
+    from jaxhil.rig import Controller
     from tuning.rig import udp_protocol as udp
 
 CPU_SHARE = 0.5  # of the period, that is the controller's

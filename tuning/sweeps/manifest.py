@@ -14,11 +14,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from jaxhil.compensators import compensator_of
 from jaxhil.contact.laws import contact_law
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import open_plain
-from jaxhil.runtime import digest
+from jaxhil.laws.compensators import compensator_of
+from jaxhil.rig import digest
 from jaxhil.simulation.environment import rounding_flags, xla_flags
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.sources import sources_sha256, versions

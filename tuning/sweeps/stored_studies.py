@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from jaxhil.files import make_folder, open_plain, write_whole, writing
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.manifest import LARGEST, Manifest
 from tuning.sweeps.store import STUDIES, Store

@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.compensators import compensator_of
 from jaxhil.contact.laws import contact_law
 from jaxhil.contact.reference import Reference
+from jaxhil.laws.compensators import compensator_of
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios

@@ -1,7 +1,7 @@
 """The loop closed over the runtime's controller: the contacts of one scenario as the rig will run them.
 
 Sensors, motion simulator and contact are those of the simulation, in jax; in the place of its controller
-stands that of `jaxhil.runtime`, in plain Python, called tick by tick.
+stands that of `jaxhil.rig`, in plain Python, called tick by tick.
 """
 
 import dataclasses
@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxhil.compensators import Compensator, Gain, Gains, Signals
-from jaxhil.runtime.gain_file import GainFile
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, Signals
+from jaxhil.rig.gain_file import GainFile
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.gain_file import LoadedGains

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
-from jaxhil.compensators import Signals
-from jaxhil.runtime import Controller
-from jaxhil.runtime.gain_file import GainFile, check_gain_document
-from jaxhil.runtime.limits import NO_LIMITS
+from jaxhil.laws.simulation_base import Signals
+from jaxhil.rig import Controller
+from jaxhil.rig.gain_file import GainFile, check_gain_document
+from jaxhil.rig.limits import NO_LIMITS
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_bounds import BRIEFLY
 from jaxhil.simulation.evaluation import Outcome, compare_with_reference

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from jaxhil.runtime import Controller, faults
-from jaxhil.runtime.gain_file import GainFile
-from jaxhil.runtime.law_status import STATUSES
-from jaxhil.runtime.limits import LIMITS, NO_LIMITS
-from jaxhil.runtime.watchdog import Watchdog
+from jaxhil.rig import Controller, faults
+from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.law_status import STATUSES
+from jaxhil.rig.limits import LIMITS, NO_LIMITS
+from jaxhil.rig.watchdog import Watchdog
 
 if TYPE_CHECKING:  # it stands on JAX, which takes a second that an early refusal need not wait for
     from jaxhil.simulation.recording import Lane
@@ -43,7 +43,7 @@ STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 class Stop(msgspec.Struct, frozen=True, kw_only=True):
     """What stopped a run, or interfered with it first."""
 
-    fault: str  # its name, as in `jaxhil.runtime.faults`
+    fault: str  # its name, as in `jaxhil.rig.faults`
     by: str  # "watchdog" or "guard"
     tripped: bool  # whether the controller tripped; else it only flagged a reading or cut a command
     contact: int  # under way, just audited, or ahead; from 1

@@ -1,6 +1,6 @@
 """The watchdog's audit of recorded contacts, many lanes at a time: what it will see on the rig, in NumPy.
 
-The accumulators are those of `jaxhil.runtime.watchdog`, of which this is the same arithmetic with a trailing
+The accumulators are those of `jaxhil.rig.watchdog`, of which this is the same arithmetic with a trailing
 axis of lanes: begin and end of every contact on the rig's terms, velocities, energy balance, and the least
 squares of the measured force on the delay-aligned measured position and its rate.
 """
@@ -8,10 +8,10 @@ squares of the measured force on the delay-aligned measured position and its rat
 from typing import NamedTuple
 
 import numpy as np
+from jaxhil.rig.filters import DelayLine
 from jaxtyping import Bool, Float, Int
 
-from jaxhil.runtime.filters import DelayLine
-from jaxhil.runtime.watchdog import FADED, PATIENCE
+from jaxhil.rig.watchdog import FADED, PATIENCE
 from tuning.watchdog.recorded import Signals
 
 

@@ -14,9 +14,9 @@ from jaxtyping import Bool
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.uncertainty import extremes
-from jaxhil.runtime.law_status import UNSTATED
-from jaxhil.runtime.limits import LIMITS
-from jaxhil.runtime.registry import COMPENSATORS
+from jaxhil.rig.law_status import UNSTATED
+from jaxhil.rig.limits import LIMITS
+from jaxhil.rig.registry import COMPENSATORS
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
@@ -45,7 +45,7 @@ ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be bett
 class Calibration(NamedTuple):
     """What a gain file says of its limits."""
 
-    # by name [SI units], all of `jaxhil.runtime.limits.LIMITS`; None for no limit
+    # by name [SI units], all of `jaxhil.rig.limits.LIMITS`; None for no limit
     limits: dict[str, float | None]
     rates: dict[str, Any]  # what is known of the watchdog's alarms under them, plain data
 

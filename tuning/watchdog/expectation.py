@@ -1,7 +1,7 @@
 """The restitution that the watchdog expects of a contact, fitted to recorded contacts.
 
 A polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 and z = b/(2 sqrt(k M)), k and b as the watchdog identifies
-them (`jaxhil.runtime.watchdog`). An unknown delay delta of the force changes k by a factor cos(omega delta)
+them (`jaxhil.rig.watchdog`). An unknown delay delta of the force changes k by a factor cos(omega delta)
 only, but b by -k delta, which nothing on the rig can tell from damping: b is used only where it helps
 contacts that were not fitted.
 """
@@ -51,7 +51,7 @@ class Features(NamedTuple):
 
 
 def expected_restitution(expectation: Expectation, features: Features, mass: float) -> np.ndarray:
-    """What the watchdog expects; the arithmetic is `jaxhil.runtime.watchdog.Expectation`'s."""
+    """What the watchdog expects; the arithmetic is `jaxhil.rig.watchdog.Expectation`'s."""
     p, w, z = _shares(features, expectation.stiffness, expectation.velocity, mass)
     p = _within(np.where(features.stiffness > 0, p, np.inf), expectation.softness)
     z = _within(np.where(features.stiffness > 0, z, -np.inf), expectation.loss)

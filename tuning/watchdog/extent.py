@@ -33,7 +33,7 @@ class Extent(NamedTuple):
 def extent_of(
     signals: Signals, period: float, clearance: float, free_distance: float, settling: float
 ) -> Extent:
-    """The extent of every lane's runs; flight is what `jaxhil.runtime.inputs` calls so."""
+    """The extent of every lane's runs; flight is what `jaxhil.rig.inputs` calls so."""
     live, begins = signals.live, signals.begins
     force, position, velocity, measured, command, sent = (np.where(live, leaf, 0.0) for leaf in signals[:6])
     goes_on = live[1:] & ~begins[1:]

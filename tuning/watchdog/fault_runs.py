@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxhil.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import evaluate, lanes_of
 from jaxhil.simulation.gain_file import LoadedGains

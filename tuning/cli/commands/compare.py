@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.environment import prepare, usable_cores
 from tuning import terminal
 from tuning.cli.commands import checks
@@ -109,7 +109,7 @@ def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence
 def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
-    from jaxhil.compensators import COMPENSATORS
+    from jaxhil.laws.compensators import COMPENSATORS
     from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
     from tuning.benchmark.tables import leaderboard, least, mechanism_table
 

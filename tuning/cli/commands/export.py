@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, shown
-from jaxhil.runtime.limits import LIMITS
+from jaxhil.rig.limits import LIMITS
 from tuning import terminal
 from tuning.cli.options_rig import Export
 from tuning.front_door.export import ExportOptions, allowed_values, export

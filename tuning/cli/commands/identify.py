@@ -11,7 +11,7 @@ from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_builtins, load
 from jaxhil.mechanism.overrides import parse_override
 from jaxhil.mechanism.structs import Mechanism, value_at
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.sources import versions
 from tuning import terminal
 from tuning.cli.commands import checks, identify_design

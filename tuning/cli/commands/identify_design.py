@@ -12,7 +12,7 @@ from jaxhil.errors import InputError, one_line
 from jaxhil.files import write_whole, writing
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import numeric_keys
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.environment import computing
 from jaxhil.simulation.sources import versions
 from tuning import terminal

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.mechanism.file import load
-from jaxhil.runtime import digest
+from jaxhil.rig import digest
 from jaxhil.simulation.sources import versions
 from tuning import terminal
 from tuning.cli.commands.identify import read_logs

@@ -99,8 +99,8 @@ def controller_folder(compensator: str, scratch: Path) -> Path:
 def load(gains: Path) -> tuple[dict[str, Any], Any]:
     """The gain file's document and mechanism, checked as on the rig. Raises InputError."""
     from jaxhil.mechanism.file import from_builtins
-    from jaxhil.runtime import GainFileError
-    from jaxhil.runtime.gain_file import check_gain_document, read_gain_document
+    from jaxhil.rig import GainFileError
+    from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 
     source = one_line(str(gains))
     try:
@@ -113,7 +113,7 @@ def load(gains: Path) -> tuple[dict[str, Any], Any]:
 
 def stroke(document: dict[str, Any]) -> tuple[float, float]:
     """The least and largest position command [m] that a gain document allows."""
-    from jaxhil.runtime.gain_file import check_gain_document
+    from jaxhil.rig.gain_file import check_gain_document
 
     limits = check_gain_document(document).limits
     return limits["command_lowest"], limits["command_highest"]

@@ -278,7 +278,7 @@ def _carried_over(result) -> list[dict[str, Any]]:
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
     """Import and compile what drawing needs, while the solver's program compiles on another core."""
-    from jaxhil.compensators import literature_gains
+    from jaxhil.laws.compensators import literature_gains
     from jaxhil.simulation.motion import prepare_motion
     from tuning.gains.tune import uncompensated
     from tuning.pictures import plots  # noqa: F401

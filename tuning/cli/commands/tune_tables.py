@@ -103,7 +103,7 @@ def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
 
 def _gains(options: Tune, result: Any) -> list[Any]:
     """The table of gains; none of a law without any."""
-    from jaxhil.compensators import compensator_of
+    from jaxhil.laws.compensators import compensator_of
 
     mechanism = result.mechanism
     rows = [

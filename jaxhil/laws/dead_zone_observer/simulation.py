@@ -1,0 +1,152 @@
+"""Phase lead, and an observer of what the force sensor's dead zone withholds.
+
+    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the deflection by x_a as late as F is
+
+After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz), of which no more than
+this is known here: what follows is our realisation. A disturbance observer adds Q (F_n - F), F_n the force by
+a nominal model. Of a dead zone more is known: it takes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz), so
+that the nominal model k_n d need only stand for F in there. Where k_n is right the two are the same; else
+k_n is wrong only where |F| < dz, and above it what is added is dz, whatever k_n.
+
+Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1), 31 Hz. Its
+lag 1/(2 pi f) would be a delay; by so much less is x_a delayed (`identification_delay`), for which f is at
+least 1/(2 pi tau_f).
+
+A dead zone moves the surface of a linear contact by dz/k: its restitution is what it was, with any delay, but
+the hardware is pressed deeper, by dz more than without. That is what the observer makes up for.
+"""
+
+import math
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.contact.laws import deflection
+from jaxhil.laws.shared.delay_line import Delay, DelayLine, delayed, empty, split
+from jaxhil.laws.shared.estimates import (
+    DEAD_ZONE,
+    FORCE_DELAY,
+    STIFFNESS,
+    force_delay,
+    peak_force,
+    typical_stiffness,
+)
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    lead,
+    lead_amplification,
+    lead_filter,
+)
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_gain
+from jaxhil.mechanism.structs import Mechanism
+
+NEAR_1 = 15.0, 0.9  # up to this frequency [Hz] |Q| is at least this
+
+
+def _widest(mechanism: Mechanism) -> float:
+    """Where [Hz] Q's pole is 0: beyond, its output would swing at every second tick."""
+    return 1 / (math.pi * mechanism.rig.control_period)
+
+
+def _nominal_bandwidth(mechanism: Mechanism) -> float:
+    frequency, gain = NEAR_1
+    widest, delay = _widest(mechanism), force_delay(mechanism)
+    without_lag = 1 / (2 * math.pi * delay) if delay > 0 else widest
+    return min(max(frequency / math.sqrt(1 / gain**2 - 1), without_lag), widest)
+
+
+def _nominal_alignment(mechanism: Mechanism) -> float:
+    return max(force_delay(mechanism) - 1 / (2 * math.pi * _nominal_bandwidth(mechanism)), 0.0)
+
+
+class DeadZoneObserverState(NamedTuple):
+    """What the law carries from tick to tick."""
+
+    lead: LeadState  # lead filter
+    withheld: Float[Array, "*batch"]  # Q's input of the tick before [N]
+    observed: Float[Array, "*batch"]  # Q's output of the tick before [N]
+    line: DelayLine  # measured positions
+
+
+class Prepared(NamedTuple):
+    """What is worked out once per run."""
+
+    gains: Gains  # of the law
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]
+    lead: LeadFilter  # lead filter
+    pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1))
+    share: Float[Array, "*batch"]  # of Q's input
+    delay: Delay  # by which positions are aligned
+
+
+class DeadZoneObserver(Compensator):
+    """Phase lead of the force and of what the dead zone withholds; see the module's text."""
+
+    name: ClassVar[str] = "dead_zone_observer"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)
+    waits_for_contact: ClassVar[bool] = True
+    gains: ClassVar[tuple[Gain, ...]] = (
+        PHASE_LEAD,
+        LEAD_FILTER,
+        rig_gain(
+            "observer_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m), typical_stiffness
+        ),
+        rig_gain(
+            "observer_bandwidth", lambda m: 0.1 * _nominal_bandwidth(m), _widest, _nominal_bandwidth,
+            logarithmic=True,
+        ),
+        rig_gain(
+            "observer_limit", lambda m: 0.0,
+            lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
+            lambda m: m.rig.force_sensor.dead_zone, neutral=0.0,
+        ),
+        rig_gain(
+            "identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
+            _nominal_alignment,
+        ),
+    )  # fmt: skip
+
+    def prepare(self, gains, constants):
+        period = constants.control_period
+        corner = (2 * math.pi) * gains["observer_bandwidth"] * period
+        scale = 1 / (2 + corner)
+        return Prepared(
+            gains,
+            constants.clearance,
+            lead_filter(gains, constants),
+            (2 - corner) * scale,
+            corner * scale,
+            split(gains["identification_delay"], period),
+        )
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return DeadZoneObserverState(LeadState(zeros, zeros), zeros, zeros, empty(ring, zeros))
+
+    def restart(self, gains, state, begins, fresh):
+        return state._replace(
+            lead=cleared(state.lead, begins),
+            withheld=jnp.where(begins, 0, state.withheld),
+            observed=jnp.where(begins, 0, state.observed),
+        )
+
+    def step(self, prepared, state, signals, tick):
+        gains = prepared.gains
+        aligned, line = delayed(prepared.delay, state.line, signals, tick)
+        force = gains["observer_stiffness"] * deflection(aligned, prepared.clearance)
+        most = gains["observer_limit"]
+        withheld = jnp.where(force > most, most, jnp.where(force < -most, -most, force))
+        observed = prepared.pole * state.observed + prepared.share * (withheld + state.withheld)
+        command, lead_state = lead(prepared.lead, state.lead, signals.force_measured + observed)
+        return command, DeadZoneObserverState(lead_state, withheld, observed, line)
+
+    def noise_amplification(self, gains, constants):
+        # What is observed knows nothing of the force readings.
+        return lead_amplification(lead_filter(gains, constants))
+
+
+COMPENSATOR = DeadZoneObserver()

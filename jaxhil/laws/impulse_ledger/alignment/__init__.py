@@ -1,0 +1,1 @@
+"""Position and velocity as old as the measured force."""

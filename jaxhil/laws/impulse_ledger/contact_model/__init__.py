@@ -1,0 +1,1 @@
+"""Contact model that is estimated from the readings."""

@@ -1,0 +1,1 @@
+"""Onset of contact, found by a cumulative sum."""

@@ -1,0 +1,1 @@
+"""Reference trajectory and its sensitivities."""

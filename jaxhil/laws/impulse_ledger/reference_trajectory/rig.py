@@ -1,0 +1,149 @@
+"""Reference trajectory: the motion that the model should have had at the time of the force reading.
+
+    x_r'' = -F_r,    F_r = max(f(x_r, v_r) + y - f(X, V), min(0, y))
+
+f is the contact model, (X, V) the hardware's motion as old as the reading y. The trajectory runs once, from
+the onset on. When the estimate of the model's parameters changes by d theta, it is corrected by its
+sensitivities s = d x_r/d theta, which are integrated beside it:
+
+    x_r += s.d theta,   v_r += s'.d theta,   s'' = -[phi(x_r, v_r) - phi(X, V) + k s + b s']
+
+k and b are slope and damping of the model at x_r. `bridge` continues the trajectory to the present. All
+values are scaled as in `contact_model`.
+
+Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
+"""
+
+from math import sqrt
+
+from jaxhil.laws.impulse_ledger.contact_model.rig import (
+    DAMPING,
+    DELAY,
+    DEPTH_DAMPING,
+    FRICTION,
+    PARAMETERS,
+    REACH,
+    UNLOADING,
+    Matrix,
+    Vector,
+    dot,
+    features,
+    force,
+    slope,
+)
+
+LOSSES = (DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION)
+STEPS = 12  # from the last reading to now
+FASTEST = 2.0  # speed; contact gives back no more than it took
+FARTHEST = 10.0  # s; depth of contact of 0.05 Hz, three times
+
+
+class ReferenceTrajectory:
+    """State of the reference trajectory.
+
+    Attributes:
+        depth, speed, force: of the trajectory at the time of the last reading [s, 1, 1/s].
+        deepest: largest depth so far [s].
+        released: whether the trajectory has left the surface.
+    """
+
+    __slots__ = ("_depths", "_losses", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
+
+    def __init__(self) -> None:
+        self.begin(0.0, [0.0] * PARAMETERS)
+
+    def begin(self, depth: float, theta: Vector) -> None:
+        """Begin at the onset, at a depth [s] and the speed 1, with these parameters of the model."""
+        self.depth = depth
+        self.speed = 1.0
+        self.force = 0.0
+        self.deepest = depth
+        self.released = False
+        self._theta = theta
+        self._depths = [0.0] * PARAMETERS  # s
+        self._speeds = [0.0] * PARAMETERS  # s'
+        self._losses = [0.0] * len(LOSSES)  # work of each dissipative feature
+
+    def correct(self, theta: Vector) -> None:
+        """Correct the trajectory for new parameters."""
+        changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
+        self._theta = theta
+        if not self.released:
+            self.depth = within(self.depth + dot(self._depths, changes), FARTHEST)
+        self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
+
+    def advance(self, period: float, reading: float, measured: Vector) -> None:
+        """Advance by one control period [s] (velocity Verlet) to the time of a reading [1/s] whose features
+        are `measured`."""
+        theta = self._theta
+        depth = self.depth + period * self.speed - 0.5 * (period * period) * self.force
+        speed = self.speed - period * self.force
+        self.deepest = depth if depth > self.deepest else self.deepest
+        self.released = self.released or (depth <= 0.0 and speed < 0.0)
+        undelayed = features(depth, speed, self.deepest, 0.0)
+        least = reading if reading < 0.0 else 0.0
+        push = dot(theta, undelayed) + (reading - dot(theta, measured))
+        push = 0.0 if self.released else (push if push > least else least)
+        if push != 0.0:
+            self._advance_sensitivities(period, depth, undelayed, measured)
+            self._losses = [
+                loss + period * speed * undelayed[j] for loss, j in zip(self._losses, LOSSES, strict=True)
+            ]
+        self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
+        self.depth = depth
+        self.force = push
+
+    def spread(self, covariance: Matrix, delay_variance: float) -> float:
+        """Return the standard deviation of the speed, sqrt(s' P s'), for a delay of this variance [s^2]."""
+        columns = [dot(row, self._speeds) for row in covariance]
+        total, known = dot(self._speeds, columns), covariance[DELAY][DELAY]
+        if known > 0.0:
+            by_delay = columns[DELAY] / known
+            total += by_delay * by_delay * (delay_variance - known)
+        return sqrt(total) if total > 0.0 else 0.0
+
+    def imbalance(self) -> float:
+        """Return the energy that the trajectory lost and the model's dissipation does not explain [1]."""
+        dissipated = 0.0
+        for j, loss in zip(LOSSES, self._losses, strict=True):
+            dissipated += self._theta[j] * loss
+        return 0.5 * (1.0 - self.speed * self.speed) - dissipated
+
+    def bridge(self, duration: float, misfit: float) -> tuple[float, float]:
+        """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
+        theta = self._theta
+        step = duration / STEPS
+        depth, speed, push = self.depth, self.speed, self.force
+        deepest, released = self.deepest, self.released
+        for _ in range(STEPS):
+            depth += step * speed - 0.5 * (step * step) * push
+            ahead = speed - step * push
+            deepest = depth if depth > deepest else deepest
+            later = force(theta, depth, ahead, deepest) + misfit
+            released = released or (ahead < 0.0 and (depth <= 0.0 or later <= 0.0))
+            later = 0.0 if released or later < 0.0 else later
+            speed -= 0.5 * step * (push + later)
+            push = later
+        return push, speed
+
+    def _advance_sensitivities(
+        self, period: float, depth: float, undelayed: Vector, measured: Vector
+    ) -> None:
+        theta = self._theta
+        inside = depth > 0.0
+        stiffness = slope(theta, depth)
+        damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if inside else 0.0
+        # Stiffer contact is not followed at this period.
+        stiffness = min(stiffness, 1.0 / (period * period))
+        damping = min(damping, 1.0 / period)
+        depths, speeds = self._depths, self._speeds
+        for j in range(PARAMETERS):
+            here = depths[j] + period * speeds[j]
+            rate = undelayed[j] - measured[j] + stiffness * here + damping * speeds[j]
+            speeds[j] -= period * rate
+            depths[j] += period * speeds[j]
+
+
+def within(value: float, limit: float) -> float:
+    """Return the value, limited to -limit and limit."""
+    return limit if value > limit else (-limit if value < -limit else value)

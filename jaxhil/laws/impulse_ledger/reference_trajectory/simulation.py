@@ -1,0 +1,88 @@
+"""Reference trajectory in JAX: trajectory, sensitivities and bridge of
+`jaxhil.laws.impulse_ledger.reference_trajectory.rig`, for batches.
+
+The equations and their source stand there.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DEPTH_DAMPING, REACH
+from jaxhil.laws.impulse_ledger.contact_model.simulation import dot, features, force, slope
+from jaxhil.laws.impulse_ledger.reference_trajectory.rig import FARTHEST, FASTEST, STEPS
+
+
+class Reference(NamedTuple):
+    """State of the reference trajectory at the time of the last reading."""
+
+    depth: Float[Array, "*batch"]  # x_r [s]
+    speed: Float[Array, "*batch"]  # v_r [1]
+    force: Float[Array, "*batch"]  # F_r [1/s]
+    deepest: Float[Array, "*batch"]  # largest depth so far [s]
+    released: Bool[Array, "*batch"]  # whether it has left the surface
+    depths: Float[Array, "parameters *batch"]  # s
+    speeds: Float[Array, "parameters *batch"]  # s'
+
+
+def begin(depth: Array, like: Array) -> Reference:
+    """Return the trajectory at the onset, at a depth [s]; `like` has the shape of the parameters."""
+    zeros = jnp.zeros_like(depth)
+    return Reference(depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like))
+
+
+def correct(old: Reference, changes: Array) -> Reference:
+    """Return the trajectory corrected for parameters that have changed."""
+    moved = jnp.where(old.released, 0, dot(old.depths, changes))
+    speed = _within(old.speed + dot(old.speeds, changes), FASTEST)
+    return old._replace(depth=_within(old.depth + moved, FARTHEST), speed=speed)
+
+
+def advance(old: Reference, theta: Array, period: Array, reading: Array, measured: Array) -> Reference:
+    """Return the trajectory one control period [s] later (velocity Verlet), at the time of a reading [1/s]
+    whose features are `measured`."""
+    depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
+    speed = old.speed - period * old.force
+    deepest = jnp.where(depth > old.deepest, depth, old.deepest)
+    released = old.released | ((depth <= 0) & (speed < 0))
+    undelayed = features(depth, speed, deepest, jnp.zeros_like(depth))
+    least = jnp.where(reading < 0, reading, 0)
+    push = dot(theta, undelayed) + (reading - dot(theta, measured))
+    push = jnp.where(released, 0, jnp.where(push > least, push, least))
+    damping = jnp.where(depth > 0, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
+    # Stiffer contact is not followed at this period.
+    stiffness = jnp.minimum(slope(theta, depth), 1 / (period * period))
+    damping = jnp.minimum(damping, 1 / period)
+    tick, moves = period[None], (push != 0)[None]
+    ahead = old.depths + tick * old.speeds
+    rates = undelayed - measured + stiffness[None] * ahead + damping[None] * old.speeds
+    speeds = old.speeds - jnp.where(moves, tick * rates, 0)
+    depths = old.depths + jnp.where(moves, tick * speeds, 0)
+    speed = _within(old.speed - 0.5 * period * (old.force + push), FASTEST)
+    return Reference(depth, speed, push, deepest, released, depths, speeds)
+
+
+def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tuple[Array, Array]:
+    """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
+    step = duration / STEPS
+
+    def advanced(_, old):
+        depth, speed, push, deepest, released = old
+        depth = depth + (step * speed - 0.5 * (step * step) * push)
+        ahead = speed - step * push
+        deepest = jnp.where(depth > deepest, depth, deepest)
+        later = force(theta, depth, ahead, deepest) + misfit
+        released = released | ((ahead < 0) & ((depth <= 0) | (later <= 0)))
+        later = jnp.where(released | (later < 0), 0, later)
+        return depth, speed - 0.5 * step * (push + later), later, deepest, released
+
+    # A loop, because it is compiled but once.
+    _, speed, push, _, _ = lax.fori_loop(0, STEPS, advanced, now[:5])
+    return push, speed
+
+
+def _within(value: Array, limit: float) -> Array:
+    """Return the value, limited to -limit and limit."""
+    return jnp.where(value > limit, limit, jnp.where(value < -limit, -limit, value))

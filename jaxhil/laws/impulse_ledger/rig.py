@@ -1,0 +1,294 @@
+"""Impulse ledger: a reference trajectory at the time of the readings, bridged to the present.
+
+A force reading tells what the numerical model should have felt D ago, D being the lag of hardware and force
+behind the model, measured in free flight at the onset. The law fits a contact model to the readings
+(`contact_model`), advances a reference trajectory at the time of the readings (`reference_trajectory`),
+bridges the D seconds to now with the fitted model, and steers the numerical model's velocity onto the result:
+
+    F_c = f_p + clip(c (v_d - T f_p/2 - v_p), -limit p, (1 + limit) p - f_p)
+
+f_p and v_p are force and speed of the bridged trajectory at the middle of the coming period, v_d is the
+model's velocity and p the peak force of contact as far as it is known. Forces are scaled by equivalent mass
+and approach speed, so that one set of gains serves every mechanism. In free flight, until the onset is
+detected (`onset_detection`), F_c = 0. A run that begins in contact has no approach speed to scale by: there
+F_c is the measured force.
+
+Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware leaves the
+surface. The estimate corrects the speed at which this contact ends. From the next contact on, it also aligns
+positions with readings and so lengthens D.
+"""
+
+from collections.abc import Mapping
+from math import inf, pi, sqrt
+from typing import ClassVar
+
+from jaxhil.laws.impulse_ledger.alignment.rig import Alignment
+from jaxhil.laws.impulse_ledger.contact_model.rig import HINGES, ContactModel, Vector, dot, features, slope
+from jaxhil.laws.impulse_ledger.onset_detection.rig import LEVEL, SETTLING, OnsetDetector
+from jaxhil.laws.impulse_ledger.reference_trajectory.rig import ReferenceTrajectory
+from jaxhil.rig.bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
+from jaxhil.rig.law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNEXPLAINED, UNSURE
+from jaxhil.rig.registry import Compensator, GainSpecification, register
+from jaxhil.rig.surfaces import deflection
+
+RELEASE_TIME = 0.03  # s for which the law acts after the hardware has left the surface
+LEAST_MOMENTUM = 1e-9  # kg m/s; below it forces cannot be scaled
+LONGEST_LAG = 0.2  # s; the lag D is at most that
+ONSET_PLACE = -0.5  # periods from the surface to the last free reading
+MISFIT = 0.003  # of a force, by which the contact model errs for `MISFIT_TIME`
+MISFIT_TIME = 0.001  # s
+OUTLYING = 16.0  # variances; a reading beyond that tells of contact
+HOLD_TIME = 0.004  # s; time constant of the misfit that the bridge holds
+SLOWEST = 1e-9  # speed; a slower one is at rest, but for rounding
+SHALLOW = 0.001  # s; depth below which a secant stiffness is not taken
+LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
+HIGHEST = 1.5  # peak forces that the bridged force is at most
+FEW_READINGS = 5  # in contact, below which the model is unsure
+LATE = 0.8  # share of the contact that is over at the onset, beyond which little time is left
+UNCERTAIN = 0.006  # standard deviation of the reference's speed, above which restitution is uncertain
+IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
+USUAL_PRELOAD = 1.0  # 1/s; prior spread of a preload, beside a specified one
+LARGEST_DELAY_SPREAD = 0.004  # s; beyond it the first order in the delay does not hold
+MOST_SPREADS = 3.0  # spreads by which the delay differs from the specified one at most
+ONSET_TICKS = 0.3  # periods by which the onset is uncertain: 1/sqrt(12)
+ONSET_MEAN = 0.25  # of the force at which the onset is detected: by how much contact begins too late
+ONSET_SPREAD = 0.4  # likewise, its standard deviation
+SPREADS = (
+    "prior_stiffness_spread",
+    "prior_slope_spread",
+    "prior_damping_spread",
+    "prior_depth_damping_spread",
+    "prior_unloading_spread",
+    "prior_friction_spread",
+    "prior_preload_spread",
+)  # gains: the prior standard deviations of the contact model
+
+
+@register("impulse_ledger")
+class ImpulseLedger(Compensator):
+    """Compensator with contact model, reference trajectory and bridge; see the module's text."""
+
+    __slots__ = (
+        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
+        "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass",
+        "_misfit", "_model", "_origin", "_outside", "_peak", "_period", "_readings", "_reference", "_side",
+        "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
+    )  # fmt: skip
+    _estimate: tuple[float, float]  # mean and variance of the delay after this contact
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        "equivalent_mass": GainSpecification("kg", *MASSES),
+        "identification_delay": GainSpecification("s", *TIMES),
+        "delay_spread": GainSpecification("s", 0.0, LARGEST_DELAY_SPREAD),
+        "force_noise": GainSpecification("N", *FORCES),
+        "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
+        "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_depth_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_unloading_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+        "prior_friction_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "prior_preload_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+        "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
+        "correction_limit": GainSpecification("1", 0.0, 20.0),
+    }
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        self._period = period
+        self._clearance = clearance
+        self._mass = gains["equivalent_mass"]
+        self._floor = gains["force_noise_floor"]
+        self._gain = gains["velocity_gain"]
+        self._correction_limit = gains["correction_limit"]
+        self._delay_spread = gains["delay_spread"]
+        self._stiffness = gains["prior_stiffness"]
+        self._spreads = [gains[name] for name in SPREADS]
+        self._identification_delay = gains["identification_delay"]
+        self._alignment = Alignment(gains["identification_delay"], period)
+        self._detector = OnsetDetector(gains["force_noise"])
+        self._model = ContactModel()
+        self._reference = ReferenceTrajectory()
+        self.reset()
+
+    def reset(self) -> None:
+        """Restart everything."""
+        self._delay = 0.0  # by which the force is older than specified, as far as known [s]
+        self._variance = self._delay_spread * self._delay_spread  # of the delay [s^2]
+        self.next_contact()
+
+    def next_contact(self) -> None:
+        """Restart everything but the estimate of the delay."""
+        self._since_start = 0.0  # ticks of this run
+        self._side = 1.0  # direction in which the surface is approached
+        self._speed = 0.0  # approach speed [m/s]; 0: nothing can be scaled
+        self._outside = 0.0  # ticks since the hardware left the surface
+        self._in_contact = False
+        self._detector.restart()
+        self.status = OUT_OF_CONTACT
+
+    @property
+    def force_delay(self) -> float:
+        """Estimated delay [s] of the force measurement."""
+        return self._identification_delay + self._delay
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """Return the force command F_c [N]."""
+        begins = self._since_start == 0.0
+        position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
+        position -= self._delay * velocity
+        settled = not self._since_start * self._period < SETTLING
+        self._since_start += 1.0
+        if begins:
+            reach = deflection(position_desired, self._clearance)
+            self._in_contact = reach != 0.0
+            self._side = 1.0 if reach > 0.0 else -1.0
+        if self._in_contact and not self._speed > 0.0:
+            return self._pass_on(force_measured, position_desired, position)
+        detector = self._detector
+        if not self._in_contact:
+            self.status = OUT_OF_CONTACT
+            self._approach(force_measured, position_desired, velocity_desired, position, settled)
+            if not detector.total > 0.0:
+                detector.learn(force_measured)
+                return 0.0
+            self._in_contact = detector.total > LEVEL
+        command = self._follow(force_measured - detector.bias, velocity_desired, position, velocity)
+        return command if self._in_contact else 0.0
+
+    def _approach(
+        self, force: float, position_desired: float, velocity_desired: float, position: float, settled: bool
+    ) -> None:
+        """Watch a reading of free flight; where it shows no contact, contact begins anew after it."""
+        side = 1.0 if velocity_desired > 0.0 or self._clearance == inf else -1.0
+        speed = side * velocity_desired
+        approaches = self._mass * speed > LEAST_MOMENTUM
+        detector = self._detector
+        # What comes after a reading of free flight, at a speed and towards a side that it is known for.
+        settled = settled and approaches and self._speed > 0.0 and side == self._side
+        detector.watch(force, side, self._floor * (self._mass * speed), settled)
+        if detector.total > 0.0:
+            return
+        self._side = side
+        self._speed = speed if approaches else 0.0
+        if not approaches:
+            return
+        self._origin = side * position - ONSET_PLACE * (self._period * speed)
+        lag = side * (position_desired - position) / speed
+        self._lag = 0.0 if lag < 0.0 else (LONGEST_LAG if lag > LONGEST_LAG else lag)
+        self._deepest = 0.0
+        self._misfit = 0.0
+        self._peak = 0.0
+        self._outside = 0.0
+        self._readings = 0
+        self._estimate = 0.0, self._variance
+        spreads = list(self._spreads)
+        preload = spreads[-1]
+        spreads[-1] = sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD)
+        self._model.restart(self._stiffness, spreads, self._variance)
+        self._reference.begin((side * position - self._origin) / speed, self._model.theta)
+
+    def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
+        """Return the command [N] after one reading of force [N], position [m] and velocity [m/s]."""
+        period, side, speed = self._period, self._side, self._speed
+        model, reference = self._model, self._reference
+        weight = self._mass * speed
+        depth = (side * position - self._origin) / speed
+        rate = side * velocity / speed
+        self._deepest = depth if depth > self._deepest else self._deepest
+        phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
+        reading = side * force / weight
+        off = MISFIT * reading
+        noise = self._detector.variance / (weight * weight)
+        variance = noise + self._floor * self._floor + off * off * (MISFIT_TIME / period)
+        tells = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
+        ended = not depth > 0.0 and rate < 0.0
+        learns = tells and depth > period
+        if learns:
+            model.learn(phi, reading, variance)
+            self._readings += 1
+        if not depth > 0.0:
+            onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + self._floor
+            onset += sqrt(noise) if noise > 0.0 else 0.0
+            known = self._spreads[-1]
+            spread = sqrt(known * known + (ONSET_SPREAD * onset) ** 2)
+            self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
+        if learns or ended:
+            model.conclude(self._estimate[0] if ended else 0.0)
+        reference.correct(model.theta)
+        reference.advance(period, reading, phi)
+        missed = reading - dot(model.theta, phi)
+        self._misfit += period / (period + HOLD_TIME) * (missed - self._misfit)
+        push, ahead = reference.bridge(self._lag + 0.5 * period, self._misfit)
+        command = self._command(push, ahead, depth, rate, reading, phi, side * velocity_desired / speed)
+        self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
+        if self._in_contact and reference.released and self._outside * period > RELEASE_TIME:
+            self._end()
+        return side * weight * command
+
+    def _command(
+        self,
+        push: float,
+        ahead: float,
+        depth: float,
+        rate: float,
+        reading: float,
+        phi: Vector,
+        desired: float,
+    ) -> float:
+        """Return the scaled command [1/s], by the bridged force [1/s] and speed and the model's speed."""
+        mean = self._model.mean
+        secant = dot(phi[:HINGES], mean[:HINGES]) / (depth if depth > SHALLOW else SHALLOW)
+        variance = self._model.covariance[0][0]
+        known = secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS
+        known -= sqrt(variance) if variance > 0.0 else 0.0
+        likely = sqrt(known if known > LEAST_STIFFNESS else LEAST_STIFFNESS)
+        self._peak = max(self._peak, reading, 1.0)
+        peak = likely if rate > SLOWEST and likely > self._peak else self._peak
+        push = push if push < HIGHEST * peak else HIGHEST * peak
+        wanted = self._gain * (desired - 0.5 * self._period * push - ahead)
+        least = -self._correction_limit * peak
+        most = (1.0 + self._correction_limit) * peak - push
+        correction = most if wanted > most else (least if wanted < least else wanted)
+        if self._in_contact:
+            self.status = self._judge(peak, correction == wanted)
+        return push + correction
+
+    def _judge(self, peak: float, free: bool) -> int:
+        """Return the status of a command whose correction is `free` of its limits, for a peak force [1/s]."""
+        reference = self._reference
+        if self._readings < FEW_READINGS:
+            return UNSURE
+        if self._lag * peak > LATE * pi:
+            return TOO_SHORT
+        if reference.spread(self._model.covariance, 0.0) > UNCERTAIN:
+            return NOISY
+        spread = reference.spread(self._model.covariance, self._estimate[1])
+        if reference.released and (
+            spread > UNCERTAIN or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
+        ):
+            return UNEXPLAINED
+        return IDENTIFIED if free else SATURATED
+
+    def _pass_on(self, force: float, position_desired: float, position: float) -> float:
+        """Return the measured force [N] of a run that began in contact, until both have left the surface."""
+        side = self._side
+        inside = side * deflection(position_desired, self._clearance) > 0.0
+        bent = side * deflection(position, self._clearance)
+        self._outside = 0.0 if bent > 0.0 else self._outside + 1.0
+        self.status = UNSURE
+        if not inside and self._outside * self._period > RELEASE_TIME:
+            self._end()
+            return 0.0
+        return force if inside and not bent < 0.0 else 0.0
+
+    def _end(self) -> None:
+        """End the contact."""
+        if self._speed > 0.0:
+            limit = MOST_SPREADS * self._delay_spread
+            shift, self._variance = self._estimate
+            self._delay = min(max(self._delay + shift, -limit), limit)
+        self._speed = 0.0
+        self._in_contact = False
+        self._detector.total = 0.0
+        self.status = OUT_OF_CONTACT

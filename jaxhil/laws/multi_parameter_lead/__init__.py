@@ -1,0 +1,1 @@
+"""Multi-parameter phase lead, by pole placement at the contact frequency."""

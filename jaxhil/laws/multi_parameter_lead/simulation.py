@@ -1,0 +1,99 @@
+"""Multi-parameter phase lead (Osaki, Konno): a F + b dF/dt, by pole placement at the contact frequency.
+
+Realised as a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead. The
+literature's rule puts a root of s^2 + omega^2 (a + b s) e^(-s tau) = 0, the contact delayed by tau, where the
+damped oscillation of the desired restitution has its own (notebooks/guide/model.md section 6, item 16).
+
+Nominal is a restitution of 1, tau the delay of the force measurement and the lag of the motion simulator
+together: what the loop adds is undone, and the mechanism's own damping, of which the model has none, is left
+to act.
+"""
+
+import cmath
+import math
+from typing import ClassVar
+
+from jaxhil.errors import InputError
+from jaxhil.laws.phase_lead.simulation import PhaseLead
+from jaxhil.laws.shared.estimates import (
+    CONTACT_FREQUENCY,
+    FORCE_DELAY,
+    SIMULATOR_LAG,
+    contact_frequency,
+    force_delay,
+    simulator_lag,
+)
+from jaxhil.laws.shared.lead_filter import LEAD_FILTER, LeadFilter
+from jaxhil.laws.simulation_base import Constants, Gain, Gains, rig_gain
+from jaxhil.mechanism.structs import Mechanism
+
+
+def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
+    """Gains a [1] and b [s] that give a contact of angular frequency omega [rad/s] behind a delay tau [s] the
+    desired restitution [1]: a + b s_d = -(s_d^2/omega^2) e^(s_d tau), s_d the damped oscillation's root.
+
+    Raises InputError unless omega and e are above 0 and all are finite.
+    """
+    for name, value, least in (
+        ("frequency", frequency, 0.0),
+        ("delay", delay, -math.inf),
+        ("restitution", restitution, 0.0),
+    ):
+        if not least < value < math.inf:
+            raise InputError(f"pole_placement: {name}: found {value!r}, allowed finite numbers > {least!r}")
+    decrement = -math.log(restitution)
+    ratio = decrement / math.hypot(math.pi, decrement)
+    root = frequency * complex(-ratio, math.sqrt(1 - ratio**2))
+    wanted = -((root / frequency) ** 2) * cmath.exp(root * delay)
+    rate = wanted.imag / root.imag
+    return wanted.real - rate * root.real, rate
+
+
+def _nominal(mechanism: Mechanism) -> tuple[float, float]:
+    delay = force_delay(mechanism) + simulator_lag(mechanism)
+    return pole_placement(contact_frequency(mechanism), delay, 1.0)
+
+
+def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
+    """a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
+    period = constants.control_period
+    slow = 2 * gains["lead_filter"]
+    scale = 1 / (slow + period)
+    constant, rate = gains["force_gain"], 2 * gains["force_rate_gain"]
+    return LeadFilter(
+        (slow - period) * scale,
+        (constant * (slow + period) + rate) * scale,
+        (constant * (period - slow) - rate) * scale,
+    )
+
+
+class MultiParameterLead(PhaseLead):
+    """F_c = a F + b dF/dt, filtered."""
+
+    name: ClassVar[str] = "multi_parameter_lead"
+    knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
+    waits_for_contact: ClassVar[bool] = True
+    # Beyond a quarter of an oscillation of delay a is negative, beyond half of one b is.
+    gains: ClassVar[tuple[Gain, ...]] = (
+        rig_gain(
+            "force_gain",
+            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[0]),
+            upper=lambda mechanism: 2.0,
+            nominal=lambda mechanism: _nominal(mechanism)[0],
+            neutral=1.0,
+        ),
+        rig_gain(
+            "force_rate_gain",
+            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[1]),
+            upper=lambda mechanism: 2 * max(0.0, _nominal(mechanism)[1]) + 0.02,
+            nominal=lambda mechanism: _nominal(mechanism)[1],
+            neutral=0.0,
+        ),
+        LEAD_FILTER,
+    )
+
+    def prepare(self, gains, constants):
+        return multi_parameter_filter(gains, constants)
+
+
+COMPENSATOR = MultiParameterLead()

@@ -1,0 +1,3 @@
+"""No compensation."""
+
+AXES = (1, 6)

@@ -1,0 +1,22 @@
+"""No compensation: the numerical model feels the measured force, F_c = F."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.rig.registry import Compensator, GainSpecification, register
+
+
+@register("none")
+class NoCompensation(Compensator):
+    """F_c = F. The baseline, whose contacts diverge with the loop's delay."""
+
+    __slots__ = ()
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {}
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        pass
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """The measured force [N]."""
+        return force_measured

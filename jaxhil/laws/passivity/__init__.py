@@ -1,0 +1,1 @@
+"""Passivity control: an adjustable damper dissipates observed energy."""

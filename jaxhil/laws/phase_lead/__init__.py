@@ -1,0 +1,3 @@
+"""Phase lead of the measured force."""
+
+AXES = (1, 6)

@@ -1,0 +1,35 @@
+"""Phase-lead force compensation, the filtered first-order inverse of a force delay."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.rig.bounds import FILTER_TIMES, TIMES
+from jaxhil.rig.filters import LeadFilter
+from jaxhil.rig.registry import Compensator, GainSpecification, register
+
+
+@register("phase_lead")
+class PhaseLead(Compensator):
+    """F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
+
+    T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`; the literature
+    sets it to the delay of the force measurement.
+    """
+
+    __slots__ = ("_lead",)
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+    }
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """The measured force [N], led."""
+        return self._lead.step(force_measured)
+
+    def reset(self) -> None:
+        """Restart the filter."""
+        self._lead.reset()

@@ -1,0 +1,42 @@
+"""Phase-lead force compensation (Shimoji): F + T_lead dF/dt, the first-order inverse of a force delay."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from jaxhil.laws.shared.estimates import FORCE_DELAY
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadState,
+    lead,
+    lead_amplification,
+    lead_filter,
+)
+from jaxhil.laws.simulation_base import Compensator, Gain
+
+
+class PhaseLead(Compensator):
+    """F_c = F + T_lead dF/dt, filtered."""
+
+    name: ClassVar[str] = "phase_lead"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
+    waits_for_contact: ClassVar[bool] = True
+    reads_position: ClassVar[bool] = False
+    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER)
+
+    def prepare(self, gains, constants):
+        return lead_filter(gains, constants)
+
+    def noise_amplification(self, gains, constants):
+        return lead_amplification(self.prepare(gains, constants))
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return LeadState(zeros, zeros)
+
+    def step(self, prepared, state, signals, tick):
+        return lead(prepared, state, signals.force_measured)
+
+
+COMPENSATOR = PhaseLead()

@@ -1,0 +1,3 @@
+"""Phase lead with a lead for each channel of the wrench."""
+
+AXES = (6,)

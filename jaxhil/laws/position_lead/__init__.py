@@ -1,0 +1,1 @@
+"""Lead of the commanded position by the inverse of the motion simulator."""

@@ -1,0 +1,1 @@
+"""Phase lead, response error and identified contact."""

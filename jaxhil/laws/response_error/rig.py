@@ -1,0 +1,148 @@
+"""Response-error force compensation with real-time identification of the contact.
+
+F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m)): y is the phase-led force, k and b the
+identified contact stiffness and damping, x_d - x_m the position by which the motion simulator lags
+the numerical model. No model of the simulator is used. The gate lets the response term act while
+the delay-aligned position is in contact, and opens and closes within two periods by where between
+the ticks the surface was met. F_c is not clamped: a clamp makes the divergence worse.
+
+Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
+stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that
+group.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.laws.shared.gates.rig import gate, share_beyond
+from jaxhil.laws.shared.recursive_least_squares.rig import ContactIdentification
+from jaxhil.rig.bounds import DAMPINGS, FILTER_TIMES, FORCES, STIFFNESSES, TIMES
+from jaxhil.rig.filters import DelayLine, LeadFilter, VelocityFilter
+from jaxhil.rig.registry import Compensator, GainSpecification, register
+from jaxhil.rig.surfaces import deflection
+
+
+@register("response_error")
+class ResponseError(Compensator):
+    """Phase lead, plus the force that the motion simulator's response error leaves out.
+
+    The measured force is late against the measured position, so the identification regresses it on
+    the position delayed by `identification_delay` (the delay-aligned position). That position x
+    deflects the contact by x where x > 0, by x + clearance where x < -clearance, and by 0 in
+    between. A reading counts by the gate of the contact times that of the force above
+    `contact_threshold`.
+    """
+
+    __slots__ = (
+        "_aligned", "_aligned_velocity", "_alignment", "_clearance", "_contact_share", "_force",
+        "_force_share", "_identification", "_lead", "_period", "_response_error", "_response_error_damping",
+        "_started", "_threshold", "_velocity",
+    )  # fmt: skip
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+        "response_error": GainSpecification("1", 0.0, 2.0),
+        "response_error_damping": GainSpecification("1", 0.0, 2.0),
+        "initial_stiffness": GainSpecification("N/m", *STIFFNESSES),
+        "initial_damping": GainSpecification("N s/m", *DAMPINGS),
+        "stiffness_covariance": GainSpecification("1/m^2", 0.0, 1e20),
+        "damping_covariance": GainSpecification("s^2/m^2", 0.0, 1e12),
+        "forgetting": GainSpecification("1", 0.5, 1.0),
+        "contact_threshold": GainSpecification("N", *FORCES),
+        "identification_delay": GainSpecification("s", *TIMES),
+        "velocity_filter": GainSpecification("s", *FILTER_TIMES),
+    }
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        self._period = period
+        self._clearance = clearance
+        self._threshold = gains["contact_threshold"]
+        self._response_error = gains["response_error"]
+        self._response_error_damping = gains["response_error_damping"]
+        self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
+        self._velocity = VelocityFilter(gains["velocity_filter"], period)
+        self._aligned_velocity = VelocityFilter(gains["velocity_filter"], period)
+        self._alignment = DelayLine(gains["identification_delay"], period)
+        self._identification = ContactIdentification(
+            gains["initial_stiffness"],
+            gains["initial_damping"],
+            gains["stiffness_covariance"],
+            gains["damping_covariance"],
+            gains["forgetting"],
+        )
+        self._aligned = 0.0
+        self._force = 0.0
+        self._contact_share = 0.0
+        self._force_share = 0.0
+        self._started = False
+
+    @property
+    def identified(self) -> tuple[float, float]:
+        """Identified stiffness [N/m] and damping [N s/m]."""
+        return self._identification.stiffness, self._identification.damping
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """The compensated force F_c [N]."""
+        if not self._started:
+            self._start(position_measured, velocity_desired)
+        force = self._lead.step(force_measured)
+        velocity_measured = self._velocity.step(position_measured)
+        aligned = self._alignment.step(position_measured)
+        aligned_velocity = self._aligned_velocity.step(aligned)
+
+        aligned_before = self._aligned
+        clearance = self._clearance
+        depth = deflection(aligned, clearance)
+        contact_share = share_beyond(depth, deflection(aligned_before, clearance), aligned - aligned_before)
+        contact_gate = gate(contact_share, self._contact_share)
+        threshold = self._threshold
+        size = abs(force_measured)
+        size_before = self._force
+        force_share = share_beyond(
+            size - threshold if size > threshold else 0.0,
+            size_before - threshold if size_before > threshold else 0.0,
+            size - size_before,
+        )
+        force_gate = gate(force_share, self._force_share)
+        self._aligned = aligned
+        self._force = size
+        self._contact_share = contact_share
+        self._force_share = force_share
+
+        if contact_gate == 0.0:
+            return force
+        identification = self._identification
+        if force_gate != 0.0:
+            identification.update(force_measured, depth, aligned_velocity, contact_gate * force_gate)
+        return force + contact_gate * (
+            self._response_error * identification.stiffness * (position_desired - position_measured)
+            + self._response_error_damping * identification.damping * (velocity_desired - velocity_measured)
+        )
+
+    def _start(self, position: float, velocity: float) -> None:
+        # Before the first tick the motion is uniform, so every filter begins in steady state.
+        alignment = self._alignment
+        alignment.start(position, velocity)
+        self._velocity.start(position, velocity)
+        aligned = alignment.step(position)
+        self._aligned_velocity.start(aligned, velocity)
+        self._aligned = aligned - self._period * velocity
+        # That step only asked for the aligned position: the tick itself takes the sample in.
+        alignment.start(position, velocity)
+        self._force = 0.0
+        self._contact_share = 0.0
+        self._force_share = 0.0
+        self._started = True
+
+    def reset(self) -> None:
+        """Restart filters, delay line and identification."""
+        self._lead.reset()
+        self._identification.reset()
+        self._started = False
+
+    def next_contact(self) -> None:
+        """Restart filters, delay line and covariance; keep the identified stiffness and damping."""
+        self._lead.reset()
+        self._identification.restart_covariance()
+        self._started = False

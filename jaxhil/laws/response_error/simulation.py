@@ -1,0 +1,229 @@
+"""The paper's compensation: phase lead, response error and real-time identification, delay-aligned.
+
+    F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
+
+The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
+motion simulator, of which no model is used (Qi et al. 2016; notebooks/guide/model.md section 5). k_hat and
+b_hat come from recursive least squares of the measured force on the measured position delayed by the same
+time (`identification_delay`): without that alignment they are biased (section 6, item 6). v_a is a filtered
+difference, s/(1 + T_v s) by Tustin's rule.
+
+`gate` is 1 while the aligned position is in contact and 0 outside; it opens and closes within two periods, by
+where between two ticks the surface was met (see `gates`). A reading's weight in the identification is that
+gate times another, of the measured force above `contact_threshold`: nothing jumps as a delay crosses a tick.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.contact.laws import deflection
+from jaxhil.laws.shared.delay_line import Delay, DelayLine, delayed, empty, split
+from jaxhil.laws.shared.estimates import (
+    FORCE_DELAY,
+    critical_damping,
+    force_delay,
+    is_damped,
+    noise_level,
+    peak_force,
+    typical_stiffness,
+)
+from jaxhil.laws.shared.gates.simulation import gate, share_beyond
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    lead,
+    lead_amplification,
+    lead_filter,
+)
+from jaxhil.laws.shared.recursive_least_squares.simulation import Identified, update
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_gain
+
+
+def _stiffness_covariance(mechanism) -> float:
+    """One sample at 3 % of the largest depth settles half of k_hat."""
+    return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
+
+
+def _damping_covariance(mechanism) -> float:
+    """One sample at the approach velocity settles half of b_hat."""
+    return 1 / mechanism.approach.velocity**2
+
+
+def _never(mechanism) -> bool:
+    """Of gains whose tuning would lower the error by less than a fifth and blur the search for the others."""
+    return False
+
+
+class ResponseErrorState(NamedTuple):
+    """What the law carries from tick to tick."""
+
+    lead: LeadState  # lead filter
+    position: Float[Array, "*batch"]  # measured at the tick before [m]
+    velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    aligned: Float[Array, "*batch"]  # position as old as the force, at the tick before [m]
+    aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    contact_share: Float[Array, "*batch"]  # of the last period in contact [1]
+    force_share: Float[Array, "*batch"]  # of the last period with a force above the threshold [1]
+    identified: Identified  # stiffness and damping
+    line: DelayLine  # readings that are delayed
+
+
+class Prepared(NamedTuple):
+    """What is worked out once per run."""
+
+    gains: Gains  # of the law
+    period: Float[Array, "*batch"]  # control period [s]
+    clearance: Float[Array, "*batch"]  # between two surfaces [m]
+    lead: LeadFilter  # lead filter
+    # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
+    rate_pole: Float[Array, "*batch"]
+    rate_gain: Float[Array, "*batch"]  # of that filter [1/s]
+    delay: Delay  # by which positions are aligned
+
+
+class ResponseError(Compensator):
+    """Phase lead + response error + identification; see the module's text."""
+
+    name: ClassVar[str] = "response_error"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
+    waits_for_contact: ClassVar[bool] = True
+    gains: ClassVar[tuple[Gain, ...]] = (
+        PHASE_LEAD,
+        LEAD_FILTER._replace(tuned=_never),
+        rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
+        rig_gain(
+            "response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
+            neutral=0.0, tuned=is_damped,
+        ),
+        rig_gain(
+            "initial_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
+            lambda m: 0.0, tuned=_never,
+        ),
+        rig_gain("initial_damping", lambda m: 0.0, critical_damping, lambda m: 0.0, tuned=_never),
+        rig_gain(
+            "stiffness_covariance", lambda m: 1e-3 * _stiffness_covariance(m),
+            lambda m: 1e1 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
+        ),
+        rig_gain(
+            "damping_covariance", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
+            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=_never,
+        ),
+        rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
+        rig_gain(
+            "contact_threshold", lambda m: 0.0, lambda m: max(peak_force(m), noise_level(m)),
+            lambda m: max(0.01 * peak_force(m), noise_level(m)), tuned=_never,
+        ),
+        rig_gain("identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02, force_delay),
+        rig_gain(
+            "velocity_filter", lambda m: 0.5 * m.rig.control_period,
+            lambda m: 20 * m.rig.control_period, lambda m: 2 * m.rig.control_period,
+            logarithmic=True, tuned=_never,
+        ),
+    )  # fmt: skip
+
+    def prepare(self, gains, constants):
+        period = constants.control_period
+        smoothing = 2 * gains["velocity_filter"]
+        scale = 1 / (smoothing + period)
+        return Prepared(
+            gains,
+            period,
+            constants.clearance,
+            lead_filter(gains, constants),
+            (smoothing - period) * scale,
+            2 * scale,
+            split(gains["identification_delay"], period),
+        )
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        identified = Identified(
+            zeros + gains["initial_stiffness"],
+            zeros + gains["initial_damping"],
+            zeros,
+            zeros + gains["stiffness_covariance"],
+            zeros + gains["damping_covariance"],
+        )
+        led, line = LeadState(zeros, zeros), empty(ring, zeros)
+        return ResponseErrorState(led, zeros, zeros, zeros, zeros, zeros, zeros, identified, line)
+
+    def restart(self, gains, state, begins, fresh):
+        old = state.identified
+        fresh = begins & fresh
+        return state._replace(
+            lead=cleared(state.lead, begins),
+            contact_share=jnp.where(begins, 0, state.contact_share),
+            force_share=jnp.where(begins, 0, state.force_share),
+            identified=old._replace(
+                coupling=jnp.where(fresh, 0, old.coupling),
+                stiffness_variance=jnp.where(fresh, gains["stiffness_covariance"], old.stiffness_variance),
+                damping_variance=jnp.where(fresh, gains["damping_covariance"], old.damping_variance),
+            ),
+        )
+
+    def step(self, prepared, state, signals, tick):
+        gains, period = prepared.gains, prepared.period
+        force, measured = signals.force_measured, signals.position_measured
+        # Before its first tick a run is in uniform motion: that is what every filter starts from.
+        begins = signals.age == 0
+        stride = period * signals.velocity_desired
+        before = jnp.where(begins, measured - stride, state.position)
+        aligned, line = delayed(prepared.delay, state.line, signals, tick)
+        aligned_before = jnp.where(begins, aligned - stride, state.aligned)
+
+        def rate(position, position_before, velocity_before):
+            velocity_before = jnp.where(begins, signals.velocity_desired, velocity_before)
+            change = position - position_before
+            return prepared.rate_pole * velocity_before + prepared.rate_gain * change
+
+        velocity = rate(measured, before, state.velocity)
+        aligned_velocity = rate(aligned, aligned_before, state.aligned_velocity)
+        depth = deflection(aligned, prepared.clearance)
+        depth_before = deflection(aligned_before, prepared.clearance)
+        contact_share = share_beyond(depth, depth_before, aligned - aligned_before)
+        contact_gate = gate(contact_share, state.contact_share)
+        threshold = gains["contact_threshold"]
+        size, size_before = jnp.abs(force), jnp.abs(state.lead.force)
+        excess, excess_before = (jnp.where(f > threshold, f - threshold, 0) for f in (size, size_before))
+        force_share = share_beyond(excess, excess_before, size - size_before)
+        identified = update(
+            state.identified,
+            gains["forgetting"],
+            (gains["stiffness_covariance"], gains["damping_covariance"]),
+            depth,
+            aligned_velocity,
+            force,
+            contact_gate * gate(force_share, state.force_share),
+        )
+        led, lead_state = lead(prepared.lead, state.lead, force)
+        response = gains["response_error"] * identified.stiffness * (
+            signals.position_desired - measured
+        ) + gains["response_error_damping"] * identified.damping * (signals.velocity_desired - velocity)
+        command = led + contact_gate * response
+        return command, ResponseErrorState(
+            lead_state,
+            measured,
+            velocity,
+            aligned,
+            aligned_velocity,
+            contact_share,
+            force_share,
+            identified,
+            line,
+        )
+
+    def noise_amplification(self, gains, constants):
+        # The lead filter's alone. Noise reaches k_hat too, whose part in F_c is smaller by (x_d - x_a)/depth
+        # and by the root of the number of samples remembered: half a percent of the whole in steady contact.
+        # A young contact, whose k_hat rests on a few shallow samples, is noisier in its first tenth.
+        return lead_amplification(lead_filter(gains, constants))
+
+    def identified(self, state):
+        return state.identified.stiffness, state.identified.damping
+
+
+COMPENSATOR = ResponseError()

@@ -1,0 +1,1 @@
+"""Parts that several compensators have in common."""

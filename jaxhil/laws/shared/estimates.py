@@ -1,0 +1,98 @@
+"""What a law knows of mechanism and rig before a run: estimates, from the nominal values of the file.
+
+They are never the values of a scenario: where the file states an uncertainty, the draw is what the estimate
+is wrong by. A law names what it must know in `Compensator.knows`.
+"""
+
+import math
+
+from jaxhil.contact.laws import contact_law
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import Mechanism
+
+FORCE_DELAY = "force delay"
+STIFFNESS = "contact stiffness"
+CONTACT_FREQUENCY = "contact frequency"
+SIMULATOR_LAG = "simulator lag"
+SIMULATOR_DYNAMICS = "simulator dynamics"
+DEAD_ZONE = "dead zone"
+FORCE_NOISE = "force noise"
+EQUIVALENT_MASS = "equivalent mass"
+
+
+def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
+    """The known delay [s] of the force measurement: transport plus first-order lag."""
+    sensor = mechanism.rig.force_sensor
+    return sensor.delay + sensor.time_constant
+
+
+def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
+    """a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
+
+    tau is the transport delay of the motion simulator and what latency and hold of the command add on
+    average: L T held linearly, (L - 1/2) T in jumps (notebooks/guide/model.md section 6, item 7).
+    """
+    rig = mechanism.rig
+    first, second = _inverse(rig.simulator)
+    delay = rig.simulator.delay
+    delay += (rig.command_latency - (0.0 if rig.command_hold == "linear" else 0.5)) * rig.control_period
+    return first + delay, second + first * delay + delay**2 / 2
+
+
+def simulator_lag(mechanism: Mechanism) -> float:
+    """By how much [s] the motion simulator follows a uniform motion late: a_1 of `simulator_inverse`."""
+    return simulator_inverse(mechanism)[0]
+
+
+def is_damped(mechanism: Mechanism) -> bool:
+    """Whether the mechanism's contact law dissipates, so that damping is worth identifying."""
+    return contact_law(mechanism.contact.law).damped and any(b > 0 for b in mechanism.contact.damping)
+
+
+def peak_force(mechanism: Mechanism) -> float:
+    """Return the order of the contact force [N], of the stiffest entry."""
+    contact = mechanism.contact
+    stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
+    mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
+    return contact_law(contact.law).nominal_peak_force(contact, stiffness, mass, velocity)
+
+
+def typical_stiffness(mechanism: Mechanism) -> float:
+    """Order of the contact stiffness [N/m]: M omega^2 of the stiffest entry."""
+    return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
+
+
+def contact_frequency(mechanism: Mechanism) -> float:
+    """Order of the contact's angular frequency [rad/s]: omega of the stiffest entry."""
+    return math.sqrt(typical_stiffness(mechanism) / mechanism.bodies.mass)
+
+
+def critical_damping(mechanism: Mechanism) -> float:
+    """2 sqrt(k M) [N s/m] of the stiffest entry."""
+    return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
+
+
+def noise_level(mechanism: Mechanism) -> float:
+    """What noise hardly ever exceeds [N]. A single reading that does, while penetration is next to nothing,
+    is a wild stiffness identified: beyond 3 standard deviations that happens in one contact of hundreds."""
+    sensor = mechanism.rig.force_sensor
+    return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
+
+
+def _inverse(simulator) -> tuple[float, float]:
+    """First and second coefficient of the series of 1/G."""
+    if simulator.model == "first_order":
+        return simulator.time_constant, 0.0
+    if simulator.model == "second_order":
+        frequency = 2 * math.pi * simulator.natural_frequency
+        return 2 * simulator.damping_ratio / frequency, 1 / frequency**2
+    if simulator.model == "third_order":
+        return simulator.coefficients[0], simulator.coefficients[1]
+    if simulator.model == "transfer_function":
+        # den/num as a series: the quotient's coefficients one after another, low powers first.
+        low = [*reversed(simulator.denominator), 0.0, 0.0][:3]
+        num = [*reversed(simulator.numerator), 0.0, 0.0][:3]
+        first = (low[1] - low[0] / num[0] * num[1]) / num[0]
+        second = (low[2] - low[0] / num[0] * num[2] - first * num[1]) / num[0]
+        return first, second
+    return 0.0, 0.0

@@ -1,0 +1,1 @@
+"""Gates that open and close smoothly with the time of a crossing."""

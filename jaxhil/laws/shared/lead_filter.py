@@ -1,0 +1,68 @@
+"""Lead filter (1 + T_1 s)/(1 + T_2 s) by Tustin's rule, in JAX, and the two gains that set it.
+
+T_1 = phase_lead + lead_filter and T_2 = lead_filter: the net lead is `phase_lead`. By the literature's rule
+it is the delay of the force measurement, and T_2 is one control period.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.laws.shared.estimates import force_delay
+from jaxhil.laws.simulation_base import Constants, Gains, rig_gain
+
+PHASE_LEAD = rig_gain(
+    "phase_lead",
+    lower=lambda mechanism: 0.0,
+    upper=lambda mechanism: 2 * force_delay(mechanism) + 0.02,
+    nominal=force_delay,
+    neutral=0.0,
+)
+LEAD_FILTER = rig_gain(
+    "lead_filter",
+    lower=lambda mechanism: 0.5 * mechanism.rig.control_period,
+    upper=lambda mechanism: 10 * mechanism.rig.control_period,
+    nominal=lambda mechanism: mechanism.rig.control_period,
+    logarithmic=True,
+)
+
+
+class LeadState(NamedTuple):
+    """The tick before."""
+
+    force: Float[Array, "*batch"]  # at the input [N]
+    output: Float[Array, "*batch"]  # [N]
+
+
+class LeadFilter(NamedTuple):
+    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
+
+    pole: Array  # of the output before
+    now: Array  # of the force
+    before: Array  # of the force before
+
+
+def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
+    """(1 + T_1 s)/(1 + T_2 s) with T_1 = phase_lead + lead_filter, T_2 = lead_filter, by Tustin's rule."""
+    period = constants.control_period
+    slow = 2 * gains["lead_filter"]
+    fast = slow + 2 * gains["phase_lead"]
+    scale = 1 / (slow + period)
+    return LeadFilter((slow - period) * scale, (fast + period) * scale, (period - fast) * scale)
+
+
+def lead(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
+    """One tick of the lead filter."""
+    output = filter_.pole * state.output + filter_.now * force + filter_.before * state.force
+    return output, LeadState(force, output)
+
+
+def lead_amplification(filter_: LeadFilter) -> Array:
+    """Standard deviation of the filter's output over that of white noise at its input.
+
+    The variance of y(n) = p y(n-1) + a F(n) + b F(n-1) for F of unit variance, stationary:
+    (a^2 + b^2 + 2 a b p)/(1 - p^2), the sum of the squares of its impulse response a, pa + b, p(pa + b), ...
+    """
+    pole, now, before = filter_
+    return jnp.sqrt((now**2 + before**2 + 2 * now * before * pole) / (1 - pole**2))

@@ -1,0 +1,1 @@
+"""Recursive least squares for contact stiffness and damping."""

@@ -1,0 +1,1 @@
+"""Base of the Smith predictor and its hybrid."""

@@ -1,0 +1,33 @@
+"""What `smith_predictor` and `smith_hybrid` share: a phase lead, and behind it a prediction of the force."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.rig.bounds import FILTER_TIMES, TIMES
+from jaxhil.rig.filters import LeadFilter
+from jaxhil.rig.registry import Compensator, GainSpecification
+
+
+class Smith(Compensator):
+    """The filters 1 + T_l s and 1 + T_s s/(1 + T_s s/2), each by Tustin's rule.
+
+    T_l = phase_lead, filtered with lead_filter as in phase lead; T_s = simulator_lag.
+    """
+
+    __slots__ = ("_lead", "_predictor")
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        "phase_lead": GainSpecification("s", *TIMES),
+        "lead_filter": GainSpecification("s", *FILTER_TIMES),
+        "simulator_lag": GainSpecification("s", *TIMES),
+    }
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        lag = gains["simulator_lag"]
+        self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
+        self._predictor = LeadFilter(lag, 0.5 * lag, period)
+
+    def reset(self) -> None:
+        """Restart the filters."""
+        self._lead.reset()
+        self._predictor.reset()

@@ -1,0 +1,86 @@
+"""What `smith_predictor` and `smith_hybrid` share: a phase lead, and behind it a prediction of the force."""
+
+import abc
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxhil.laws.shared.estimates import FORCE_DELAY, SIMULATOR_LAG, simulator_lag
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    lead,
+    lead_filter,
+)
+from jaxhil.laws.simulation_base import Compensator, Constants, Gain, Gains, rig_gain
+
+# An ideal simulator under commands held in jumps is half a period ahead: a lag below 0 is none to predict.
+LAG = rig_gain(
+    "simulator_lag",
+    lower=lambda mechanism: 0.0,
+    upper=lambda mechanism: 2 * max(0.0, simulator_lag(mechanism)) + 0.02,
+    nominal=lambda mechanism: max(0.0, simulator_lag(mechanism)),
+    neutral=0.0,
+)
+
+
+class Cascade(NamedTuple):
+    """Filters one behind the other, or their states."""
+
+    lead: Any  # 1 + T_l s, filtered as in phase lead
+    predictor: Any  # (1 + (3/2) T_s s)/(1 + T_s s/2)
+
+
+class Smith(Compensator):
+    """F_c from the force led and the force led and predicted; both filters by Tustin's rule."""
+
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
+    reads_position: ClassVar[bool] = False
+    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, LAG)
+    # A/(T_s/2) of the law's own transfer function behind the lead, (1 + A s)/(1 + T_s s/2).
+    excess: eqx.AbstractClassVar[float]
+
+    @abc.abstractmethod
+    def combined(self, led: Array, predicted: Array) -> Array:
+        """F_c [N]."""
+
+    def prepare(self, gains, constants):
+        period, lag = constants.control_period, gains["simulator_lag"]
+        scale = 1 / (lag + period)
+        predictor = LeadFilter((lag - period) * scale, (3 * lag + period) * scale, (period - 3 * lag) * scale)
+        return Cascade(lead_filter(gains, constants), predictor)
+
+    def noise_amplification(self, gains, constants):
+        return cascade_amplification(gains, constants, self.excess)
+
+    def init(self, gains, constants, ring):
+        zeros = jnp.zeros_like(constants.control_period)
+        return Cascade(LeadState(zeros, zeros), LeadState(zeros, zeros))
+
+    def step(self, prepared, state, signals, tick):
+        led, lead_state = lead(prepared.lead, state.lead, signals.force_measured)
+        predicted, predictor = lead(prepared.predictor, state.predictor, led)
+        return self.combined(led, predicted), Cascade(lead_state, predictor)
+
+
+def cascade_amplification(gains: Gains, constants: Constants, excess: float) -> Float[Array, "*batch"]:
+    """Standard deviation of white noise behind the lead and (1 + A s)/(1 + C s), C = T_s/2, A = excess C.
+
+    Tustin's rule maps the unit circle on the imaginary axis: the variance is T times the integral
+    (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, E = T/2, of the filter H before it was made discrete. With
+    numerator 1 + b_1 s + b_2 s^2 and denominator 1 + a_1 s + a_2 s^2 + a_3 s^3 that is (James, Nichols and
+    Phillips 1947, I_3) (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3)); in b_2^2/a_3 a factor C
+    cancels, and T_s = 0 leaves the lead alone.
+    """
+    period, pole = constants.control_period, gains["lead_filter"]
+    zero = pole + gains["phase_lead"]
+    half, lag = period / 2, gains["simulator_lag"] / 2
+    b_1, b_2 = zero + excess * lag, zero * excess * lag
+    a_1, a_2 = pole + half + lag, pole * half + lag * (pole + half)
+    steepest = excess**2 * lag * zero**2 / (pole * half)
+    variance = period * (steepest * a_1 + b_1**2 - 2 * b_2 + a_2)
+    return jnp.sqrt(variance / (2 * (lag + pole) * (pole + half) * (half + lag)))

@@ -1,0 +1,1 @@
+"""Mean of Smith predictor and phase lead."""

@@ -1,0 +1,24 @@
+"""The mean of Smith predictor and phase lead: (1 + (1/2) T_s s/(1 + T_s s/2)) (1 + T_l s) F.
+
+Half of the lag T_s is predicted, the other half stays: less amplification of noise for more divergence. See
+`smith_predictor`.
+"""
+
+from typing import ClassVar
+
+from jaxhil.laws.shared.smith.simulation import Smith
+
+
+class SmithHybrid(Smith):
+    """F_c = (F_smith + F_lead)/2; see the module's text."""
+
+    name: ClassVar[str] = "smith_hybrid"
+    waits_for_contact: ClassVar[bool] = True
+    # 1 + (1/2) T_s s/(1 + T_s s/2) = (1 + T_s s)/(1 + T_s s/2).
+    excess: ClassVar[float] = 2.0
+
+    def combined(self, led, predicted):
+        return (predicted + led) / 2
+
+
+COMPENSATOR = SmithHybrid()

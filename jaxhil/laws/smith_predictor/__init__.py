@@ -1,0 +1,1 @@
+"""Smith predictor behind a phase lead."""

@@ -1,0 +1,15 @@
+"""Smith predictor of the force: phase lead for its delay, a prediction for the motion simulator's lag."""
+
+from jaxhil.laws.shared.smith.rig import Smith
+from jaxhil.rig.registry import register
+
+
+@register("smith_predictor")
+class SmithPredictor(Smith):
+    """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, the factors as in `Smith`."""
+
+    __slots__ = ()
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """The measured force [N], led and predicted."""
+        return self._predictor.step(self._lead.step(force_measured))

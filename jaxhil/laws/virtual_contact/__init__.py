@@ -1,0 +1,1 @@
+"""Force of a specified contact at the desired position."""

@@ -1,0 +1,32 @@
+"""Virtual contact: spring and damper on the commanded motion, beside the real contact (EPOS)."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.rig.bounds import DAMPINGS, STIFFNESSES
+from jaxhil.rig.registry import Compensator, GainSpecification, register
+from jaxhil.rig.surfaces import deflection
+
+
+@register("virtual_contact")
+class VirtualContact(Compensator):
+    """F_c = F + k_v d + b_v v_d while the numerical model's position is beyond a surface, by d; else F."""
+
+    __slots__ = ("_clearance", "_damping", "_stiffness")
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {
+        "virtual_stiffness": GainSpecification("N/m", -STIFFNESSES[1], STIFFNESSES[1]),
+        "virtual_damping": GainSpecification("N s/m", *DAMPINGS),
+    }
+
+    def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
+        self._stiffness = gains["virtual_stiffness"]
+        self._damping = gains["virtual_damping"]
+        self._clearance = clearance
+
+    def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
+        """The measured force and the virtual contact's [N]."""
+        depth = deflection(position_desired, self._clearance)
+        if depth == 0.0:
+            return force_measured
+        return force_measured + (self._stiffness * depth + self._damping * velocity_desired)

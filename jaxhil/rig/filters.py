@@ -1,0 +1,126 @@
+"""The discrete filters that the compensators are built of, one sample per control period.
+
+Each keeps its past in a few floats, evaluates its equation from left to right as written, and
+allocates nothing per tick.
+"""
+
+from math import floor
+from typing import Annotated
+
+from jaxhil.rig.types import Count, Index, Positive
+
+
+class LeadFilter:
+    """Lead (1 + T_1 s)/(1 + T_2 s), T_1 = lead + lag, T_2 = lag, by Tustin's rule at period T:
+
+    y = ((2 T_2 - T) y_prev + (2 T_1 + T) u - (2 T_1 - T) u_prev) / (2 T_2 + T),
+
+    at rest (y_prev = u_prev = 0) to begin with. Times in seconds; the output has the input's unit.
+    """
+
+    __slots__ = ("_denominator", "_input", "_of_input", "_of_output", "_of_previous", "_output")
+
+    def __init__(self, lead: float, lag: float, period: float) -> None:
+        zero = lead + lag
+        self._of_output = 2.0 * lag - period
+        self._of_input = 2.0 * zero + period
+        self._of_previous = 2.0 * zero - period
+        self._denominator = 2.0 * lag + period
+        self.reset()
+
+    def reset(self) -> None:
+        """Come to rest."""
+        self._input = 0.0
+        self._output = 0.0
+
+    def step(self, value: float) -> float:
+        """The filtered value."""
+        output = (
+            self._of_output * self._output + self._of_input * value - self._of_previous * self._input
+        ) / self._denominator
+        self._input = value
+        self._output = output
+        return output
+
+
+class VelocityFilter:
+    """Filtered derivative s/(1 + T_v s) by Tustin's rule at period T:
+
+    w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T).
+
+    Its past is 0 unless `start` says otherwise. Position in m, velocity in m/s, times in s; it serves a
+    force as well.
+    """
+
+    __slots__ = ("_denominator", "_of_velocity", "_period", "_position", "_velocity")
+
+    def __init__(self, time_constant: float, period: float) -> None:
+        self._period = period
+        self._of_velocity = 2.0 * time_constant - period
+        self._denominator = 2.0 * time_constant + period
+        self._position = 0.0
+        self._velocity = 0.0
+
+    def start(self, position: float, velocity: float) -> None:
+        """Make the past a uniform motion that reaches `position` at the next step."""
+        self._position = position - self._period * velocity
+        self._velocity = velocity
+
+    def step(self, position: float) -> float:
+        """The filtered velocity."""
+        velocity = (
+            self._of_velocity * self._velocity + 2.0 * (position - self._position)
+        ) / self._denominator
+        self._position = position
+        self._velocity = velocity
+        return velocity
+
+
+class DelayLine:
+    """A position delayed by any time tau >= 0, linear between samples:
+
+    r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1].
+
+    `start` must come before the first `step`. Raises ValueError when the delay spans more than
+    `LONGEST` periods.
+    """
+
+    LONGEST = 100_000
+
+    __slots__ = ("_fraction", "_head", "_period", "_remainder", "_samples", "_size", "_whole")
+    _head: Annotated[Count, "index"]
+
+    def __init__(self, delay: float, period: Positive) -> None:
+        ratio = delay / period
+        if not 0.0 <= ratio <= self.LONGEST:
+            raise ValueError(f"a delay of {ratio!r} periods, allowed 0 to {self.LONGEST}")
+        # The margin keeps a delay of a whole number of periods whole when its ratio rounds down.
+        self._whole = floor(ratio + 1e-9)
+        self._fraction = ratio - self._whole
+        self._remainder = 1.0 - self._fraction
+        self._period = period
+        self._size = self._whole + 2
+        self._samples = [0.0] * self._size
+        self._head = 0
+
+    def start(self, position: float, velocity: float) -> None:
+        """Make the past, sample j < 0, the uniform motion position + j T velocity."""
+        period = self._period
+        samples = self._samples
+        size = self._size
+        for j in range(1, len(samples)):
+            samples[j] = position + (j - size) * period * velocity
+        self._head = 0
+
+    def step(self, position: float) -> float:
+        """The delayed position."""
+        head = self._head
+        samples = self._samples
+        samples[head] = position
+        # Negative indices wrap: the line holds exactly the `whole + 2` latest samples.
+        newer: Index = head - self._whole
+        older: Index = newer - 1
+        delayed = self._remainder * samples[newer] + self._fraction * samples[older]
+        head += 1
+        self._head = 0 if head == self._size else head
+        return delayed

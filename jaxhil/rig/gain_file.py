@@ -1,0 +1,245 @@
+"""Reading a gain file: JSON in, checked numbers out, or a `GainFileError` of one line.
+
+A file is refused as a whole: first its form (JSON, schema, digest), then what the digest cannot
+know (compensator, gains, units, bounds, control period). Whoever changes a file can sign it anew: gains and
+limits have to be within the file's bounds and within those of the code too (`bounds`). The digest is the
+SHA-256 of the document's canonical JSON without the date, the timings and the digest itself.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Mapping
+from math import inf, isfinite
+from typing import Any, NamedTuple
+
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, span
+from jaxhil.rig.errors import GainFileError, printable, refusal, shown
+from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete
+from jaxhil.rig.registry import COMPENSATORS, GainSpecification
+
+SCHEMA = "jaxhil/gains/1"
+LARGEST = 4 * 1024 * 1024
+DEEPEST = 32
+UNSIGNED = ("created", "timings", "sha256")
+RETIRED = ("retrospective_reference", "retrospective_delay_bank")
+NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
+
+
+class GainFile(NamedTuple):
+    """What the controller needs of a gain file."""
+
+    compensator: str  # the law's name
+    gains: Mapping[str, float]  # by name, in SI units
+    control_period: float  # [s]
+    clearance: float  # of a contact with two sides [m]; infinite with one
+    limits: Mapping[str, float] = NO_LIMITS  # by name, in SI units
+
+
+def digest(document: Mapping[str, Any]) -> str:
+    """SHA-256, in hexadecimal, of a gain document without its `created`, `timings` and `sha256`.
+
+    Raises ValueError or TypeError for a document that JSON cannot express (NaN, infinity, sets).
+    """
+    content = {key: value for key, value in document.items() if key not in UNSIGNED}
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The JSON object in the file, unchecked but for its form. Raises GainFileError."""
+    source = os.fspath(path)
+    try:
+        mode = os.stat(source).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            # Reading a pipe waits for its writer, and a device may never end.
+            raise OSError(errno.EINVAL, "found a pipe or a device, expected a plain file")
+        with open(source, "rb") as file:
+            content = file.read(LARGEST + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise GainFileError(printable(f"{source}: cannot be read: {reason}")) from None
+    if len(content) > LARGEST:
+        raise refusal(source, "", "a larger file", f"at most {LARGEST} bytes")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise refusal(source, "", f"bytes that are not UTF-8 at {error.start}", "UTF-8") from None
+    try:
+        document = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique_keys)
+    except RecursionError:
+        raise refusal(source, "", "deeper nesting", f"at most {DEEPEST} levels") from None
+    except ValueError as error:
+        raise refusal(source, "", f"not JSON ({error})", f"a JSON object, {SCHEMA}") from None
+    if not isinstance(document, dict):
+        raise refusal(source, "", shown(document), f"a JSON object, {SCHEMA}")
+    return document
+
+
+def check_gain_document(
+    document: Mapping[str, Any],
+    source: str = "gain document",
+    others: Mapping[str, Mapping[str, GainSpecification]] = NO_OTHERS,
+    axes: tuple[int, ...] = (1,),
+) -> GainFile:
+    """The controller's part of a gain document, named `source` in errors. Raises GainFileError.
+
+    `others` are the gains of compensators, by name, that can be simulated but have no class here; `axes` the
+    numbers of axes that the gains may be for.
+    """
+    _check_form(document, source)
+    number = document.get("axes", 1)
+    if number not in axes:
+        allowed = f"{' or '.join(map(str, axes))}: gains of six axes are simulated only so far"
+        raise refusal(source, "axes", shown(number), allowed)
+    name = _entry(document, "compensator", source, "")
+    if name in RETIRED:
+        message = f"compensator: found {shown(name)}, expected 'impulse_ledger', which replaces it"
+        raise GainFileError(printable(f"{source}: {message}"))
+    known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
+    if not isinstance(name, str) or name not in known:
+        raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")
+    gains = _gains(document, name, known[name], source)
+    period = _number(_entry(document, "control_period", source, ""), "control_period", source)
+    _check_within(period, *CONTROL_PERIODS, "control_period", source)
+    mechanism = _object(document, "mechanism", source, "")
+    rig = _object(mechanism, "rig", source, "mechanism.")
+    key = "mechanism.rig.control_period"
+    if _number(_entry(rig, "control_period", source, "mechanism.rig."), key, source) != period:
+        allowed = f"{rig['control_period']!r}, as {key} says"
+        raise refusal(source, "control_period", shown(period), allowed)
+    contact = _object(mechanism, "contact", source, "mechanism.") if number == 1 else {}
+    clearance = inf
+    if "clearance" in contact:
+        clearance = _number(contact["clearance"], "mechanism.contact.clearance", source)
+        _check_within(clearance, *DISTANCES, "mechanism.contact.clearance", source)
+    return GainFile(name, gains, period, clearance, _limits(document, source))
+
+
+def _check_form(document: Mapping[str, Any], source: str) -> None:
+    if not isinstance(document, Mapping):
+        raise refusal(source, "", shown(document), f"a JSON object, {SCHEMA}")
+    schema = _entry(document, "schema", source, "")
+    if schema != SCHEMA:
+        raise refusal(source, "schema", shown(schema), f"'{SCHEMA}'")
+    if not _is_shallow(document):
+        raise refusal(source, "", "deeper nesting", f"at most {DEEPEST} levels")
+    stated = _entry(document, "sha256", source, "")
+    try:
+        actual = digest(document)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise refusal(source, "", f"what JSON cannot express ({error})", "JSON values") from None
+    if stated != actual:
+        allowed = f"'{actual}', the digest of its content (was it edited?)"
+        raise refusal(source, "sha256", shown(stated, 80), allowed)
+
+
+def _gains(
+    document: Mapping[str, Any], law: str, specifications: Mapping[str, GainSpecification], source: str
+) -> dict[str, float]:
+    entries = _object(document, "gains", source, "")
+    for name in entries:
+        if name not in specifications:
+            allowed = ", ".join(specifications) or "no gains"
+            raise refusal(source, "gains", f"an extra gain {shown(name)}", allowed)
+    gains = {}
+    for name, specification in specifications.items():
+        if name not in entries:
+            allowed = f"all gains of {law} (is it of an earlier version? `jaxhil tune` makes a new file)"
+            raise refusal(source, f"gains.{name}", "nothing", allowed)
+        entry = _object(entries, name, source, "gains.")
+        prefix = f"gains.{name}."
+        unit = _entry(entry, "unit", source, prefix)
+        if unit != specification.unit:
+            raise refusal(source, f"{prefix}unit", shown(unit), f"'{specification.unit}'")
+        value, lower, upper = (
+            _number(_entry(entry, key, source, prefix), prefix + key, source)
+            for key in ("value", "lower", "upper")
+        )
+        _check_within(value, lower, upper, f"{prefix}value", source)
+        _check_within(value, specification.lowest, specification.highest, f"{prefix}value", source)
+        gains[name] = value
+    return gains
+
+
+def _limits(document: Mapping[str, Any], source: str) -> dict[str, float]:
+    if "limits" not in document:
+        return dict(NO_LIMITS)
+    limits = {}
+    for name, entry in _object(document, "limits", source, "").items():
+        if name not in LIMITS:
+            raise refusal(source, "limits", f"an unknown limit {shown(name)}", ", ".join(LIMITS))
+        specification = LIMITS[name]
+        prefix = f"limits.{name}."
+        if not isinstance(entry, Mapping):
+            raise refusal(source, prefix[:-1], shown(entry), "an object")
+        unit = _entry(entry, "unit", source, prefix)
+        if unit != specification.unit:
+            raise refusal(source, f"{prefix}unit", shown(unit), f"'{specification.unit}'")
+        value = _entry(entry, "value", source, prefix)
+        if value is None:
+            continue
+        limits[name] = _number(value, f"{prefix}value", source)
+        _check_within(limits[name], specification.lowest, specification.highest, f"{prefix}value", source)
+    try:
+        return complete(limits)
+    except ValueError as error:
+        raise refusal(source, "limits", str(error), "limits that fit one another") from None
+
+
+def _entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:
+    if key not in mapping:
+        raise refusal(source, prefix + key, "nothing", "this key is required")
+    return mapping[key]
+
+
+def _object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Mapping[str, Any]:
+    value = _entry(mapping, key, source, prefix)
+    if not isinstance(value, Mapping):
+        raise refusal(source, prefix + key, shown(value), "an object")
+    return value
+
+
+def _number(value: object, key: str, source: str) -> float:
+    # bool is an int to Python, and an integer of JSON may be too large for a float.
+    if not isinstance(value, bool) and isinstance(value, (int, float)):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = inf
+        if isfinite(number):
+            return number
+    raise refusal(source, key, shown(value), "a finite number")
+
+
+def _check_within(value: float, lowest: float, highest: float, key: str, source: str) -> None:
+    if not lowest <= value <= highest:
+        raise refusal(source, key, shown(value), span(lowest, highest))
+
+
+def _is_shallow(document: Mapping[str, Any]) -> bool:
+    level: list[Any] = [document]
+    for _ in range(DEEPEST):
+        deeper: list[Any] = []
+        for value in level:
+            if isinstance(value, Mapping):
+                deeper.extend(value.values())
+            elif isinstance(value, (list, tuple)):
+                deeper.extend(value)
+        if not deeper:
+            return True
+        level = deeper
+    return False
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) != len(pairs):
+        raise ValueError("a key occurs twice in one object")
+    return entries

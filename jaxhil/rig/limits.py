@@ -1,0 +1,112 @@
+"""The limits that a gain file may carry for the rig: names, units, bounds, and what holds without them.
+
+`jaxhil export` works the limits out and writes them under the file's digest. No file can set them beyond the
+bounds here; where it has none, or null, the default holds: what limits, limits to the outermost (`bounds`).
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from jaxhil.rig.bounds import (
+    DECELERATIONS,
+    DISTANCES,
+    FORCE_SLEWS,
+    FORCES,
+    MASSES,
+    POSITIONS,
+    SPEEDS,
+    STIFFNESSES,
+    TIMES,
+)
+
+BRIDGED = 0.0, 1000.0  # ticks in a row
+COUNTED = 0.0, 1e6  # ticks, beyond the longest gap that the clock counts
+RATIOS = 0.0, 1e300  # of energies or restitutions, the highest beyond all that occurs, however slow an entry
+FEATURES = -1e3, 1e3  # p, w and z of the expected restitution
+COEFFICIENTS = -1e9, 1e9  # of it, by powers of those
+
+
+class Limit(NamedTuple):
+    """One limit."""
+
+    unit: str  # of its value
+    default: float  # its value where a file has none
+    lowest: float  # its least value
+    highest: float  # its largest value
+    meaning: str  # what it is
+
+    def admits(self, value: float) -> bool:
+        """Whether the value is within the bounds."""
+        return self.lowest <= value <= self.highest
+
+
+LIMITS: dict[str, Limit] = {
+    "force_range": Limit("N", FORCES[1], *FORCES, "a force reading of this size is out of range"),
+    "measured_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position that the sensor may read"),
+    "measured_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position that the sensor may read"),
+    "held_readings": Limit("1", 0.0, *BRIDGED, "bad readings in a row that are bridged"),
+    "force_stuck_travel": Limit("m", DISTANCES[1], *DISTANCES, "travel in contact under one force reading"),
+    "position_stuck_travel": Limit(
+        "m", DISTANCES[1], *DISTANCES, "the model's travel under one position reading"
+    ),
+    "free_distance": Limit("m", 0.0, *DISTANCES, "distance from a surface that counts as out of contact"),
+    "settling": Limit("s", 0.0, 0.0, 100.0, "time that force and command need to die out after contact"),
+    "free_force": Limit("N", FORCES[1], *FORCES, "largest force reading out of contact"),
+    "late_fraction": Limit(
+        "1", 0.25, 0.0, 1.0, "lateness or earliness of a tick, in periods, that is flagged; late: below 0.5"
+    ),
+    "missed_in_a_row": Limit("1", COUNTED[1], *COUNTED, "missed ticks in a row that are bridged"),
+    "tare_ticks": Limit("1", 0.0, *COUNTED, "readings that a tare averages"),
+    "tare_spread": Limit("N", FORCES[1], *FORCES, "largest difference between readings of a tare"),
+    "bias_limit": Limit("N", FORCES[1], *FORCES, "largest bias that a tare may find"),
+    "force_limit": Limit("N", FORCES[1], *FORCES, "largest force on the numerical model"),
+    "force_slew": Limit(
+        "N/s", FORCE_SLEWS[1], *FORCE_SLEWS, "fastest change of the force on the numerical model"
+    ),
+    "limited_in_a_row": Limit("1", 0.0, *BRIDGED, "ticks in a row at which a rate may be cut"),
+    "command_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position command"),
+    "command_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position command"),
+    "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest change of the position command"),
+    "start_distance": Limit(
+        "m", 0.0, *DISTANCES, "distance of a run's first command from where the drives read, out of contact"
+    ),
+    "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
+    "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the way out of contact after a trip"),
+    "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "the model's; 0: no energies are audited"),
+    "fading": Limit("N", 0.0, *FORCES, "force reading that counts as no contact"),
+    "longest_contact": Limit("s", 1e5, 0.0, 1e5, "longest contact"),
+    "energy_balance": Limit("1", RATIOS[1], *RATIOS, "energy out of balance, of the approach's"),
+    "restitution_margin": Limit("1", RATIOS[1], *RATIOS, "largest difference from the expected restitution"),
+    "alignment": Limit("s", 0.0, *TIMES, "delay of the force reading against the position reading"),
+    "reference_stiffness": Limit("N/m", 1.0, 1e-3, STIFFNESSES[1], "stiffness at which p is 0"),
+    "reference_velocity": Limit("m/s", 1.0, 1e-6, SPEEDS[1], "approach speed at which w is 0"),
+    "softness_lowest": Limit("1", 0.0, *FEATURES, "least p"),
+    "softness_highest": Limit("1", 0.0, *FEATURES, "largest p"),
+    "speed_lowest": Limit("1", 0.0, *FEATURES, "least w"),
+    "speed_highest": Limit("1", 0.0, *FEATURES, "largest w"),
+    "loss_lowest": Limit("1", 0.0, *FEATURES, "least z"),
+    "loss_highest": Limit("1", 0.0, *FEATURES, "largest z"),
+    "expected_1": Limit("1", 1.0, *COEFFICIENTS, "expected restitution at p = w = z = 0"),
+    **{
+        f"expected_{term}": Limit("1", 0.0, *COEFFICIENTS, f"coefficient of {' '.join(term)} in it")
+        for term in ("p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
+    },
+}
+
+
+def complete(limits: Mapping[str, float]) -> dict[str, float]:
+    """All limits, those that are not given at their defaults. Raises ValueError for limits that clash."""
+    found = {name: limits.get(name, one.default) for name, one in LIMITS.items()}
+    for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
+        if not found[low] < found[high]:
+            raise ValueError(f"{low} {found[low]!r} is not below {high} {found[high]!r}")
+    if found["retreat_velocity"] > found["velocity_limit"]:
+        raise ValueError(
+            f"retreat_velocity {found['retreat_velocity']!r} is above velocity_limit "
+            f"{found['velocity_limit']!r}"
+        )
+    return found
+
+
+NO_LIMITS: Mapping[str, float] = MappingProxyType(complete({}))
