@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 
 SOFT = campaign_kinds.voigt((124355.0,), (264.0,))  # damping over stiffness: 2.1 ms

@@ -9,7 +9,8 @@ from lanes import IDEAL, SECOND_ORDER, as_arrays, mechanism, run_rollout, valida
 from jaxhil.contact.laws import LAWS
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import compare_with_reference, evaluate
+from jaxhil.simulation.one_axis import evaluate
+from jaxhil.simulation.outcome import compare_with_reference
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
 from tuning.gains.common_program import common_programs

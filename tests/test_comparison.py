@@ -16,7 +16,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.benchmark.runs import build_scene, judge_gains
 from tuning.gains.common_program import common_programs

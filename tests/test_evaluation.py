@@ -14,7 +14,8 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.environment import DEVICES
-from jaxhil.simulation.evaluation import TILE, evaluate, expected_duration, shard, whole_delays
+from jaxhil.simulation.evaluation import TILE
+from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.tune import neutral_gains
 
@@ -71,12 +72,12 @@ def test_neutral_gains_are_no_compensation(compensator):
 def test_other_mechanism_seed_and_number_reuse_the_program():
     loop, gains, scenarios = setting()
     evaluate(loop, gains, scenarios)
-    programs = programs_of("_run_tiles")
+    programs = programs_of("run_tiles")
     other, other_gains, other_scenarios = setting(name="claw-350kg", seed=7, lanes=65)
     assert other == loop
     evaluate(other, other_gains, other_scenarios)
     evaluate(*setting(seed=3, lanes=128, overrides=("bodies.equivalent_mass=200",)))
-    assert programs_of("_run_tiles") == programs > 0
+    assert programs_of("run_tiles") == programs > 0
 
 
 def test_every_contact_is_set_beside_its_own_reference():
@@ -95,14 +96,16 @@ def test_every_contact_is_set_beside_its_own_reference():
 
 def tiled(scenarios):
     """Whole delays and durations expected of the lanes as they are dealt out, (tiles in turn, lanes)."""
-    _, _, dealt = shard(scenarios, {})
+    _, _, dealt = ONE_AXIS.shard(scenarios, {})
 
     def in_turn(leaf):
         rows = np.moveaxis(leaf, (1, 0), (-3, -2))
         return rows.reshape(*rows.shape[:-3], np.prod(rows.shape[-3:]))
 
     lanes = jax.tree.map(in_turn, dealt)
-    return (row.reshape(-1, TILE) for row in (whole_delays(lanes), expected_duration(lanes)))
+    return (
+        row.reshape(-1, TILE) for row in (ONE_AXIS.whole_delays(lanes), ONE_AXIS.expected_duration(lanes))
+    )
 
 
 def test_lanes_of_a_tile_look_back_alike_and_take_as_long():

@@ -14,7 +14,7 @@ import pytest
 import tuning
 from jaxhil.mechanism.file import from_builtins, to_builtins
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.identification.estimate import Options, identify
 

@@ -14,7 +14,7 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import DELAY, PARAMETERS, Cont
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 
 LAW = "impulse_ledger"

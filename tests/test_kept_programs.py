@@ -22,7 +22,7 @@ from jaxhil.files import read_sealed
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation import evaluation, kept_programs, sources
+from jaxhil.simulation import kept_programs, one_axis, sources
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.compile_cache import ENDING
 from jaxhil.simulation.environment import CACHE, TICKS, program_folder
@@ -290,12 +290,12 @@ def test_a_kept_batch_has_the_same_bits_and_is_not_compiled_again(tmp_path, monk
     scenarios = build_scenarios(mechanism, draw(mechanism, 20, 0))
     loop = build_loop(mechanism, "phase_lead", scenarios)
     gains = {name: np.full(lanes, value) for name, value in literature_gains(mechanism, "phase_lead").items()}
-    wanted = evaluation.evaluate(loop, gains, scenarios)
+    wanted = one_axis.evaluate(loop, gains, scenarios)
     monkeypatch.setattr(kept_programs, "program_folder", lambda: str(tmp_path))
     made = []
     for _ in range(3):
         kept_programs._programs.clear()
-        outcome = evaluation.evaluate(loop, gains, scenarios)
+        outcome = one_axis.evaluate(loop, gains, scenarios)
         jax.tree.map(np.testing.assert_array_equal, outcome, wanted)
-        made.append(programs_of("_run_tiles"))
+        made.append(programs_of("run_tiles"))
     assert made[0] == made[1] == made[2] > 0

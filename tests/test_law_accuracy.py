@@ -17,7 +17,8 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import Outcome, evaluate
+from jaxhil.simulation.one_axis import evaluate
+from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, probe_figures, probed_scenarios
 

@@ -10,11 +10,11 @@ from jax import export
 
 from jaxhil.laws.compensators import COMPENSATORS, SIX_AXES, literature_gains
 from jaxhil.mechanism.file import load_any
+from jaxhil.rig_models import rig_model
 from jaxhil.simulation import environment
 from jaxhil.simulation.environment import ROLLOUT, flags, known_options
-from jaxhil.simulation.evaluation import _run_tiles, shard
+from jaxhil.simulation.evaluation import run_tiles
 from tuning.caches import program_cache
-from tuning.gains import simulated
 from tuning.gains.rounds import prepare_solver
 from tuning.gains.tasks import build_task
 
@@ -34,9 +34,11 @@ def calls(function, *arguments):
 
 def case(name, compensator):
     mechanism = load_any(name).mechanism
-    scenarios = simulated.scenarios_of(mechanism)
+    model = rig_model(mechanism)
+    scenarios = model.scenarios(mechanism)
     return (
-        simulated.loop_of(mechanism, compensator, scenarios),
+        model,
+        model.loop(mechanism, compensator, scenarios),
         literature_gains(mechanism, compensator),
         scenarios,
     )
@@ -44,17 +46,17 @@ def case(name, compensator):
 
 def batch(name, compensator):
     """What a batch on all devices calls."""
-    loop, gains, scenarios = case(name, compensator)
-    return calls(lambda *parts: _run_tiles(loop, *parts), *shard(scenarios, gains))
+    model, loop, gains, scenarios = case(name, compensator)
+    return calls(lambda *parts: run_tiles((model, loop), *parts), *model.shard(scenarios, gains))
 
 
 def jacobian(name, compensator):
     """What the derivatives of a tuning's errors by all gains call."""
-    loop, gains, scenarios = case(name, compensator)
+    model, loop, gains, scenarios = case(name, compensator)
 
     def errors(values, scenarios):
-        rig = simulated.prepared(loop, scenarios)
-        return simulated.outcome(loop, dict(zip(gains, values, strict=True)), rig).error
+        rig = model.prepared(loop, scenarios)
+        return model.outcome(loop, dict(zip(gains, values, strict=True)), rig).error
 
     return calls(jax.jacfwd(errors), np.array([*gains.values()], float), scenarios)
 

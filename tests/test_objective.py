@@ -14,8 +14,8 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.objective import (
     FAILED,
@@ -79,7 +79,7 @@ def run(batch, gains=GAINS, objective=STATED):
     loop, _, rigs = batch
     objectives = [objective] * len(GAINS) if isinstance(objective, Objective) else objective
     problems = Problem(rigs, {}, stacked(objectives))
-    static = loop, NAMES, common_terms(objectives)
+    static = ONE_AXIS, loop, NAMES, common_terms(objectives)
     return [np.asarray(a) for a in with_jacobian(static, jnp.asarray(gains), problems)]
 
 

@@ -12,7 +12,7 @@ from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.caches import program_cache
 from tuning.gains import pareto_search

@@ -15,9 +15,9 @@ from jaxhil.contact.laws import LAWS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.contact_plot import STYLES, contact_plot, save
-from jaxhil.simulation.evaluation import Outcome, parameters_by_slot
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.motion import Curve, Piece, _in_space
+from jaxhil.simulation.outcome import Outcome, parameters_by_slot
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
 from tuning.gains.rounds import Start

@@ -10,14 +10,14 @@ import pytest
 import tuning
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
+from jaxhil.rig_models import rig_model
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.caches import program_cache
 from tuning.caches.pieces import Pieces
 from tuning.front_door import tune_verdict
 from tuning.front_door.tune_options import TuneOptions
-from tuning.gains import simulated
 from tuning.gains.noise import amplification
 from tuning.gains.objective import Objective, objective_value
 from tuning.gains.quiet import is_quiet, tolerance_of
@@ -243,8 +243,8 @@ def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
 def test_scenarios_without_noise_differ_in_their_noise_alone(name):
     sensor = {} if name != "petals" else {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
     mechanism = load_any(name, {**sensor, "rig.force_sensor.delay": 0.003}).mechanism
-    scenarios = simulated.scenarios_of(mechanism)
-    silent = simulated.without_noise(scenarios)
+    scenarios = rig_model(mechanism).scenarios(mechanism)
+    silent = rig_model(mechanism).without_noise(scenarios)
     noisy = jax.tree.leaves(scenarios)
     changed = [
         (before, after)

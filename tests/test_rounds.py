@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from lead_cases import lead_tasks
 
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import rounds
 from tuning.gains.objective import RMS, Objective, objective_value
 from tuning.gains.rounds import GIVEN_UP, solve_tasks

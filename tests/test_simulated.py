@@ -11,7 +11,7 @@ from lanes import spread, validated
 
 from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.simulation.building import build_loop
-from tuning.gains.simulated import outcome, prepared, with_compensator
+from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 class LargeLaw(NoCompensator):
@@ -22,17 +22,19 @@ class LargeLaw(NoCompensator):
 
 
 def test_runs_of_a_large_law_are_compiled_apart(monkeypatch):
-    monkeypatch.setattr("tuning.gains.simulated.COMPENSATORS", {"none": NoCompensator(), "large": LargeLaw()})
+    monkeypatch.setattr(
+        "jaxhil.simulation.one_axis.COMPENSATORS", {"none": NoCompensator(), "large": LargeLaw()}
+    )
     parsed = validated(next(iter(CASES.values())).mechanism)
     scenarios = jax.tree.map(jnp.asarray, spread(parsed, 4))
     plain = build_loop(parsed, "none", scenarios)
     found, loops_left = [], []
     for name in ("none", "large"):
-        loop = with_compensator(plain, name)
+        loop = ONE_AXIS.with_compensator(plain, name)
 
         def tiles(scenarios, loop=loop):
             tiled = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scenarios)
-            return jax.lax.map(lambda one: outcome(loop, {}, prepared(loop, one)), tiled)
+            return jax.lax.map(lambda one: ONE_AXIS.outcome(loop, {}, ONE_AXIS.prepared(loop, one)), tiled)
 
         program = jax.jit(tiles).lower(scenarios).compile()
         found.append(program(scenarios))

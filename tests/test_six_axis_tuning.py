@@ -157,15 +157,15 @@ def test_derivatives_reach_through_the_loop():
     """Of what tuning minimises, by both gains: those of central differences."""
     from jaxhil.mechanism.uncertainty import quasi_random
     from jaxhil.simulation.environment import computing
-    from tuning.gains import simulated
+    from jaxhil.sixdof.six_axes import SIX_AXES
     from tuning.gains.objective import RMS, Problem, common_terms, residuals
 
     mechanism = load_any("probe-drogue").mechanism
     with computing():
-        scenarios = simulated.scenarios_of(mechanism, quasi_random(mechanism, 8, 0))
-        loop = simulated.loop_of(mechanism, "phase_lead", scenarios)
+        scenarios = SIX_AXES.scenarios(mechanism, quasi_random(mechanism, 8, 0))
+        loop = SIX_AXES.loop(mechanism, "phase_lead", scenarios)
         rig, weights = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (scenarios, RMS.weights))
-        static = loop, ("phase_lead", "lead_filter"), common_terms([RMS], contacts=2)
+        static = SIX_AXES, loop, ("phase_lead", "lead_filter"), common_terms([RMS], contacts=2)
 
         @jax.jit
         def found(gains):

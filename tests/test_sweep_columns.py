@@ -5,11 +5,11 @@ import pytest
 from sweep_cases import case
 
 from jaxhil.mechanism.file import load
-from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
+from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.sweeps.columns import OUTCOMES, STATUSES, contact_slots, judge, rows_of, sweep_columns, unit_of
+from tuning.sweeps.columns import OUTCOMES, STATUSES, error_slots, judge, rows_of, sweep_columns, unit_of
 
 LIMIT = 0.01
 NAN = np.nan
@@ -130,7 +130,7 @@ def test_unlike_contact_says_more_than_an_error_and_less_than_saturation():
 def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
     found = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
     old = {name: values for name, values in found.items() if not name.startswith("reference_")}
-    judged = judge(old, contact_slots(2), np.array(np.inf), np.array(2e-3), LIMIT)
+    judged = judge(old, error_slots(("error",), 2), np.array(np.inf), np.array(2e-3), LIMIT)
     assert outcomes(found) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
 
 

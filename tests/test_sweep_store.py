@@ -10,7 +10,7 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.rig import digest
-from tuning.sweeps.columns import OUTCOMES, STATUSES, contact_slots, judge
+from tuning.sweeps.columns import OUTCOMES, STATUSES, error_slots, judge
 from tuning.sweeps.manifest import unlike_here
 from tuning.sweeps.parts import decode_part, encode_part, same_rows
 from tuning.sweeps.store import (
@@ -31,6 +31,9 @@ MANIFEST = manifest(case(2))
 UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
 
 
+SLOTS = error_slots(("error",), 2)
+
+
 def made_up(part, label=MANIFEST, seed=0):
     """Rows of a part, made up, with gaps."""
     first, number = label.part_rows(part)
@@ -48,7 +51,10 @@ def made_up(part, label=MANIFEST, seed=0):
             rows[column.name] = generator.integers(0, len(texts), number).astype(np.int8)
         else:
             rows[column.name] = values
-    return {**rows, **judge(rows, contact_slots(2), np.array(np.inf), np.array(1e-3), label.largest_error)}
+    return {
+        **rows,
+        **judge(rows, SLOTS, np.array(np.inf), np.array(1e-3), label.largest_error),
+    }
 
 
 @pytest.fixture
@@ -135,7 +141,10 @@ def test_outcomes_follow_from_errors(store, column):
     rows = made_up(0)
     for name, value in good.items():
         rows[f"{name}_1"][5] = rows[f"{name}_2"][5] = value
-    rows = {**rows, **judge(rows, contact_slots(2), np.array(np.inf), np.array(1e-3), MANIFEST.largest_error)}
+    rows = {
+        **rows,
+        **judge(rows, SLOTS, np.array(np.inf), np.array(1e-3), MANIFEST.largest_error),
+    }
     assert OUTCOMES[rows["outcome"][5]] == "good" and not rows["failed"][5] and rows["worst_error"][5] == 0.25
     write_part(store, 0, rows)
     assert read_part(store, 0) is not None

@@ -8,7 +8,7 @@ import pytest
 
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import tune_all
 from tuning.gains.multistart import choose_starts
 from tuning.gains.objective import RMS, objective_value

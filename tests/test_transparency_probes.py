@@ -12,7 +12,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import pareto_search
 from tuning.gains.objective import Objective, contact_terms, objective_value
 from tuning.gains.pareto import fronts

@@ -9,7 +9,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.multistart import BATCHES, choose_starts
 from tuning.gains.rounds import solve_tasks

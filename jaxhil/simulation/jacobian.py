@@ -24,10 +24,10 @@ from jaxhil.mechanism.overrides import KeyProblem, parse_key
 from jaxhil.mechanism.structs import Mechanism, numeric_keys, value_at
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.environment import computing
-from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.outcome import Outcome, compare_with_reference
 from jaxhil.simulation.plausibility import check_run
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.run import ContactResult, check_seed

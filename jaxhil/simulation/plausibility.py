@@ -19,8 +19,8 @@ from jaxhil.mechanism.uncertainty import dimensions, quantiles
 from jaxhil.simulation import kept_programs
 from jaxhil.simulation.cells import FASTEST_POLE
 from jaxhil.simulation.environment import computing
-from jaxhil.simulation.evaluation import parameters_by_slot
 from jaxhil.simulation.free_flight import APPROACH
+from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import LONGEST_CONTACT, MotionSimulator, Scenario, build_scenarios
 
 MOST_TICKS = 1e7  # of a contact

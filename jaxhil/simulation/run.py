@@ -17,10 +17,11 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, duration_off, too_hard
 from jaxhil.simulation.environment import computing
-from jaxhil.simulation.evaluation import Outcome, evaluate
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES, STATUS_REASONS
+from jaxhil.simulation.one_axis import evaluate
+from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.plausibility import Meaning, check_run, meaning
 from jaxhil.simulation.recording import record_lanes
 from jaxhil.simulation.scenario import build_scenarios

@@ -18,8 +18,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.evaluation import expected_duration
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
+from jaxhil.simulation.one_axis import ONE_AXIS
 from jaxhil.simulation.scenario import Scenario
 from tuning.gains.objective import RMS, Problem, common_terms, residuals
 from tuning.gains.tasks import (
@@ -144,7 +144,7 @@ def _build_constants(loop: Loop, scenarios: Scenario) -> RigConstants:
 
 def _dealt(scenarios: Scenario) -> Scenario:
     """Scenarios ordered so that every device has its share of long ones."""
-    order = np.argsort(expected_duration(scenarios), kind="stable")
+    order = np.argsort(ONE_AXIS.expected_duration(scenarios), kind="stable")
     order = np.concatenate([order[device :: _devices()] for device in range(_devices())])
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., order], scenarios)
 
@@ -160,7 +160,9 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
         def some(i, found):
             coordinates = jax.lax.dynamic_slice_in_dim(points, i * together, together)
             rows = residuals(
-                (loop, names, common_terms([RMS])), jax.vmap(to_gains, (0, None))(coordinates, bounds), copies
+                (ONE_AXIS, loop, names, common_terms([RMS])),
+                jax.vmap(to_gains, (0, None))(coordinates, bounds),
+                copies,
             )
             losses = jnp.sum(rows**2, axis=1) / 2
             return jax.lax.dynamic_update_slice_in_dim(found, losses, i * together, 0)

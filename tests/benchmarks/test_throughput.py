@@ -21,6 +21,7 @@ from jaxhil.simulation import evaluation
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.environment import TICKS, known_options
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.one_axis import ONE_AXIS
 from jaxhil.simulation.rollout import run_contacts, run_to_its_end
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.batches import join
@@ -101,14 +102,14 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
         return int(baseline.run(loop, rig, gains, on_device, 4000)["ticks"].max())
 
     # C++ too finds its numbers in place.
-    arguments = evaluation.place(*evaluation.shard(scenarios, gains))
+    arguments = evaluation.place(*ONE_AXIS.shard(scenarios, gains))
     tiles = ticks_run(loop, *arguments)
     lane_steps = int(np.sum(tiles)) * arguments[-1].velocity.shape[-1]
     flown, skipped = horizon(flying[0]), horizon(skipping[0])
     runs = [(b, flown) for b in flying] + [(b, skipped) for b in skipping]
     jax_time, whole, *cpp_times = best(
-        timed(lambda: evaluation.run_tiles(loop, *arguments)),
-        timed(lambda: evaluation.evaluate(loop, gains, scenarios)),
+        timed(lambda: ONE_AXIS.run_tiles(loop, *arguments)),
+        timed(lambda: ONE_AXIS.evaluate(loop, gains, scenarios)),
         *(lambda b=b, n=n: b.run(loop, rig, gains, on_device, n)["seconds"] for b, n in runs),
     )
     widths = len(WIDTHS)

@@ -12,6 +12,7 @@ from test_throughput import LANES, PROCESSOR, best, case, timed
 
 from jaxhil.simulation import evaluation
 from jaxhil.simulation.environment import ROLLOUT
+from jaxhil.simulation.one_axis import ONE_AXIS, OneAxis
 
 pytestmark = pytest.mark.benchmark
 OURS = evaluation.TILE, ROLLOUT["xla_cpu_prefer_vector_width"]
@@ -24,18 +25,18 @@ def test_no_other_tiles_and_vectors_are_faster(compensator, monkeypatch, capsys)
     runs, outcomes = [], []
 
     def use(options):
-        monkeypatch.setattr(evaluation, "compiler_options", lambda _: options)
+        monkeypatch.setattr(OneAxis, "compiler_options", options)
 
     def run(options, arguments):
         use(options)
-        return evaluation.run_tiles(loop, *arguments)
+        return ONE_AXIS.run_tiles(loop, *arguments)
 
     for tile, width in (OURS, *OTHERS):
         options = {**ROLLOUT, "xla_cpu_prefer_vector_width": width}
         monkeypatch.setattr(evaluation, "TILE", tile)
         use(options)
-        outcomes.append(evaluation.evaluate(loop, gains, scenarios))
-        runs.append(timed(partial(run, options, evaluation.place(*evaluation.shard(scenarios, gains)))))
+        outcomes.append(ONE_AXIS.evaluate(loop, gains, scenarios))
+        runs.append(timed(partial(run, options, evaluation.place(*ONE_AXIS.shard(scenarios, gains)))))
     ours, *others = best(*runs)
     rates = {own: ours / time for own, time in zip(OTHERS, others, strict=True)}
     with capsys.disabled():

@@ -14,7 +14,7 @@ from jaxhil.laws.simulation_base import Constants
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import cut, join
 from tuning.gains.common_program import CommonProgram

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxhil.errors import InputError, one_line
-from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.rig import digest
 from jaxhil.simulation.environment import computing
 from tuning import terminal
@@ -240,7 +239,6 @@ def _complete(
 
 
 def _document(options: SweepOptions, store: "Store", done, tally, rate: float | None) -> dict[str, Any]:
-    from tuning.gains.simulated import compensator_name
     from tuning.sweeps.run import describe_outcomes
     from tuning.sweeps.tally import error_quantiles, failure_probability
 
@@ -255,8 +253,8 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "sweep_sha256": manifest.sha256,
         "gains_sha256": manifest.gains_sha256,
         "mechanism": done.mechanism.name,
-        "axes": 6 if isinstance(done.mechanism, SixAxisMechanism) else 1,
-        "compensator": compensator_name(done.loop),
+        "axes": done.model.axes,
+        "compensator": done.model.compensator_name(done.loop),
         "scenarios": tally.scenarios,
         "most_scenarios": manifest.scenarios,
         **{key: getattr(manifest, key) for key in ("seed", "sampling", "precision", "limit", "until_width")},

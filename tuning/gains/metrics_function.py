@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxhil.errors import InputError, one_line, shown
-from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.outcome import Outcome
 
 ALLOWED = "a function of metrics that returns a finite number >= 0"
 

@@ -32,8 +32,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.errors import InputError, shown
-from jaxhil.simulation.evaluation import Outcome
-from tuning.gains import simulated
+from jaxhil.simulation.evaluation import RigModel
+from jaxhil.simulation.outcome import Outcome
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, scenario_metrics
 from tuning.transparency.probes import are_probes
 
@@ -142,7 +142,7 @@ class Weights(NamedTuple):
 class Problem(NamedTuple):
     """What one start is solved for; where there are several, each leaf has a leading axis of them."""
 
-    rig: Any  # a batch of scenarios, as `tuning.gains.simulated.prepared` has it
+    rig: Any  # a batch of scenarios, as `RigModel.prepared` returns it
     fixed: dict[str, Array]  # gains that stay as they are
     weights: Weights  # the objective's
 
@@ -174,7 +174,7 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
 
 
 def residuals(
-    static: tuple[Any, tuple[str, ...], Terms],
+    static: tuple[RigModel, Any, tuple[str, ...], Terms],
     gains: Float[Array, "problems gains"],
     problems: Problem,
 ) -> Float[Array, "problems residuals"]:
@@ -185,10 +185,10 @@ def residuals(
     where they are among the terms. Contacts that fail count with the constant error, excess and chatter
     `FAILED`.
 
-    `static` is the loop, the names of the gains that are tuned and the objective's terms. The scenarios of
-    all problems run side by side, as the lanes of one batch.
+    `static` are the rig model, the loop, the names of the gains that are tuned and the objective's terms. The
+    scenarios of all problems run side by side, as the lanes of one batch.
     """
-    loop, names, terms = static
+    model, loop, names, terms = static
     if terms.chatter:
         loop = dataclasses.replace(loop, chatter=True)
     number, lanes = len(gains), jax.tree.leaves(problems.rig)[0].shape[-1]
@@ -198,7 +198,7 @@ def residuals(
 
     def run(arguments):
         values, rig = arguments
-        return simulated.outcome(loop, values, rig)
+        return model.outcome(loop, values, rig)
 
     outcome = _in_chunks(run, (values, rig)) if terms.transparency else run((values, rig))
 
@@ -206,7 +206,7 @@ def residuals(
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
     error, excess, chatter = map(by_problem, contact_terms(outcome))
-    amplification = jnp.mean(by_problem(simulated.amplification(loop, values, rig)), axis=1)
+    amplification = jnp.mean(by_problem(model.noise_amplification(loop, values, rig)), axis=1)
     probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
     wanted = by_problem(outcome.wanted)
     figure = None

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jaxhil.mechanism.file import to_builtins
-from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.outcome import Outcome
 from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, decode, digest_of, encode
 from tuning.caches.worker import setting

@@ -16,9 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.simulation.environment import program_folder
-from jaxhil.simulation.evaluation import at_rest, expected_duration
 from tuning.caches import program_cache
-from tuning.gains import simulated
 from tuning.gains.objective import RMS, SCALE, Objective, Problem, common_terms, one_each, residuals
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work
@@ -97,7 +95,9 @@ def solve_tasks(
     # As many as if every task had as many starts: where few go on, the same program serves.
     advance = _stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)), work)
     # Neighbours in a call take about as long.
-    order = np.argsort([-float(np.max(expected_duration(task.scenarios))) for task in tasks], kind="stable")
+    order = np.argsort(
+        [-float(np.max(task.model.expected_duration(task.scenarios))) for task in tasks], kind="stable"
+    )
     rank = {int(task): place for place, task in enumerate(order)}
     problems.sort(key=lambda problem: rank[problem.task])
     done, probed = 0, tasks[0].probed
@@ -193,7 +193,13 @@ def _stepper(tasks, names, bounds, objectives, number, work: Work):
 
 def _folder(tasks: list[TuneTask]) -> Any:
     """Where programs are kept; nowhere with contact laws whose sources are not known."""
-    return None if any(simulated.has_foreign_law(task.scenarios) for task in tasks) else program_folder()
+    return None if any(_has_foreign_law(task.scenarios) for task in tasks) else program_folder()
+
+
+def _has_foreign_law(scenarios: Any) -> bool:
+    """Return whether six-axis scenarios, which carry their contact laws, have a user-registered one."""
+    groups = getattr(scenarios, "groups", ())
+    return any(not type(group.law).__module__.startswith("jaxhil.") for group in groups)
 
 
 def step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
@@ -223,7 +229,7 @@ def _calls(tasks, names, bounds, objectives, number):
     size = _size(number)
     lanes = tasks[0].lanes
     terms = common_terms(objectives, tasks[0].probed, tasks[0].contacts)
-    static = (loop, names, terms), LONGEST, max(1, TILE // lanes)
+    static = (tasks[0].model, loop, names, terms), LONGEST, max(1, TILE // lanes)
 
     def call(some: list[_Problem], limit: int):
         places = sharded(size)
@@ -233,7 +239,7 @@ def _calls(tasks, names, bounds, objectives, number):
         index = np.array([p.task for p in filled])
         starts = np.stack([p.coordinates for p in filled])
         scenarios, others, weighed, limits = jax.tree.map(itemgetter(index), table)
-        return at_rest(scenarios, idle), others, weighed, limits, starts, np.array(limit)
+        return tasks[0].model.at_rest(scenarios, idle), others, weighed, limits, starts, np.array(limit)
 
     return static, call
 
@@ -273,9 +279,9 @@ def _advance(static: tuple[Any, int, int], arguments: Any) -> Solution:
     from tuning.optimisation.levenberg_marquardt import solve
 
     what, longest, tile = static
-    loop = what[0]
+    model, loop, *_ = what
     scenarios, fixed, weights, bounds, starts, limit = arguments
 
-    rigs = jax.vmap(lambda scenarios: simulated.prepared(loop, scenarios))(scenarios)
+    rigs = jax.vmap(lambda scenarios: model.prepared(loop, scenarios))(scenarios)
     problems = Problem(rigs, fixed, weights)
     return solve(residuals, what, problems, bounds, starts, limit, longest=longest, tile=tile)

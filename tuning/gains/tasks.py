@@ -21,10 +21,11 @@ from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import quasi_random
-from jaxhil.simulation.evaluation import lanes_of, parameters_by_slot
+from jaxhil.rig_models import rig_model
+from jaxhil.simulation.evaluation import RigModel, lanes_of
+from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.watch import LONGEST_FADING
-from tuning.gains import simulated
 from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import Bounds, to_gains
 from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
@@ -61,8 +62,13 @@ class TuneTask:
 
     @property
     def contacts(self) -> int:
-        """Contacts of each scenario; in six axes two of each episode, one for each error."""
-        return simulated.contacts_of(self.mechanism)
+        """Rows of each scenario's outcome: its contacts, or both errors of its episodes."""
+        return self.model.rows(self.mechanism)
+
+    @property
+    def model(self) -> RigModel:
+        """The model of the mechanism's rig."""
+        return rig_model(self.mechanism)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
@@ -92,17 +98,20 @@ def build_task(
         raise ValueError("probed: found True, allowed False for mechanisms that share a program")
     noisy = has_sensor_noise(mechanism)
     number = scenarios or (NOISY_SCENARIOS // (LANES_PER_SCENARIO if probed else 1) if noisy else SCENARIOS)
-    draws = quasi_random(mechanism, number, seed)
-    one_axis = isinstance(mechanism, Mechanism)
-    if probed and one_axis:
-        batch: Any = probed_scenarios(mechanism, draws, seed).scenarios
-    else:
-        batch = simulated.scenarios_of(mechanism, draws, seed)
-    loop = simulated.loop_of(mechanism, compensator, batch)
-    if one_axis:
+    draws, model = quasi_random(mechanism, number, seed), rig_model(mechanism)
+    if isinstance(mechanism, Mechanism):
+        batch: Any = (
+            probed_scenarios(mechanism, draws, seed).scenarios
+            if probed
+            else model.scenarios(mechanism, draws, seed)
+        )
+        loop = model.loop(mechanism, compensator, batch)
         batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
-    if common is not None and one_axis:
-        batch, loop = common.scenarios(mechanism, batch), common.loop(loop)
+        if common is not None:
+            batch, loop = common.scenarios(mechanism, batch), common.loop(loop)
+    else:
+        batch = model.scenarios(mechanism, draws, seed)
+        loop = model.loop(mechanism, compensator, batch)
     gains = literature_gains(mechanism, compensator, setting)
     return TuneTask(mechanism, compensator, gains, batch, loop, common, probed)
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from jaxhil.laws.compensators import compensator_of
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.evaluation import Outcome
-from tuning.gains import simulated
+from jaxhil.rig_models import rig_model
+from jaxhil.simulation.outcome import Outcome
 from tuning.gains.global_search import FACTOR, GlobalComparison, compare_with_global_search
 from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
 from tuning.gains.objective import SCALE
@@ -266,12 +265,13 @@ def _real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:
-    """Of six axes, those of each error by itself, under its name; of one axis nothing."""
-    if isinstance(result.mechanism, Mechanism):
+    """Return the metrics of each error by itself, by its name; nothing where there is but one error."""
+    model = rig_model(result.mechanism)
+    if len(model.errors) == 1:
         return {}
     parts: dict[str, dict[str, ErrorFigures]] = {}
     for key, outcome in result.outcomes.items():
-        for name, part in simulated.error_parts(outcome).items():
+        for name, part in model.by_error(outcome).items():
             parts.setdefault(name, {})[key] = figures(part)
     return parts
 

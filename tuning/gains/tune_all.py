@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism, to_builtins
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import Metrics
+from jaxhil.simulation.outcome import Outcome
 from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, decode, digest_of, encode
 from tuning.caches.worker import setting

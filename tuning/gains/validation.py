@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxhil.laws.simulation_base import Constants
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.evaluation import Batch, Outcome, begin_batch, lanes_of, place_batch
+from jaxhil.simulation.evaluation import Batch, RigModel, lanes_of
+from jaxhil.simulation.outcome import Outcome
 from tuning.batches import cut, join
-from tuning.gains import simulated
 from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
 from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
 from tuning.gains.work import Work
@@ -51,11 +52,11 @@ class Validation:
         """Of every task under its gains: outcome on fresh scenarios, the nominal run last; where tasks are
         probed, outcome (slots, scenarios, `LANES_PER_SCENARIO`) of the fresh scenarios with their probes.
         Of another `compensator` than that of the tasks, if one is given; or without the sensors' noise."""
-        loop = self.loop
+        model, loop = self.tasks[0].model, self.loop
         if compensator is not None:
-            loop = simulated.with_compensator(loop, compensator)
+            loop = model.with_compensator(loop, compensator)
         values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
-        outcome = begin_batch(loop, values, self._judged if noise else self._judged_without_noise)()
+        outcome = model.begin_batch(loop, values, self._judged if noise else self._judged_without_noise)()
         every = cut(outcome, self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
@@ -143,11 +144,13 @@ class Validation:
         values = {name: np.repeat([own[name] for own in gains], number) for name in self.tasks[0].literature}
         shape = coordinates.shape[:2]
         scenarios, batch = self._placed(tuple(which), shape[1], number, lanes)
-        ended = begin_batch(self.loop, values, batch, read)
+        ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
         if not noise:
             return lambda: (ended(), np.ones(shape))
         # The mean over the scenarios, as `tuning.gains.objective.residuals` has it.
-        constants = simulated.constants_of(scenarios)
+        constants = Constants(
+            jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
+        )
         own: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
         amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
         return lambda: (ended(), np.mean(amplification.reshape(*shape, number), axis=-1))
@@ -155,18 +158,19 @@ class Validation:
     @cached_property
     def _judged(self) -> Batch:
         # Where few are judged, they share the program of the training scenarios.
-        return place_batch(self.judged, at_least=lanes_of(self.training))
+        return self.tasks[0].model.place_batch(self.judged, at_least=lanes_of(self.training))
 
     @cached_property
     def _judged_without_noise(self) -> Batch:
         # The same program: its noise is multiplied by 0.
-        return place_batch(simulated.without_noise(self.judged), at_least=lanes_of(self.training))
+        model = self.tasks[0].model
+        return model.place_batch(model.without_noise(self.judged), at_least=lanes_of(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
         """Training scenarios of tasks, the first so many of each, once for each of so many points; the same
         on the devices. The last few are kept: a search asks for them again and again."""
-        return lru_cache(maxsize=4)(partial(_placed, self.training))
+        return lru_cache(maxsize=4)(partial(_placed, self.tasks[0].model, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """All of the compensator's gains at a point of the unit box."""
@@ -194,13 +198,15 @@ def _of_terms(outcome: Any) -> Any:
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
-def _placed(training: Any, which: tuple[int, ...], points: int, number: int, lanes: int) -> tuple[Any, Batch]:
+def _placed(
+    model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
+) -> tuple[Any, Batch]:
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
         return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
     scenarios = jax.tree.map(side_by_side, training)
-    return scenarios, place_batch(scenarios, at_least=lanes)
+    return scenarios, model.place_batch(scenarios, at_least=lanes)
 
 
 def build_validation(
@@ -244,22 +250,22 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
 def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
     """Scenarios of a task that its tuning with that seed never saw."""
     seed += VALIDATION_SEED
-    return simulated.scenarios_of(task.mechanism, draw(task.mechanism, number, seed), seed)
+    return task.model.scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
 
 def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Any, ProbedScenarios | None, Any, Any]:
     """Fresh scenarios of a task, the same with their probes, what is judged of it, its loop."""
     drawn = draw(task.mechanism, number, seed)
-    fresh, probed = simulated.scenarios_of(task.mechanism, drawn, seed), None
+    fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):
         probed = probed_scenarios(task.mechanism, drawn, seed)
         nominal = probed_scenarios(task.mechanism).scenarios
         judged = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
     else:
-        judged = join([fresh, simulated.scenarios_of(task.mechanism)])
+        judged = join([fresh, task.model.scenarios(task.mechanism)])
     if task.common is None:
         both = join([judged, task.scenarios])
-        return fresh, probed, judged, simulated.loop_of(task.mechanism, task.compensator, both, chatter=True)
+        return fresh, probed, judged, task.model.loop(task.mechanism, task.compensator, both, chatter=True)
     assert isinstance(task.mechanism, Mechanism)
-    loop = task.common.loop(simulated.loop_of(task.mechanism, task.compensator, judged, chatter=True))
+    loop = task.common.loop(task.model.loop(task.mechanism, task.compensator, judged, chatter=True))
     return fresh, probed, task.common.scenarios(task.mechanism, judged), loop

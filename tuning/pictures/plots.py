@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from jaxhil.errors import one_line
+from jaxhil.rig_models import rig_model
 from jaxhil.simulation.contact_plot import (
     BLACK,
     BLUE,
@@ -22,7 +23,6 @@ from jaxhil.simulation.contact_plot import (
 )
 from tuning.gains.objective import Objective
 from tuning.gains.pareto import Front
-from tuning.gains.simulated import error_parts
 from tuning.gains.tune import TuneResult
 
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
@@ -93,7 +93,7 @@ def two_errors_plot(result: TuneResult, limit: float) -> Figure:
     for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
         sizes: list[float] = [limit] if 0 < limit < np.inf else []
         for name, outcome in result.outcomes.items():
-            part = error_parts(outcome)[error]
+            part = rig_model(result.mechanism).by_error(outcome)[error]
             size = np.sort(np.abs(part.error[part.good]))[::-1]
             if not len(size):
                 continue

@@ -14,8 +14,9 @@ import numpy as np
 from jaxhil.mechanism.file import to_builtins
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import Outcome, evaluate, expected_duration
 from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
+from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
@@ -192,7 +193,10 @@ def _run(
     kept: Pieces,
 ) -> np.ndarray:
     """Return what `_worst` says of each lane, part by part: each has lanes that take long and that do not."""
-    loop, order = build_loop(mechanism, compensator, scenarios), np.argsort(expected_duration(scenarios))
+    loop, order = (
+        build_loop(mechanism, compensator, scenarios),
+        np.argsort(ONE_AXIS.expected_duration(scenarios)),
+    )
     found = np.empty((5, len(order)))
     parts = -(-len(order) // PART)
     lanes = [order[number::parts] for number in range(parts)]

@@ -22,7 +22,7 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     import jax
 
     from jaxhil.contact.laws import contact_law
-    from jaxhil.simulation.evaluation import parameters_by_slot
+    from jaxhil.simulation.outcome import parameters_by_slot
     from jaxhil.simulation.scenario import build_scenarios
 
     scenario = build_scenarios(mechanism)

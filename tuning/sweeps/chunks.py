@@ -14,10 +14,10 @@ import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import extremes
+from jaxhil.rig_models import rig_model
 from jaxhil.simulation.environment import on_half_the_cores
-from jaxhil.simulation.evaluation import begin_evaluation
+from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.gain_file import LoadedGains
-from tuning.gains.simulated import loop_of, scenarios_of
 from tuning.sweeps.columns import read_of, rows_of
 from tuning.sweeps.draws import drawn_scenarios
 from tuning.sweeps.manifest import Manifest, loaded_gains
@@ -33,6 +33,11 @@ class Sweep(NamedTuple):
     mechanism: AnyMechanism  # of the gain file
     loop: Any  # serves whatever can be drawn (`widest_loop`)
     gains: dict[str, float]  # of the gain file
+
+    @property
+    def model(self) -> RigModel:
+        """The model of the mechanism's rig."""
+        return rig_model(self.mechanism)
 
 
 class _Batch(NamedTuple):
@@ -55,8 +60,9 @@ def widest_loop(loaded: LoadedGains, works: bool) -> Any:
     if PERIOD in draws:
         # The longest delay counted in the shortest periods.
         draws[PERIOD] = draws[PERIOD][::-1]
-    scenarios = scenarios_of(loaded.mechanism, draws)
-    return loop_of(loaded.mechanism, loaded.compensator, scenarios, energies=works, exact=works)
+    model = rig_model(loaded.mechanism)
+    scenarios = model.scenarios(loaded.mechanism, draws)
+    return model.loop(loaded.mechanism, loaded.compensator, scenarios, energies=works, exact=works)
 
 
 def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
@@ -107,7 +113,7 @@ def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
     manifest = sweep.manifest
     limit, works = manifest.largest_error, manifest.works
     read = partial(read_of, sweep.mechanism, works)
-    outcome = begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, manifest.chunk, read)
+    outcome = sweep.model.begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, manifest.chunk, read)
     return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)
 
 

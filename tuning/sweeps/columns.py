@@ -15,9 +15,10 @@ from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import PHASE, dimensions
+from jaxhil.rig_models import rig_model
 from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, unlike_ideal
-from jaxhil.simulation.evaluation import Outcome
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
+from jaxhil.simulation.outcome import Outcome
 
 GOOD, BEYOND, UNLIKE, SATURATED = "good", "error beyond limit", "unlike the ideal contact", "saturated"
 UNLIKENESS = (
@@ -112,19 +113,15 @@ class Slot(NamedTuple):
 
 
 def slots(mechanism: AnyMechanism) -> list[Slot]:
-    """One for every contact or, in six axes, first of all episodes' errors of the energy, then of the
-    twist: as the rows of an outcome."""
-    if not isinstance(mechanism, SixAxisMechanism):
-        return contact_slots(mechanism.approach.contacts)
-    made = range(1, (mechanism.approach.episodes if mechanism.approach else 1) + 1)
-    return [
-        Slot(number, f"{error}_{number}", f"status_{number}") for error in ERRORS_IN_SPACE for number in made
-    ]
+    """Return a slot for every row of an outcome: every contact, or every error of every episode."""
+    model = rig_model(mechanism)
+    return error_slots(model.errors, model.runs(mechanism))
 
 
-def contact_slots(contacts: int) -> list[Slot]:
-    """Those of so many contacts of one axis."""
-    return [Slot(number, f"error_{number}", f"status_{number}") for number in range(1, contacts + 1)]
+def error_slots(errors: Iterable[str], runs: int) -> list[Slot]:
+    """Return the slots of every error of so many contacts or episodes."""
+    numbers = range(1, runs + 1)
+    return [Slot(number, f"{error}_{number}", f"status_{number}") for error in errors for number in numbers]
 
 
 def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
@@ -135,7 +132,7 @@ def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
         for path in dimensions(mechanism)
         for name in input_names(mechanism, path)
     ]
-    what = "episode" if isinstance(mechanism, SixAxisMechanism) else "contact"
+    what = rig_model(mechanism).run_name
     for number in sorted({slot.number for slot in slots(mechanism)}):
         columns += [
             Column(f"{one.name}_{number}", "number", one.unit, f"{what} {number}: {one.meaning}")
@@ -162,7 +159,7 @@ def texts_of(column: str) -> tuple[str, ...]:
 
 def _kept(mechanism: AnyMechanism, works: bool) -> list[PerContact]:
     """The numbers that every contact has."""
-    if not isinstance(mechanism, SixAxisMechanism):
+    if rig_model(mechanism).axes == 1:
         return [*PER_CONTACT, *(WORKS if works else ())]
     errors = [PerContact(name, "1", meaning) for name, meaning in ERRORS_IN_SPACE.items()]
     return [*errors, *(one for one in PER_CONTACT if one.name in PER_EPISODE)]

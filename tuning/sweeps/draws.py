@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.uncertainty import at_points, dimensions, draw
-from tuning.gains.simulated import scenarios_of
+from jaxhil.rig_models import rig_model
 
 REPLICATES = 16
 BITS = 30  # of a Sobol point's coordinate
@@ -30,7 +30,7 @@ def drawn_scenarios(
         draws = draw(mechanism, number, seed, first)
     else:
         draws = at_points(mechanism, sobol_points(sum(dimensions(mechanism).values()), seed, first, number))
-    return draws, scenarios_of(mechanism, draws, seed, first)
+    return draws, rig_model(mechanism).scenarios(mechanism, draws, seed, first)
 
 
 def sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:

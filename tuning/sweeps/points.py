@@ -12,9 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxhil.mechanism.uncertainty import at_points
-from jaxhil.simulation.evaluation import evaluate
 from tuning.caches.pieces import NOTHING_KEPT, Pieces
-from tuning.gains.simulated import scenarios_of
 from tuning.sweeps.chunks import Rows, Sweep, in_precision
 from tuning.sweeps.columns import rows_of
 
@@ -39,10 +37,10 @@ Computer = Callable[[Sweep, Iterable[Points]], Iterator[tuple[str, Rows]]]
 def run_piece(sweep: Sweep, points: np.ndarray, noise: np.ndarray) -> Rows:
     """`COLUMNS` of the scenarios at at most a chunk's points, in order."""
     manifest = sweep.manifest
-    scenarios = scenarios_of(sweep.mechanism, at_points(sweep.mechanism, points), manifest.seed)
+    scenarios = sweep.model.scenarios(sweep.mechanism, at_points(sweep.mechanism, points), manifest.seed)
     key = np.stack([scenarios.key[0], noise.astype(np.uint32)])
     scenarios = in_precision(scenarios._replace(key=key), manifest.precision)
-    outcome = evaluate(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
+    outcome = sweep.model.evaluate(sweep.loop, sweep.gains, scenarios, at_least=manifest.chunk)
     rows = rows_of(sweep.mechanism, 0, {}, scenarios, outcome, manifest.largest_error, manifest.works)
     return {name: rows[name] for name in COLUMNS}
 

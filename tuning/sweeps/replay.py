@@ -42,7 +42,7 @@ def replay(store: Store, index: int) -> Replay:
 
 def picture_of(sweep: Sweep, index: int, title: str) -> Figure:
     """The scenario's motion tick by tick, of one axis or of six."""
-    if not isinstance(sweep.mechanism, SixAxisMechanism):
+    if sweep.model.axes == 1:
         return contact_plot(motion_of(sweep, index), title, sensors="rig")
     from tuning.pictures.six_axes import six_axes_plot
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import binomtest, bootstrap
 
-from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.outcome import Outcome
 from tuning.statistics.bootstrap import ErrorIntervals, Interval, error_intervals
 from tuning.statistics.intervals import Estimate
 

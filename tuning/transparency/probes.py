@@ -26,7 +26,7 @@ from jaxhil.contact.laws import contact_law
 from jaxhil.contact.reference import Reference
 from jaxhil.laws.compensators import compensator_of
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.evaluation import Outcome
+from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.statistics.intervals import Estimate
 from tuning.transparency.damping_perturbations import perturb_damping

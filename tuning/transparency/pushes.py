@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import ContactLaw, ContactParameters
 from jaxhil.contact.reference_motion import integrate_contact
-from jaxhil.simulation.evaluation import parameters_by_slot
+from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import Scenario
 from tuning.batches import join

@@ -25,9 +25,9 @@ from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.rig.limits import NO_LIMITS
 from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_bounds import BRIEFLY
-from jaxhil.simulation.evaluation import Outcome, compare_with_reference
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK, STATUS_NAMES, Metrics
+from jaxhil.simulation.outcome import Outcome, compare_with_reference
 from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification.closed_loop import run_closed_loop
 from tuning.verification.stops import Stop

@@ -22,9 +22,10 @@ from jaxtyping import Float
 
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.evaluation import evaluate, lanes_of
+from jaxhil.simulation.evaluation import lanes_of
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.plausibility import meaning
 from jaxhil.simulation.scenario import Scenario
 from tuning.statistics.intervals import binomial_interval, number_to_decide

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxhil.simulation.evaluation import compare_with_reference
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.outcome import compare_with_reference
 from jaxhil.simulation.recording import record_ticks
 from jaxhil.simulation.scenario import Scenario
 from tuning.sweeps.chunks import widest_loop

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.files import follow
-from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.environment import prepare
 from tuning import terminal
 from tuning.cli.commands import checks
@@ -44,7 +43,6 @@ def run(options: Replay) -> int:
 
 
 def _document(options: Replay, store, found) -> dict[str, Any]:
-    from tuning.gains.simulated import compensator_name
     from tuning.sweeps.columns import ERRORS_IN_SPACE, PER_EPISODE, slots, texts_of
 
     row = {
@@ -52,18 +50,17 @@ def _document(options: Replay, store, found) -> dict[str, Any]:
         for name, values in found.again.items()
     }
     mechanism = found.sweep.mechanism
-    what, keys = "contacts", KEYS
-    if isinstance(mechanism, SixAxisMechanism):
-        what, keys = "episodes", (*ERRORS_IN_SPACE, *PER_EPISODE)
+    model = found.sweep.model
+    keys = KEYS if model.axes == 1 else (*ERRORS_IN_SPACE, *PER_EPISODE)
     return {
         "store": str(store.folder),
         "index": options.index,
         "mechanism": mechanism.name,
-        "compensator": compensator_name(found.sweep.loop),
+        "compensator": model.compensator_name(found.sweep.loop),
         "inputs": {
             column.name: row[column.name] for column in store.manifest.columns if column.kind == "input"
         },
-        what: [
+        f"{model.run_name}s": [
             {**{key: row[f"{key}_{number}"] for key in keys}, "status": row[f"status_{number}"]}
             for number in sorted({slot.number for slot in slots(mechanism)})
         ],

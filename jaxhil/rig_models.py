@@ -1,0 +1,21 @@
+"""Choice of the rig model that a mechanism needs: along one axis or in six."""
+
+from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation.evaluation import RigModel
+from jaxhil.simulation.one_axis import ONE_AXIS
+
+
+def rig_model(mechanism: AnyMechanism) -> RigModel:
+    """Return the model of a mechanism's rig; imports six axes only where they are needed.
+
+    Example:
+        >>> import jaxhil
+        >>> rig_model(jaxhil.load("rig-300kg")).axes
+        1
+    """
+    if not isinstance(mechanism, SixAxisMechanism):
+        return ONE_AXIS
+    from jaxhil.sixdof.six_axes import SIX_AXES
+
+    return SIX_AXES

@@ -1,0 +1,88 @@
+"""Outcome of runs: their metrics beside those of the ideal contact."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.contact.laws import ContactParameters
+from jaxhil.contact.reference import Reference
+from jaxhil.simulation.contact_bounds import unlike_ideal
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.metrics import OK, Metrics
+from jaxhil.simulation.scenario import Scenario
+
+
+class Outcome(NamedTuple):
+    """A run beside the ideal contact, per contact, (slots, *batch)."""
+
+    metrics: Metrics  # of the run
+    # e* of the ideal contact, entered at the same speed [1]
+    reference_restitution: Float[Array, "slots *batch"]
+    reference_peak_force: Float[Array, "slots *batch"]  # of that contact [N]
+    # of that contact [s]; infinite if the bodies never separate
+    reference_duration: Float[Array, "slots *batch"]
+    error: Float[Array, "slots *batch"]  # e - e* [1]
+    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the reference's peak force [1]
+    # excess variation of F_c (`Metrics`) over the reference's peak force [1]
+    chatter: Float[Array, "slots *batch"]
+    wanted: Bool[Array, "slots *batch"]  # whether the contact was asked for
+    good: Bool[Array, "slots *batch"]  # whether it was reached and ended well
+    # whether its real force or its duration is beyond the bounds beside the ideal contact (`contact_bounds`)
+    unlike: Bool[Array, "slots *batch"]
+
+    @property
+    def peak_force_ratio(self) -> Any:
+        """Largest real contact force over the ideal contact's peak force [1]."""
+        return self.metrics.peak_force / self.reference_peak_force
+
+    @property
+    def duration_ratio(self) -> Any:
+        """Time with a real contact force over the ideal contact's duration [1]."""
+        return self.metrics.duration / self.reference_duration
+
+
+def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
+    """Compare a run with the ideal contacts, each entered at the speed it had on the rig."""
+    slots = metrics.restitution.shape[0]
+    number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
+        slots, *[1] * (metrics.restitution.ndim - 1)
+    )
+    wanted = number < scenario.contacts[None]
+    good = wanted & (metrics.status == OK)
+    velocity = jnp.where(good, metrics.approach_velocity, scenario.velocity[None])
+    contact = parameters_by_slot(scenario.contact)
+    mass = jnp.broadcast_to(scenario.equivalent_mass, velocity.shape)
+    reference = loop.law.reference(contact, mass, velocity)
+    known = scenario.reference
+    if known is not None:
+        given = ~jnp.isnan(known.restitution)
+        reference = Reference(*(jnp.where(given, a, b) for a, b in zip(known, reference, strict=True)))
+    return Outcome(
+        metrics=metrics,
+        reference_restitution=reference.restitution,
+        reference_peak_force=reference.peak_force,
+        reference_duration=reference.duration,
+        error=metrics.restitution - reference.restitution,
+        peak_ratio=metrics.peak_command / reference.peak_force,
+        chatter=metrics.excess_variation / reference.peak_force,
+        wanted=wanted,
+        good=good,
+        unlike=good
+        & unlike_ideal(
+            metrics.peak_force,
+            reference.peak_force,
+            metrics.duration,
+            reference.duration,
+            scenario.control_period[None],
+        ),
+    )
+
+
+def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
+    """Return contact parameters with the slots as part of the batch: (segments, slots, *batch)."""
+    nested = contact.stiffness.ndim > contact.damping.ndim
+    return contact._replace(
+        stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,
+        depths=jnp.moveaxis(contact.depths, 0, 1),
+    )

@@ -1,0 +1,148 @@
+"""Model of a rig that moves in six axes.
+
+An episode has two errors, that of the energy and that of the twist: an outcome has the rows of the first,
+then those of the second.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhil.laws.simulation_base import Gains
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.simulation import environment
+from jaxhil.simulation import metrics as one_axis
+from jaxhil.simulation.contact_bounds import unlike_ideal
+from jaxhil.simulation.evaluation import RigModel
+from jaxhil.simulation.outcome import Outcome
+from jaxhil.sixdof import building
+from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.metrics import Metrics, evaluate
+from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
+from jaxhil.sixdof.scenario import Scenario
+
+# What a status is on one axis; whatever is not here diverged.
+STATUSES = {
+    MISS: one_axis.NOT_REACHED,
+    REBOUNDED: one_axis.OK,
+    CAPTURED: one_axis.OK,
+    JAMMED: one_axis.TIMEOUT,
+    TIMEOUT: one_axis.TIMEOUT,
+    NON_FINITE: one_axis.NON_FINITE,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class SixAxes(RigModel):
+    """Model of a rig in six axes: its runs are episodes, with an error of the energy and one of the twist."""
+
+    axes: ClassVar[int] = 6
+    run_name: ClassVar[str] = "episode"
+    errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
+    compiler_options: ClassVar[Mapping[str, int | str]] = environment.SIX_AXES
+
+    def scenarios(
+        self,
+        mechanism: SixAxisMechanism,
+        draws: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        first: int = 0,
+    ) -> Scenario:
+        """Return scenarios; see `jaxhil.sixdof.building.build_scenarios`."""
+        return jax.tree.map(np.asarray, building.build_scenarios(mechanism, draws, seed, first))
+
+    def loop(self, mechanism: SixAxisMechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
+        """Return the loop that runs all the scenarios; the `parts` of one axis are ignored."""
+        return building.loop_of(mechanism, compensator, scenarios)
+
+    def runs(self, mechanism: SixAxisMechanism) -> int:
+        """Return how many episodes a scenario has."""
+        return mechanism.approach.episodes if mechanism.approach else 1
+
+    def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
+        """Run the episodes of a batch and compare them with the ideal contacts."""
+        return outcome_of(evaluate(loop, gains, scenario).metrics, scenario)
+
+    def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
+        """Return scenarios of which the `idle` lanes end at once."""
+        duration: Any = np.where(idle, 0.0, scenarios.duration).astype(np.asarray(scenarios.duration).dtype)
+        return scenarios._replace(duration=duration)
+
+    def expected_duration(self, scenarios: Scenario) -> np.ndarray:
+        """Return zeros: nothing is known before a run."""
+        return np.zeros(np.shape(scenarios.duration))
+
+    def whole_delays(self, scenarios: Scenario) -> np.ndarray:
+        """Return zeros: lanes are read one by one."""
+        return np.zeros(np.shape(scenarios.duration))
+
+    def without_noise(self, scenarios: Scenario) -> Scenario:
+        """Return the scenarios with a force sensor that has no noise."""
+        sensor = scenarios.sensor
+        return scenarios._replace(sensor=sensor._replace(noise_std=np.zeros_like(sensor.noise_std)))
+
+    def with_compensator(self, loop: Loop, compensator: str) -> Loop:
+        """Return the loop with another compensator."""
+        return dataclasses.replace(loop, compensator=compensator)
+
+    def compensator_name(self, loop: Loop) -> str:
+        """Return the name of a loop's compensator."""
+        return loop.compensator
+
+
+SIX_AXES = SixAxes()
+
+
+def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
+    """Return the metrics of episodes as an outcome; its peaks are of the real force, its chatter is 0."""
+    # A draw that goes past the target, or never comes, has no contact to judge.
+    begins = jnp.isfinite(scenario.start.chaser.position.z)
+    wanted = (found.status != MISS) & begins[None]
+    known = jnp.isfinite(found.energy_error) & jnp.isfinite(found.twist_error)
+    status = jnp.full_like(found.status, one_axis.DIVERGED)
+    for own, meant in STATUSES.items():
+        status = jnp.where(found.status == own, meant, status)
+    status = jnp.where(wanted, jnp.where((status == one_axis.OK) & ~known, one_axis.NON_FINITE, status),
+                       one_axis.NOT_REACHED)  # fmt: skip
+    zero = jnp.zeros_like(found.energy_error)
+    metrics = one_axis.Metrics(
+        restitution=found.restitution,
+        approach_velocity=found.approach_velocity,
+        peak_force=found.peak_force,
+        peak_command=found.peak_force,
+        excess_variation=zero,
+        position_shortfall=zero,
+        duration=found.duration,
+        work_in=zero,
+        work_out=zero,
+        trajectory_error=zero,
+        force_delay=zero,
+        status=status,
+        ticks=0 * status,
+    )
+    ratio = found.peak_force / jnp.where(found.reference_peak_force > 0, found.reference_peak_force, jnp.nan)
+    both = Outcome(
+        metrics=metrics,
+        reference_restitution=found.reference_restitution,
+        reference_peak_force=found.reference_peak_force,
+        reference_duration=found.reference_duration,
+        error=found.energy_error,
+        peak_ratio=ratio,
+        chatter=zero,
+        wanted=wanted,
+        good=status == one_axis.OK,
+        unlike=(status == one_axis.OK)
+        & unlike_ideal(
+            found.peak_force,
+            found.reference_peak_force,
+            found.duration,
+            found.reference_duration,
+            scenario.control_period[None],
+        ),
+    )
+    rows: Outcome = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), both)
+    return rows._replace(error=jnp.concatenate([found.energy_error, found.twist_error]))
