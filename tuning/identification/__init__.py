@@ -1,1 +1,1 @@
-"""From a rig's logs to a mechanism file: what the numbers of a rig are, and how well the logs tell them."""
+"""Identification of a rig from its logs: parameter values, their uncertainty, and a mechanism file."""

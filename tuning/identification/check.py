@@ -1,4 +1,4 @@
-"""Whether logs are those of a mechanism as it is: its own model against every run, nothing estimated."""
+"""Check of logs against a mechanism file: its model is compared with every run; nothing is estimated."""
 
 from __future__ import annotations
 
@@ -25,45 +25,45 @@ from tuning.identification.records import Campaign, Run
 from tuning.identification.result import PRESS, UNCERTAINTY, Identification, experiment
 from tuning.identification.uncertain_effect import Effect, uncertain_effect
 
-CLOCK = 2e-5  # s, to which no delay is known better
-USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
+CLOCK = 2e-5  # s, least standard deviation of any delay
+USUAL_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
 
 
 def check(
     campaign: Campaign, mechanism: Mechanism, limit: float = 0.01, fitted: FreeMotion | None = None
 ) -> Identification:
-    """Set logs against a mechanism as it is; estimate nothing.
+    """Compare logs with a mechanism, without estimating anything.
 
-    The force's noise is that of the runs at rest, else the mechanism's.
+    The noise of the force sensor comes from runs at rest or in free motion, else from the mechanism.
 
     Args:
         campaign: The logs.
-        mechanism: What they are set against.
-        limit: On the effects on e and on e - e*.
-        fitted: A motion simulator of any order fitted to the free runs, if there is one already. Only a fit
-            shows a wrong hold or latency whose delay the mechanism has taken up.
+        mechanism: Mechanism that the logs are compared with.
+        limit: Largest allowed effect on e and on e - e*.
+        fitted: Motion simulator fitted to the free runs with any order, if it is available. Only a fit
+            reveals a wrong hold or latency that the mechanism's delay compensates.
 
     Returns:
         An identification without estimates.
 
     Raises:
-        InputError: If the logs have neither free motion nor contact, or the contact law cannot be set
-            against logs.
+        InputError: If the logs have neither free motion nor contact, or the contact law cannot be compared
+            with logs.
     """
     two_clocks.refuse(campaign.timing)
     model = known.motion_model(mechanism)
     free = [run for run in campaign.runs if run.kind == "free"]
-    period = campaign.timing.control_period
-    whole = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
-    whole = contacts.after_gaps(whole, model, period) if whole else []
-    touching = [piece for run in whole for piece in contacts.pieces(run, period)]
+    mass, period = campaign.equivalent_mass, campaign.timing.control_period
+    touches = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    touches = contacts.after_gaps(touches, model, period) if touches else []
+    touching = [piece for run in touches for piece in contacts.pieces(run, period)]
     motion = free_motion.of_known(free, campaign.timing, model)
     contact = None
     if touching:
         contact = _known_contact(touching, model, campaign, mechanism)
     elif motion is None:
         raise InputError("logs: found neither free motion nor contact, allowed runs of either kind")
-    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, campaign.equivalent_mass)
+    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, mass)
     lines = []
     if motion is not None:
         fitted = fitted or free_motion.estimate(free, campaign.timing)
@@ -72,8 +72,8 @@ def check(
         lines = [*validation.of_motion(motion, frequency), validation.sign_of_delay(fitted, frequency)]
     if contact is not None:
         lag = contacts.lag(contact, model, frequency)
-        every = np.ones(len(touching), bool)
-        lines += validation.of_contact(contact, touching, campaign.equivalent_mass, frequency, lag, every)
+        flags = np.ones(len(touching), bool)
+        lines += validation.of_contact(contact, touching, mass, frequency, lag, flags)
     effect = uncertain_effect(mechanism)
     if contact is not None:
         lines += edges(contact, touching, effect)
@@ -92,21 +92,24 @@ def check(
 
 
 def uncertainty(effect: Effect, pressed: bool) -> list[validation.Line]:
-    """Say what the file's own uncertainty can do, if an identification stated it, and what lessens it."""
+    """Return a check of the effect of the file's own uncertainty, with advice for further runs.
+
+    The list is empty if the file does not come from an identification.
+    """
     if not effect.parts:
         return []
     largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]
-    found = f"{' and '.join(largest)} above all"
+    finding = f"{' and '.join(largest)} above all"
     if len(largest) == 2:
         advice = experiment(*largest)
         if pressed and advice == PRESS:
             advice = "a longer or stronger press run with a multisine to 45 Hz"
-        found += f"; {advice} would tell them better"
-    return [validation.Line(UNCERTAINTY, found, True, effect.restitution, on_error=effect.error)]
+        finding += f"; {advice} would tell them better"
+    return [validation.Line(UNCERTAINTY, finding, True, effect.restitution, on_error=effect.error)]
 
 
 def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechanism: Mechanism) -> ContactFit:
-    """The mechanism's contact in the place of a fitted one."""
+    """Return the mechanism's contact in the form of a fit."""
     rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
     law = known.contact_law(contact)
     delay = rig.force_sensor.delay - rig.position_sensor.delay
@@ -132,7 +135,8 @@ def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechan
     problem = Problem(motion, readings, law, plane, lag)
     inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _places(mechanism)
-    delays = np.clip(delays, problem.shortest, max(LONGEST, delay))  # as far as the motion is known
+    # The motion is only computed up to this delay.
+    delays = np.clip(delays, problem.shortest, max(LONGEST, delay))
     posterior = Posterior(
         ["delay", "plane", *problem.names],
         np.column_stack([delays, planes, np.tile(values, (validation.CERTAIN_DRAWS, 1))]),
@@ -145,7 +149,7 @@ def _known_contact(runs: Sequence[Run], model: Model, campaign: Campaign, mechan
 
 
 def _noise(runs: Sequence[Run]) -> Noise | None:
-    """The force sensor's at rest, or else in free motion."""
+    """Return the force sensor's noise at rest, else in free motion; None for fewer than 200 readings."""
     for kind in ("rest", "free"):
         for run in runs:
             if run.kind == kind and run.force_measured is not None:
@@ -156,14 +160,14 @@ def _noise(runs: Sequence[Run]) -> Noise | None:
 
 
 def _scatter(problem: Problem, delay: float, plane: float, values: np.ndarray) -> float:
-    """Standard deviation of what the law leaves, from one row to the next [N]."""
+    """Return the standard deviation [N] of the force that the law leaves unexplained, from row to row."""
     left = problem.readings.force - problem.force(delay, plane, values)
     steps = np.diff(left, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
     return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)
 
 
 def _places(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-    """Delays and planes that the mechanism's uncertainty allows: which rows are surely in contact."""
+    """Return draws of the relative force delay [s] and the surface [m] from the mechanism's uncertainty."""
     count, rig = validation.CERTAIN_DRAWS, mechanism.rig
     drawn = draw(mechanism, count, 0)
 

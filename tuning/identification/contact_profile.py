@@ -1,9 +1,9 @@
-"""The force delay and the plane on a grid, all else of a contact by linear least squares.
+"""Posterior on a grid of force delay and surface position, with linear least squares for the coefficients.
 
-The delay is not differentiated: while damped contact lasts, first-order information on it is the damping's,
-and what remains is at the onset, where the likelihood has kinks. So the grid carries the posterior itself
-(flat prior on delay and plane, no negative damping), and draws from it are what everything after reckons
-with: means, standard deviations, intervals, correlations.
+The delay is not differentiated. During damped contact, first-order information on the delay is shared with
+the damping; the rest comes from the onset, where the likelihood has kinks. Therefore the grid represents the
+posterior itself (flat prior on delay and surface, no negative damping). All results, such as means, intervals
+and correlations, come from draws of this posterior.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from tuning.identification import press
 from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
 from tuning.identification.normal_draws import factor
 
-FINE = 2e-5  # s, between the next
-SMOOTHED = 7  # of these delays, over which the plane is averaged
-REGION = 30.0  # of twice the log posterior below its best: what the final grid covers
-ROUGH_REGION = 400.0  # the same of the coarse grid, whose heights are full of rows on the wrong side
-FEW_PLANES = 15  # of the grid that finds the region
-ROUGHLY = 2.0  # times the plane's standard deviation that the first look tells
-DELAYS, PLANES = 61, 13  # of the final grid
-REACH = 0.003  # s, on each side of a delay that is known roughly
-PLANE_REACH = 3.2  # standard deviations of the plane at a given delay, on each side
+FINE = 2e-5  # s, between the delays of the second grid
+SMOOTHED = 7  # delays of the second grid over which the plane is averaged
+REGION = 30.0  # drop of twice the log posterior below its maximum that the final grid covers
+ROUGH_REGION = 400.0  # the same for the coarse grid, whose log posterior is less accurate near onsets
+FEW_PLANES = 15  # planes of the second grid
+ROUGHLY = 2.0  # factor on the plane's standard deviation from the coarse grid
+DELAYS, PLANES = 61, 13  # size of the final grid
+REACH = 0.003  # s, half width of the search about an approximate delay
+PLANE_REACH = 3.2  # half width in standard deviations of the plane at a given delay
 DRAWS = 4000
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of delay, plane and coefficients, and the profile they come from."""
+    """Draws of delay, surface and coefficients, and the profile over the delay."""
 
     names: list[str]  # "delay", "plane", then the coefficients
     draws: np.ndarray  # (draws, names)
     delays: np.ndarray  # s, the final grid
-    log_posterior: np.ndarray  # of the delay there, less its largest
+    log_posterior: np.ndarray  # of the delay at the final grid, minus its maximum
     best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
     evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
 
@@ -57,20 +57,24 @@ def profile(
     near: tuple[float, float] | None = None,
     size: tuple[int, int] = (DELAYS, PLANES),
 ) -> Posterior:
-    """The posterior of the force delay, the plane and the coefficients.
+    """Return the posterior of the force delay, the surface and the coefficients.
 
-    `near`: a delay [s] and the plane there [m] within some milliseconds of the best, where they are known;
-    else, and where delays further away are as likely, all delays are looked at. `size`: of the final grid,
-    delays and planes."""
+    Args:
+        problem: Readings, motion and law.
+        seed: Seed of the random numbers.
+        near: Delay [s] and surface [m] within some milliseconds of the best fit, if they are known. All
+            delays are searched without it, or if the best delay may lie further away.
+        size: Numbers of delays and planes of the final grid.
+    """
     delays, start = np.arange(problem.shortest, LONGEST + COARSE / 2.0, COARSE), 0.0
     scanned = None
     if near is not None:
         close, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
         close = np.unique(np.clip(close, problem.shortest, LONGEST))
         scanned = _scan(problem, close, start)
-        likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= REGION
+        is_likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= REGION
         inner = close[0] > problem.shortest, close[-1] < LONGEST
-        if np.any(likely & inner):
+        if np.any(is_likely & inner):
             scanned = None
         else:
             delays = close
@@ -80,35 +84,35 @@ def profile(
     planes, stds, heights = scanned or _scan(problem, delays, start)
     low, high = _region(problem, delays, heights, ROUGH_REGION)
     finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
-    known = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
-    places, cells = _grid(problem, finer, (known[0], ROUGHLY * known[1]), FEW_PLANES)
+    surface = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
+    places, cells = _grid(problem, finer, (surface[0], ROUGHLY * surface[1]), FEW_PLANES)
     heights, planes, spreads = _by_delay(places, cells, len(finer))
     low, high = _region(problem, finer, heights, REGION)
     delays = np.linspace(low, high, size[0])
-    # Where one cell has all the posterior of a delay, that of the next delay may be in another.
+    # If a single cell holds the posterior of a delay, the plane jumps from delay to delay: smooth it.
     planes = uniform_filter1d(planes, SMOOTHED, mode="nearest")
-    known = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, known[1]))
-    places, cells = _grid(problem, delays, known, size[1])
+    surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
+    places, cells = _grid(problem, delays, surface, size[1])
     return _sample(problem, places, cells, delays, seed)
 
 
 def first_plane(problem: Problem, delay: float) -> float:
-    """Where the mechanism was when the force first rose above its noise, the median of the runs [m]."""
+    """Return the position [m] at which the force first rises above its noise, the median of the runs."""
     position, _ = problem.motion.at(delay)
     readings = problem.readings
     if readings.bias is not None:
-        found = press.first_plane(position, readings.force, readings.counts, readings.bias)
-        if found is not None:
-            return found
+        crossing = press.first_plane(position, readings.force, readings.counts, readings.bias)
+        if crossing is not None:
+            return crossing
     level = np.median(readings.force[readings.counts])
     loud = readings.counts & (np.abs(readings.force - level) > 5.0 * readings.std + readings.threshold)
     sustained = loud & np.roll(loud, -1, axis=0) & np.roll(loud, -2, axis=0)
-    found = [position[np.argmax(lane), i] for i, lane in enumerate(sustained.T) if lane.any()]
-    return float(np.median(found)) if found else 0.0
+    crossings = [position[np.argmax(lane), i] for i, lane in enumerate(sustained.T) if lane.any()]
+    return float(np.median(crossings)) if crossings else 0.0
 
 
 def _scan(problem: Problem, delays: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At each delay the best plane, its standard deviation, and the log posterior with it integrated out."""
+    """Return the best plane, its standard deviation and the marginal log posterior at each delay."""
     planes, stds, heights = [], [], []
     for delay in delays:
         plane, inner, gain = problem.settled(delay, start)
@@ -119,23 +123,32 @@ def _scan(problem: Problem, delays: np.ndarray, start: float) -> tuple[np.ndarra
 
 
 def _region(problem: Problem, delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
-    """The delays around the best whose posterior is worth a grid, one step wider on each side."""
+    """Return the range of delays within `reach` of the best posterior, one step wider on each side."""
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
     step = delays[1] - delays[0]
     return max(problem.shortest, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
 
 
 def _grid(
-    problem: Problem, delays: np.ndarray, known: tuple[np.ndarray, np.ndarray], across: int
+    problem: Problem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
 ) -> tuple[np.ndarray, list[Inner]]:
-    """Fits at each delay and at planes across the plane's uncertainty there: `known`, its mean and standard
-    deviation at each.
+    """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
 
-    Damped touches begin with a jump, and a row on its other side costs much: the likelihood is smooth but for
-    the planes at which a row comes into contact, and those are cells' edges. Places are rows of (delay,
-    plane, width in the plane)."""
+    Damped contacts begin with a jump, so a row on the wrong side of the onset raises the misfit. The
+    likelihood is smooth between the planes at which a row enters the contact; these planes are the edges of
+    the cells.
+
+    Args:
+        problem: Readings, motion and law.
+        delays: Delays [s].
+        surface: Mean and standard deviation of the plane [m] at each delay.
+        across: Number of planes at each delay.
+
+    Returns:
+        Rows of (delay, plane, width in the plane), and the fit of each row.
+    """
     places, cells = [], []
-    for delay, centre, std in zip(delays, *known, strict=True):
+    for delay, centre, std in zip(delays, *surface, strict=True):
         if problem.plane is not None:
             cells.append(problem.at(delay, problem.plane))
             places.append((delay, problem.plane, 1.0))
@@ -144,13 +157,16 @@ def _grid(
         edges = cut(low, high, problem.onsets_between(delay, low, high), across)
         planes = (edges[1:] + edges[:-1]) / 2.0
         cells += problem.across(delay, planes)
-        places += [(delay, *one) for one in zip(planes, np.diff(edges), strict=True)]
+        places += [(delay, *cell) for cell in zip(planes, np.diff(edges), strict=True)]
     return np.array(places), cells
 
 
 def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
-    """The edges of so many cells from low to high, cut at these places first, then in the widest cells; of
-    places too many, those go that leave the smallest cells."""
+    """Return the edges of `number` cells from `low` to `high` that include the positions `at`.
+
+    Further edges halve the widest cells. If there are too many positions, those that leave the smallest cells
+    are dropped.
+    """
     edges = [low, *at, high]
     while len(edges) <= number:
         widest = int(np.argmax(np.diff(edges)))
@@ -163,38 +179,38 @@ def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
 def _by_delay(
     places: np.ndarray, cells: list[Inner], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log posterior of each delay, all planes together; mean and standard deviation of the plane there."""
+    """Return the marginal log posterior of each delay, and the plane's mean and standard deviation there."""
     heights, planes = _heights(places, cells).reshape(count, -1), places[:, 1].reshape(count, -1)
     total: Any = special.logsumexp(heights, axis=1)
     share = np.exp(heights - total[:, None])
     mean = np.sum(share * planes, axis=1)
     spread = np.sqrt(np.sum(share * (planes - mean[:, None]) ** 2, axis=1))
-    # A grid so wide that one plane has it all says no more than the distance to the next.
+    # If one plane holds all of the posterior, only the spacing of the planes bounds the deviation.
     best = np.argmax(heights, axis=1)
     width = places[:, 2].reshape(count, -1)[np.arange(count), best]
     return total, mean, np.maximum(spread, width / 2.0)
 
 
 def _heights(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
-    """Log posterior of each cell of a grid."""
+    """Return the log posterior of each cell of a grid."""
     return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
 
 
 def _sample(
     problem: Problem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
 ) -> Posterior:
-    """Draws from the grid: a cell by its weight, a place in it, coefficients by their normal distribution."""
+    """Return draws from the grid: a cell by its weight, a point in it, and normal coefficients."""
     heights = _heights(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
     rng = np.random.default_rng(seed)
-    # Spread evenly over the weights: less luck in the draws.
+    # Systematic resampling reduces the variance of the draws.
     picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
     picked = np.minimum(picked, len(cells) - 1)
     step, rows = delays[1] - delays[0], []
     slopes = np.zeros((len(cells), len(cells[0].coefficients)))
     if problem.plane is not None:
-        # Within a cell the coefficients go along with the delay, damping above all.
+        # Within a cell the coefficients change with the delay, above all the damping.
         slopes = np.gradient(np.array([cell.coefficients for cell in cells]), step, axis=0)
     for index in np.unique(picked):
         count = int(np.sum(picked == index))
@@ -218,7 +234,7 @@ def _sample(
 
 
 def _coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
-    """Normal draws; those with a negative damping are drawn again."""
+    """Return normal draws of the coefficients; those with a negative damping are drawn again."""
     root = factor(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T
     for _ in range(50):

@@ -1,8 +1,8 @@
-"""From a campaign to an identification: rest, free motion, contact, validation, in that order.
+"""Identification of a campaign in four stages: rest, free motion, contact, validation.
 
-Each stage takes what the one before it found; a stage without runs takes the prior's numbers. What the logs
-cannot tell is taken as told: the hold, the latency, the way rows are written, the mass, and how the motion's
-delay is shared with the position sensor's.
+Each stage uses the results of the previous ones; without runs for a stage, the prior's values are used. The
+logs cannot determine the hold, the latency, the row convention, the mass, or the split of the motion's delay
+between the motion and the position sensor. These are taken as specified.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from tuning.identification.records import Campaign, Run
 from tuning.identification.result import Identification, confounded
 from tuning.identification.uncertain_effect import uncertain_effect
 
-SHORTEST_REST = 200  # rows from which a run at rest says what a sensor's noise is
-USUAL_FREQUENCY = 3.0  # Hz, of contacts, where none was made
+SHORTEST_REST = 200  # rows at rest that an estimate of the noise needs
+USUAL_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
 TOUCHING = ("contact", "press", "tap")
-STAGES = 3  # free motion, contact, validation; with a bootstrap one more for each piece of its fits
-Say = Callable[[str], None]  # told what begins
+STAGES = 3  # free motion, contact, validation; a bootstrap adds one for each chunk of its fits
+Say = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY, DEAD_ZONE = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
 STIFFNESS, POSITION_DELAY = "contact.stiffness.", "rig.position_sensor.delay"
-CLEAR = 2.0  # standard deviations by which a force delay is taken to be above 0
+CLEAR = 2.0  # standard deviations between 0 and a force delay that would else be negative
 
 
 def _silent(text: str) -> None:
@@ -53,71 +53,56 @@ def _silent(text: str) -> None:
 def identify(
     campaign: Campaign, prior: Mechanism | None = None, options: Options | None = None, say: Say = _silent
 ) -> Identification:
-    """What the runs of a campaign say of the rig and the mechanism.
+    """Identify the rig and the mechanism from the runs of a campaign.
 
-    `prior` gives what the logs do not tell. Where neither does for a number that a mechanism file must have,
-    there is no mechanism and the verdict is bad. `say` is called with what begins, in words, `STAGES` times
-    at most, once more for each piece of a bootstrap. Raises `InputError` for options that cannot be."""
+    Args:
+        campaign: Runs and their timing.
+        prior: Mechanism with the values that the logs do not determine, or None.
+        options: Options of the caller.
+        say: Function that receives the name of each stage (at most `STAGES`) and bootstrap chunk.
+
+    Returns:
+        Estimates, draws, checks and the mechanism, or a bad verdict if a required value is unknown.
+
+    Raises:
+        InputError: If the options are invalid.
+    """
     options = options or Options()
     check(options, prior)
     runs = {kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *TOUCHING)}
-    period, mass = campaign.timing.control_period, campaign.equivalent_mass
     force, position = _noise(runs)
     say("fitting the motion simulator")
     motion = free_motion.estimate(runs["free"], campaign.timing, options.order)
     model = _told_model(prior) if motion is None else motion.model
-    contact, touching, left_out, frequency = None, [], [], USUAL_FREQUENCY
     dead_zone = options.fixed.get(DEAD_ZONE, 0.0 if prior is None else prior.rig.force_sensor.dead_zone)
-    whole = [run for run in campaign.runs if run.kind in TOUCHING]
-    if whole and model is not None:
-        whole = contacts.after_gaps(whole, model, period)
-        touching = [piece for run in whole for piece in contacts.pieces(run, period)]
-        contact, left_out = _contact(touching, model, campaign, force, dead_zone, options, say)
-        frequency = contacts.frequency(contact, mass)
+    touching = [] if model is None else _touching(campaign, model)
+    contact, left_out = _contact(touching, model, campaign, force, dead_zone, options, say)
+    frequency = _frequency(contact, campaign.equivalent_mass)
     apart = None if contact is None else contact.drift
     share = _position_delay(motion, None if apart else contact, prior, options)
-    found = _draws(motion, contact, model, frequency, share, options.seed)
-    first = FIRST
-    if apart is not None:
-        # What a constant between two clocks adds to it, no log shows.
-        del found[FORCE_DELAY]
-        first = (*FIRST, FORCE_DELAY)
-    if options.bayes and prior is not None:
-        found = knowledge.with_prior(found, prior, frequency, options.seed)
-    later = {key: value for key, value in options.fixed.items() if key not in first}
-    later = knowledge.spread_out(later, list(found))
-    found, denied = knowledge.with_told(found, later)
+    draws = _draws(motion, contact, model, frequency, share, options.seed)
+    first = FIRST if apart is None else (*FIRST, FORCE_DELAY)
+    draws, later, denied = _conditioned(draws, first, frequency, prior, options)
     fixed = {**_told_first(first, share, prior, options), **later}
-    told = {key: np.full(DRAWS, value) for key, value in later.items()}
-    found, vague = _without_vague(found)
-    told_contact = contact if any(key.startswith(STIFFNESS) for key in (*found, *fixed)) else None
-    numbers = estimates(found, motion, told_contact, force, position, fixed)
-    untold = apart is not None and FORCE_DELAY not in fixed
-    mechanism, missing = None, _missing(prior, model, told_contact, untold)
-    if not missing:
-        mechanism = mechanism_of(campaign, prior, model, told_contact, numbers, found, options)
-    written, refused = _written(mechanism)
-    lines = _of_file(campaign, written, motion if options.order is None else None)
-    if lines is None:
-        lines = [*refused, *_of_fits(motion, contact, model, touching, mass)]
-        if written is not None:
-            lines += uncertainty(uncertain_effect(written), any(run.kind == "press" for run in whole))
-    keys = list(found)
-    table = np.array([found[key] for key in keys]).T if keys else np.zeros((DRAWS, 0))
+    draws, vague = _without_vague(draws)
+    used = contact if any(key.startswith(STIFFNESS) for key in (*draws, *fixed)) else None
+    numbers = estimates(draws, motion, used, force, position, fixed)
+    missing = _missing(prior, model, used, apart is not None and FORCE_DELAY not in fixed)
+    mechanism = None if missing else mechanism_of(campaign, prior, model, used, numbers, draws, options)
+    mechanism, lines = _checked(mechanism, campaign, motion, contact, model, touching, options)
+    table = np.array(list(draws.values())).T if draws else np.zeros((DRAWS, 0))
     return Identification(
         estimates=numbers,
         draws=table,
-        combinations=combinations(found | told, told_contact),
-        confounded=confounded(keys, table),
+        combinations=combinations(draws | {k: np.full(DRAWS, v) for k, v in later.items()}, used),
+        confounded=confounded(list(draws), table),
         lines=(*lines, *left_out),
-        mechanism=None if refused else mechanism,
+        mechanism=mechanism,
         limit=options.limit,
         notes=(
-            *_notes(motion, contact, told_contact, force, vague),
+            *_notes(motion, contact, used, force, vague),
             *_no_dead_zone(contact, dead_zone),
-            *_moved(fixed, options),
-            *_at_bounds(found),
-            *denied,
+            *(*_moved(fixed, options), *_at_bounds(draws), *denied),
         ),
         missing=missing,
         motion=motion,
@@ -127,26 +112,70 @@ def identify(
     )
 
 
-def _without_vague(found: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The draws without entries of the contact lists whose stiffness is hardly told, and its keys; where no
-    entry is told, without the contact."""
-    keys = [key for key in found if key.startswith(STIFFNESS)]
-    vague = [key for key in keys if found[key].std() > VAGUE * abs(found[key].mean())]
+def _touching(campaign: Campaign, model: Model) -> list[Run]:
+    """Return the runs in contact, divided into segments of similar length."""
+    period = campaign.timing.control_period
+    runs = contacts.after_gaps([run for run in campaign.runs if run.kind in TOUCHING], model, period)
+    return [segment for run in runs for segment in contacts.pieces(run, period)]
+
+
+def _frequency(contact: ContactFit | None, mass: float) -> float:
+    """Return the contact frequency [Hz]."""
+    return USUAL_FREQUENCY if contact is None else contacts.frequency(contact, mass)
+
+
+def _conditioned(
+    draws: dict[str, np.ndarray],
+    first: Sequence[str],
+    frequency: float,
+    prior: Mechanism | None,
+    options: Options,
+) -> tuple[dict[str, np.ndarray], dict[str, float], list[str]]:
+    """Condition the draws on the prior and on the fixed parameters that are not in `first`.
+
+    Returns:
+        The draws of the other parameters, these fixed parameters by key, and notes on contradictions.
+    """
+    if options.bayes and prior is not None:
+        draws = knowledge.with_prior(draws, prior, frequency, options.seed)
+    later = {key: value for key, value in options.fixed.items() if key not in first}
+    later = knowledge.spread_out(later, list(draws))
+    draws, denied = knowledge.with_told(draws, later)
+    return draws, later, denied
+
+
+def _without_vague(draws_by_key: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Drop the entries of the contact lists whose stiffness is hardly determined.
+
+    Returns:
+        The remaining draws, without any contact key if no entry is determined; and the vague stiffness keys.
+    """
+    keys = [key for key in draws_by_key if key.startswith(STIFFNESS)]
+    vague = [key for key in keys if draws_by_key[key].std() > VAGUE * abs(draws_by_key[key].mean())]
     entries = {key.split(".")[2] for key in vague}
     if entries == {key.split(".")[2] for key in keys}:
-        return {key: draws for key, draws in found.items() if vague == [] or key.startswith(SIMULATOR)}, vague
-    # A damping that all entries share is told by the others.
-    shared = sum(key.startswith("contact.damping.") for key in found) == 1
+        return {
+            key: draws for key, draws in draws_by_key.items() if vague == [] or key.startswith(SIMULATOR)
+        }, vague
+    # The remaining entries determine a damping that all entries share.
+    shared = sum(key.startswith("contact.damping.") for key in draws_by_key) == 1
     lists = (STIFFNESS,) if shared else (STIFFNESS, "contact.damping.")
-    gone = tuple(f"{name}{entry}" for name in lists for entry in entries)
-    left = {k: v for k, v in found.items() if not any(k == one or k.startswith(f"{one}.") for one in gone)}
+    dropped = tuple(f"{name}{entry}" for name in lists for entry in entries)
+    left = {
+        k: v
+        for k, v in draws_by_key.items()
+        if not any(k == key or k.startswith(f"{key}.") for key in dropped)
+    }
     return left, vague
 
 
 def _missing(
     prior: Mechanism | None, model: Model | None, contact: ContactFit | None, untold: bool
 ) -> tuple[str, ...]:
-    """What neither the logs nor the prior tell, and the run that would; `untold`: the force delay."""
+    """Return the parameters that neither the logs nor the prior determine, each with the run that would.
+
+    `untold` says that the force delay is one of them.
+    """
     missing = ["rig.simulator (a run of kind free would)"] if model is None else []
     if prior is None and untold:
         missing.append(f"{FORCE_DELAY} (--fix would: of two clocks nobody knows the constant)")
@@ -160,7 +189,10 @@ def _told_model(prior: Mechanism | None) -> Model | None:
 
 
 def _noise(runs: Mapping[str, Sequence[Run]]) -> tuple[Noise | None, Noise | None]:
-    """Of the force and position sensors at rest; the force sensor's in free motion where it never rested."""
+    """Return the noise of the force and position sensors at rest.
+
+    The noise of the force sensor comes from free motion if no run is at rest.
+    """
     force = position = None
     for run in (*runs["rest"], *runs["free"]):
         if run.valid.sum() < SHORTEST_REST:
@@ -178,14 +210,16 @@ def _whole(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def _contact(
     runs: list[Run],
-    model: Model,
+    model: Model | None,
     campaign: Campaign,
     force: Noise | None,
     dead_zone: float,
     options: Options,
     say: Say,
-) -> tuple[ContactFit, list[validation.Line]]:
-    """The fit to all touches, and how one to most of them explains the others."""
+) -> tuple[ContactFit | None, list[validation.Line]]:
+    """Fit all contacts, and check a fit to most of them on those left out; None without contacts."""
+    if model is None or not runs:
+        return None, []
     plane = options.fixed.get("rig.contact_plane")
     say(f"fitting the contact to {len(runs)} touches")
     fit = contacts.estimate(runs, model, campaign.timing, force, options.law, plane, options.seed, dead_zone)
@@ -193,15 +227,32 @@ def _contact(
         say(f"fitting {options.bootstrap} times to contacts drawn again")
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
     say("judging the fit by touches left out of it")
-    held = held_out(runs, options.hold_out)
-    if not held.any():
+    left_out = held_out(runs, options.hold_out)
+    if not left_out.any():
         return fit, []
-    others = contacts.without(fit, held, options.seed)
-    return fit, validation.of_touches_left_out(others, runs, campaign.equivalent_mass, held)
+    partial_fit = contacts.without(fit, left_out, options.seed)
+    return fit, validation.of_touches_left_out(partial_fit, runs, campaign.equivalent_mass, left_out)
+
+
+def _checked(
+    mechanism: dict[str, Any] | None,
+    campaign: Campaign,
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: Model | None,
+    touching: list[Run],
+    options: Options,
+) -> tuple[dict[str, Any] | None, list[validation.Line]]:
+    """Return the mechanism, or None if its file is invalid, and the checks of that file or of the fits."""
+    written, refused = _written(mechanism)
+    lines = _of_file(campaign, written, motion if options.order is None else None)
+    if lines is None:
+        lines = [*refused, *_of_fits(motion, contact, model, touching, campaign.equivalent_mass, written)]
+    return None if refused else mechanism, lines
 
 
 def _written(mechanism: dict[str, Any] | None) -> tuple[Mechanism | None, list[validation.Line]]:
-    """Return the mechanism as its file has it; or what is wrong with it, as the lines of a verdict."""
+    """Return the mechanism as its file would contain it, or that file's error as a line of the verdict."""
     if mechanism is None:
         return None, []
     try:
@@ -213,9 +264,10 @@ def _written(mechanism: dict[str, Any] | None) -> tuple[Mechanism | None, list[v
 def _of_file(
     campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
 ) -> list[validation.Line] | None:
-    """Check the mechanism as it is written, as `identify --check` would.
+    """Check the written mechanism, as `identify --check` does.
 
-    `motion`: fitted, of any order. Returns None where no file is written, or none can be checked."""
+    `motion` is fitted with any order. Returns None if no file is written or the file cannot be checked.
+    """
     if written is None or campaign.timing.two_clocks:
         return None
     if not any(run.kind in (*TOUCHING, "free") for run in campaign.runs):
@@ -232,40 +284,47 @@ def _of_fits(
     model: Model | None,
     touching: list[Run],
     mass: float,
+    written: Mechanism | None,
 ) -> list[validation.Line]:
-    """Check the fits themselves, where there is no file to check."""
-    frequency = USUAL_FREQUENCY if contact is None else contacts.frequency(contact, mass)
-    lines = []
+    """Check the fits themselves, if there is no file that can be checked."""
+    frequency, lines = _frequency(contact, mass), []
     if motion is not None:
         lines = [*validation.of_motion(motion, frequency), validation.sign_of_delay(motion, frequency)]
     if contact is not None and model is not None:
         lag = contacts.lag(contact, model, frequency)
-        every = np.ones(len(touching), bool)
+        all_touches = np.ones(len(touching), bool)
         lines += [
             validation.sign_of_force(contact),
-            *validation.of_contact(contact, touching, mass, frequency, lag, every),
+            *validation.of_contact(contact, touching, mass, frequency, lag, all_touches),
         ]
+    if written is not None:
+        lines += uncertainty(uncertain_effect(written), any(run.kind == "press" for run in touching))
     return lines
 
 
-def _at_bounds(found: Mapping[str, np.ndarray]) -> list[str]:
-    """Name the numbers whose values in the file are 0 since the logs say that they are below."""
+def _at_bounds(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
+    """Return a note for each parameter that is 0 in the file because the logs indicate a negative value."""
     notes = []
-    for key, draws in found.items():
+    for key, draws in draws_by_key.items():
         if off_bound(key, draws) > 0.0:
-            told = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {unit_of(key)}"
-            notes.append(f"{key}: {told}: the file has its least value, 0, and the difference as uncertainty")
+            interval = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {unit_of(key)}"
+            notes.append(
+                f"{key}: {interval}: the file has its least value, 0, and the difference as uncertainty"
+            )
     return notes
 
 
 def held_out(runs: Sequence[Run], share: float) -> np.ndarray:
-    """A flag for each run: of each speed `share` of the touches, one at least where there are three."""
+    """Return a flag for each run that is left out of a fit: a `share` of the contacts of each speed.
+
+    At least one contact of each speed is left out if there are three or more.
+    """
     flags = np.zeros(len(runs), bool)
     speeds = [round(1e4 * (run.speed or 0.0)) if run.kind == "contact" else -1 for run in runs]
     for speed in set(speeds) - {-1}:
-        members = [i for i, one in enumerate(speeds) if one == speed]
+        members = [i for i, speed_of_run in enumerate(speeds) if speed_of_run == speed]
         count = max(1, round(share * len(members))) if share > 0.0 and len(members) >= 3 else 0
-        # Every so many, so that a list's entries are all left to fit to.
+        # At regular intervals, so that contacts of every entry of the lists remain in the fit.
         for i in members[1 :: max(1, len(members) // max(count, 1))][:count]:
             flags[i] = True
     return flags
@@ -279,26 +338,32 @@ def _draws(
     share: float,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Draws of every number by its key, in the key's unit; `share`: of the delays, the position sensor's."""
-    found, lag = {}, np.zeros(DRAWS)
+    """Return draws of every parameter by its key, in the key's unit.
+
+    `share` [s] is the part of the delays that belongs to the position sensor.
+    """
+    result, lag = {}, np.zeros(DRAWS)
     if motion is not None and model is not None:
         rng = np.random.default_rng([seed, 1])
-        found, lag = parameters.simulator_draws(model, motion.covariance, frequency, DRAWS, rng)
+        result, lag = parameters.simulator_draws(model, motion.covariance, frequency, DRAWS, rng)
     if contact is not None:
-        # An error of the motion's lag is one of the force delay, the other way round.
-        found |= parameters.contact_draws(contact)
-        found[FORCE_DELAY] = found[FORCE_DELAY] - lag
+        # The force delay is relative to the motion, so an error of the motion's lag enters with a minus.
+        result |= parameters.contact_draws(contact)
+        result[FORCE_DELAY] = result[FORCE_DELAY] - lag
     if motion is not None:
-        found["rig.simulator.delay"] = found["rig.simulator.delay"] - share
+        result["rig.simulator.delay"] = result["rig.simulator.delay"] - share
     if contact is not None:
-        found[FORCE_DELAY] = found[FORCE_DELAY] + share
-    return found
+        result[FORCE_DELAY] = result[FORCE_DELAY] + share
+        if contact.drift is not None:
+            # No log shows the constant between two clocks, which adds to the force delay.
+            del result[FORCE_DELAY]
+    return result
 
 
 def _told_first(
     keys: Sequence[str], share: float, prior: Mechanism | None, options: Options
 ) -> dict[str, float]:
-    """What was told before anything was fitted, and the position sensor's delay if it is not the prior's."""
+    """Return the fixed parameters, and the position sensor's delay if it differs from the prior."""
     first = {key: options.fixed[key] for key in keys if key in options.fixed}
     if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
         first[POSITION_DELAY] = share
@@ -308,18 +373,18 @@ def _told_first(
 def _position_delay(
     motion: FreeMotion | None, contact: ContactFit | None, prior: Mechanism | None, options: Options
 ) -> float:
-    """Of the position sensor [s]: as told, else 0; more where the force delay would be negative."""
+    """Return the position sensor's delay [s]; it is raised if the force delay would be negative."""
     if POSITION_DELAY in options.fixed:
         return options.fixed[POSITION_DELAY]
-    told = 0.0 if prior is None else prior.rig.position_sensor.delay
+    specified = 0.0 if prior is None else prior.rig.position_sensor.delay
     if motion is None or contact is None:
-        return told
+        return specified
     delay = contact.posterior.draws[:, 0]
-    return told if delay.mean() + told >= 0.0 else float(CLEAR * delay.std() - delay.mean())
+    return specified if delay.mean() + specified >= 0.0 else float(CLEAR * delay.std() - delay.mean())
 
 
 def _moved(fixed: Mapping[str, float], options: Options) -> list[str]:
-    """That some of the delays were taken as the position sensor's, though nobody said so."""
+    """Return a note if an unspecified part of the motion's delay was assigned to the position sensor."""
     if POSITION_DELAY not in fixed or POSITION_DELAY in options.fixed:
         return []
     share = f"{1e3 * fixed[POSITION_DELAY]:.3g} ms of the motion's delay were taken as its"
@@ -329,13 +394,14 @@ def _moved(fixed: Mapping[str, float], options: Options) -> list[str]:
 def _notes(
     motion: FreeMotion | None,
     contact: ContactFit | None,
-    told: ContactFit | None,
+    used: ContactFit | None,
     force: Noise | None,
     vague: Sequence[str],
 ) -> list[str]:
+    """Return notes on missing runs, vague parameters, and the noise and dead zone of the force."""
     notes = []
     if vague:
-        taken = "the contact is the prior's" if told is None else "taken as the entry before it"
+        taken = "the contact is the prior's" if used is None else "taken as the entry before it"
         notes.append(
             f"{', '.join(vague)}: known to {100 * VAGUE:.0f} % at best: {taken}; "
             "more touches or deeper ones would tell it"
@@ -366,8 +432,8 @@ def _notes(
     return notes
 
 
-def _no_dead_zone(contact: ContactFit | None, told: float) -> list[str]:
-    """Say that the readings have no dead zone though one was told."""
-    if contact is None or contact.dead_zone or not told:
+def _no_dead_zone(contact: ContactFit | None, specified: float) -> list[str]:
+    """Return a note if a dead zone was specified but the readings show none."""
+    if contact is None or contact.dead_zone or not specified:
         return []
-    return [f"{DEAD_ZONE}: {told:g} N were told, but readings at rest show none: taken as none"]
+    return [f"{DEAD_ZONE}: {specified:g} N were told, but readings at rest show none: taken as none"]

@@ -1,4 +1,4 @@
-"""Estimates with their intervals, from draws of what logs tell and from what sensors say at rest."""
+"""Estimates with 95 % intervals, from posterior draws and from the sensors' noise at rest."""
 
 from __future__ import annotations
 
@@ -13,58 +13,58 @@ from tuning.identification.contact import ContactFit
 from tuning.identification.result import Estimate
 
 DAMPING, DELAY = "contact.damping", "rig.force_sensor.delay"
-NEAR, CROWD = 0.1, 0.005  # standard deviations from 0, and share of the draws there, that make a crowd
+NEAR, CROWD = 0.1, 0.005  # draws pile up at 0 if more than this share lies within this many std of 0
 
 
 def estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
-    """Estimates of what has draws, then of what the sensors say at rest and of what was told."""
+    """Return the estimates of the parameters with draws, then of the noise and the fixed parameters."""
     at_bound = dampings_at_zero(found)
-    every = [_of_draws(key, values, at_bound) for key, values in found.items()]
-    others = []
+    from_draws = [_of_draws(key, values, at_bound) for key, values in found.items()]
+    direct = []
     if force is not None and not force.silent:
-        others.append(_plain("rig.force_sensor.noise_std", force.std, force.std_std))
-        others.append(_plain("rig.force_sensor.bias", force.mean, force.mean_std))
+        direct.append(_plain("rig.force_sensor.noise_std", force.std, force.std_std))
+        direct.append(_plain("rig.force_sensor.bias", force.mean, force.mean_std))
     elif contact is not None:
         std = contact.readings.std
-        others.append(_plain("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom)))
+        direct.append(_plain("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom)))
         if force is None:
             bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]
-            others.append(_plain("rig.force_sensor.bias", float(bias.mean()), float(bias.std())))
+            direct.append(_plain("rig.force_sensor.bias", float(bias.mean()), float(bias.std())))
     if force is not None and force.quantum:
-        others.append(_plain("rig.force_sensor.quantum", force.quantum, 0.0))
+        direct.append(_plain("rig.force_sensor.quantum", force.quantum, 0.0))
     if position is not None:
-        others.append(_plain("rig.position_sensor.noise_std", position.std, position.std_std))
+        direct.append(_plain("rig.position_sensor.noise_std", position.std, position.std_std))
         if position.quantum:
-            others.append(_plain("rig.position_sensor.quantum", position.quantum, 0.0))
+            direct.append(_plain("rig.position_sensor.quantum", position.quantum, 0.0))
     elif motion is not None:
-        count = sum(len(one.frequency) for one in motion.spectra)
+        count = sum(len(spectrum.frequency) for spectrum in motion.spectra)
         std = motion.noise_std
-        others.append(_plain("rig.position_sensor.noise_std", std, std / np.sqrt(2.0 * max(count, 1))))
-    others += [
+        direct.append(_plain("rig.position_sensor.noise_std", std, std / np.sqrt(2.0 * max(count, 1))))
+    direct += [
         Estimate(key, value, 0.0, value, value, unit_of(key), told=True) for key, value in fixed.items()
     ]
-    return (*every, *others)
+    return (*from_draws, *direct)
 
 
 def at_zero(values: np.ndarray) -> bool:
-    """Return whether draws that cannot be negative crowd at 0, so that 0 is as likely as any."""
+    """Return whether draws that cannot be negative accumulate at 0, so that 0 is as probable as any value."""
     return bool(np.mean(values <= NEAR * values.std()) > CROWD)
 
 
 def dampings_at_zero(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the draws of the damping coefficients [N s/m] that crowd at 0, by key."""
+    """Return the draws of the damping coefficients [N s/m] that accumulate at 0, by key."""
     return {key: values for key, values in found.items() if key.startswith(DAMPING) and at_zero(values)}
 
 
 def without_damping(values: np.ndarray, at_bound: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return draws moved to what they would be with these damping coefficients at 0, by linear regression."""
+    """Return draws moved to zero damping coefficients `at_bound`, by linear regression."""
     damping = np.column_stack(list(at_bound.values()))
     slope = np.linalg.lstsq(damping - damping.mean(axis=0), values - values.mean(), rcond=None)[0]
     return values - damping @ slope
 
 
 def shortest(values: np.ndarray) -> tuple[float, float]:
-    """Return the shortest interval with 95 % of the draws; of those that crowd at 0 it has 0."""
+    """Return the shortest interval with 95 % of the draws; it includes 0 if they accumulate there."""
     ordered = np.sort(values)
     inside = int(np.ceil(0.95 * len(ordered)))
     first = int(np.argmin(ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]))
@@ -72,10 +72,10 @@ def shortest(values: np.ndarray) -> tuple[float, float]:
 
 
 def _of_draws(key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}) -> Estimate:
-    """Return the estimate of a number from its draws.
+    """Return the estimate of a parameter from its draws.
 
-    `at_bound`: the dampings whose draws crowd at 0. Their interval is one-sided, and that of the force delay,
-    which the logs hardly tell from damping, includes the delays that go with no damping.
+    `at_bound` holds the dampings whose draws accumulate at 0. Their interval is one-sided. The logs hardly
+    separate them from the force delay, so its interval includes the delays that belong to zero damping.
     """
     low, high = np.quantile(values, (0.025, 0.975))
     if key in at_bound:
@@ -95,7 +95,7 @@ def _plain(key: str, value: float, std: float) -> Estimate:
 
 
 def unit_of(key: str) -> str:
-    """SI unit of a key, the number of a list's entry behind it or not."""
+    """Return the SI unit of a key, with or without the index of a list's entry."""
     parts = key.split(".")
     while parts[-1].isdigit():
         parts.pop()
@@ -103,7 +103,10 @@ def unit_of(key: str) -> str:
 
 
 def combinations(found: Mapping[str, np.ndarray], contact: ContactFit | None) -> tuple[Estimate, ...]:
-    """What the logs tell better than its parts: delays together, damping less stiffness times delay."""
+    """Return the combinations that the logs determine better than their parts.
+
+    These are sums of delays, and the damping minus stiffness times delay ("apparent damping").
+    """
     combined, at_bound = [], dampings_at_zero(found)
     motion, force = (found.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
     lag = found.get("rig.force_sensor.time_constant")

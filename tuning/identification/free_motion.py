@@ -1,7 +1,7 @@
-"""The motion simulator from runs without contact: order, numbers, delay, and what they leave unexplained.
+"""Motion simulator from runs without contact: order, parameters, delay and unexplained residuals.
 
-The delay found is the sum of the motion's and the position sensor's: no law with fixed gains can tell how the
-two share it, nor can a log.
+The delay is the sum of the delays of the motion and of the position sensor. Neither a log nor a compensator
+with fixed gains can separate the two.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from tuning.identification.order import Candidate, choose, criterion, left
 from tuning.identification.rational import Fit, Lines, Model, fit
 from tuning.identification.records import Run, Timing
 
-SETTLING = 10.0  # time constants after which a transient is over
-SLOWEST = 0.05  # s, time constant assumed before any is known
-UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which intervals are widened by it
-RARE = 1e-6  # probability under which the model itself is taken to err: it costs most of what is known
-BANDS = 10  # of frequency, in each of which it errs by as much everywhere
-LARGEST = 10.0  # relative error that is looked for
-ROUNDS = 3  # of fitting and of looking how much it errs
+SETTLING = 10.0  # time constants that a transient lasts
+SLOWEST = 0.05  # s, assumed time constant before the fit
+UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which the intervals are widened
+RARE = 1e-6  # p-value below which a model error is added; low, because it widens the intervals a lot
+BANDS = 10  # frequency bands, in each of which the model error is constant
+LARGEST = 10.0  # largest relative model error
+ROUNDS = 3  # iterations of the fit and the model error
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """What runs without contact say."""
+    """Motion simulator fitted to runs without contact."""
 
-    lines: Lines  # with the noise that the runs show
-    spectra: tuple[Spectrum, ...]  # one a run
+    lines: Lines  # with the measured noise
+    spectra: tuple[Spectrum, ...]  # one per run
     chosen: Candidate
     candidates: tuple[Candidate, ...]
-    gain: tuple[float, float]  # of the measured position over the desired one, and its standard deviation
-    other_hold: float  # by how much the criterion falls with the other hold; negative: it rises
-    beyond: float = 0.0  # relative error of the model that counts at each line beside the noise
+    gain: tuple[float, float]  # measured over desired position, and its standard deviation
+    other_hold: float  # decrease of the criterion with the other hold; negative: it rises
+    beyond: float = 0.0  # relative model error at each line in addition to the noise
 
     @property
     def model(self) -> Model:
@@ -49,45 +49,45 @@ class FreeMotion:
 
     @property
     def left(self) -> float:
-        """Power of what the model leaves over that of the noise."""
+        """Return the residual power over the noise power."""
         error, noise = self.misfit()
         return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.freedom, 1)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of the model's parameters; wider where the model leaves more than noise."""
+        """Return the covariance of the model's parameters, wider if the residual exceeds the noise."""
         unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
         return self.fit.covariance * (unexplained if unexplained > UNEXPLAINED else 1.0)
 
     @property
     def noise_std(self) -> float:
-        """Of the position readings [m]."""
-        return float(np.sqrt(np.mean([one.noise_std**2 for one in self.spectra])))
+        """Return the standard deviation of the position readings' noise [m]."""
+        return float(np.sqrt(np.mean([spectrum.noise_std**2 for spectrum in self.spectra])))
 
     def lag(self, frequency: float) -> tuple[float, float]:
-        """Delay of the phase [s] at a frequency [Hz], all of it, and its standard deviation."""
+        """Return the total phase delay [s] at a frequency [Hz], and its standard deviation."""
         s = np.array([2j * np.pi * frequency])
         slopes = np.imag(self.model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
         phase = np.angle(self.model.response(s)[0])
         return float(-phase / (2.0 * np.pi * frequency)), float(np.sqrt(slopes @ self.covariance @ slopes))
 
     def misfit(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative error of the model at each line, complex, and the noise's standard deviation in it."""
+        """Return the model's complex relative error at each line, and the noise's standard deviation."""
         predicted = self.model.predict(self.lines)
         return (self.lines.output - predicted) / predicted, self.lines.std / np.abs(predicted)
 
 
 def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> FreeMotion | None:
-    """From all free runs together; None where none is long enough to say anything."""
+    """Fit the motion simulator to all free runs together; return None if none is long enough."""
     spectra = spectra_of(runs, timing)
     if not spectra:
         return None
     lines = join(spectra, timing)
     chosen, candidates = choose(lines, order)
-    # What a wrong hold leaves, one order more takes up.
+    # A model of one order more can compensate a wrong hold.
     highest = chosen.fit.model.structure.order + 1
-    other = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
-    other_hold = chosen.criterion - criterion(choose(other, order, highest)[0].fit, left(candidates))
+    other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
+    other_hold = chosen.criterion - criterion(choose(other_lines, order, highest)[0].fit, left(candidates))
     beyond, weighed = 0.0, lines
     for _ in range(ROUNDS):
         beyond = erring(chosen.fit.model, lines)
@@ -101,11 +101,13 @@ def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> F
 
 
 def erring(model: Model, lines: Lines) -> float:
-    """Standard deviation of the model's relative error that counts at each line, 0 where noise explains all.
+    """Return the relative model error at each line (rms), or 0 if noise explains the residual.
 
-    A model errs smoothly: all lines of a band share one error. So it is found from the means over bands, and
-    counts as often as a band has lines; else lines of little noise would decide what it is elsewhere. The
-    error is relative to the model's output: where nothing comes out, what was measured is noise alone."""
+    A model error is smooth: all lines of a band share one error. It is therefore estimated from the means
+    over bands and multiplied by the root of the number of lines. Otherwise lines with little noise would
+    determine the error elsewhere. It is relative to the model's output, since a measured output without
+    response is noise.
+    """
     expected = model.predict(lines)
     size = np.abs(expected)
     errors, variances, counts = [], [], []
@@ -129,7 +131,7 @@ def erring(model: Model, lines: Lines) -> float:
 
 
 def of_known(runs: Sequence[Run], timing: Timing, model: Model) -> FreeMotion | None:
-    """The same with a model that is known: what it leaves of the lines, nothing fitted."""
+    """Compare the free runs with a known model, without fitting; return None if no run is long enough."""
     spectra = spectra_of(runs, timing)
     if not spectra:
         return None
@@ -139,34 +141,34 @@ def of_known(runs: Sequence[Run], timing: Timing, model: Model) -> FreeMotion | 
         return Fit(model, np.zeros((size, size)), (model.predict(lines) - lines.output) / lines.std)
 
     lines = join(spectra, timing)
-    other = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
+    other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).freedom, 1))
     candidate = Candidate(fit, criterion(fit, inflation), "")
-    gain = candidate.criterion - criterion(held(other), inflation)
+    gain = candidate.criterion - criterion(held(other_lines), inflation)
     return FreeMotion(lines, tuple(spectra), candidate, (candidate,), gain_of(fit, lines), gain)
 
 
 def spectra_of(runs: Sequence[Run], timing: Timing) -> list[Spectrum]:
-    """Of the runs that are long enough."""
+    """Return the spectra of the runs that are long enough."""
     rest = round(SETTLING * SLOWEST / timing.control_period)
     spectra = []
     for run in runs:
-        found = spectrum(
+        result = spectrum(
             run.position_desired, run.position_measured, run.valid & np.isfinite(run.position_measured),
             timing.control_period, rest,
         )  # fmt: skip
-        if found is not None and len(found.frequency) >= 4:
-            spectra.append(found)
+        if result is not None and len(result.frequency) >= 4:
+            spectra.append(result)
     return spectra
 
 
 def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:
-    """The lines of several runs, one after the other."""
+    """Return the lines of several runs, concatenated."""
     return Lines(
-        np.concatenate([one.frequency for one in spectra]),
-        np.concatenate([one.command for one in spectra]),
-        np.concatenate([one.output for one in spectra]),
-        np.concatenate([one.std for one in spectra]),
+        np.concatenate([spectrum.frequency for spectrum in spectra]),
+        np.concatenate([spectrum.command for spectrum in spectra]),
+        np.concatenate([spectrum.output for spectrum in spectra]),
+        np.concatenate([spectrum.std for spectrum in spectra]),
         timing.control_period,
         timing.command_hold,
         timing.command_latency,
@@ -175,7 +177,7 @@ def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:
 
 
 def gain_of(fit: Fit, lines: Lines) -> tuple[float, float]:
-    """The static gain, were it free, and its standard deviation: one Newton step from 1."""
+    """Return the static gain if it were free, and its standard deviation, by one Newton step from 1."""
     s, command = lines.copies
     scale = np.sqrt(2.0) / lines.std
     predicted = fit.model.predict(lines)

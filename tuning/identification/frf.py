@@ -1,11 +1,11 @@
-"""Spectra of free motion: command and measured position at the lines, with the noise the data show.
+"""Spectra of free motion: command and measured position at the excited lines, with the noise from the data.
 
-A command that repeats itself (a multisine) is averaged over its periods: what differs from period to period
-is noise, what appears at lines that were not excited is nonlinearity: odd ones for friction and dead bands,
-even ones for asymmetry (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2012).
-Of any other command the local polynomial method takes the transient away and leaves the noise: around each
-line the response and the transient are polynomials of degree 2 over 13 lines (Schoukens and others 2009).
-Rows that were lost do not count; a period is averaged over the rows it has.
+A periodic command (a multisine) is averaged over its periods. Differences between periods are noise. Power at
+lines without excitation is nonlinear distortion: odd lines show friction and dead bands, even lines show
+asymmetry (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2012). For any other
+command the local polynomial method separates transient and noise: around each line, response and transient
+are polynomials of degree 2 over 13 lines (Schoukens and others 2009). Lost rows are not used; a period is
+averaged over its available rows.
 """
 
 from __future__ import annotations
@@ -16,54 +16,54 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 SMOOTHED = 15  # lines over which the variance of the noise is averaged
-SIDE, DEGREE = 6, 2  # of the local polynomial method: lines on each side, degree of the polynomials
-UNSURE = 20.0  # variance of the transient's estimate over that of the noise, above which a line is left out
-DRIVEN = 3e-3  # of the largest power: a line at which a command that does not repeat itself drives
-EXCITED = 1e-3  # of the largest amplitude: an excited line
+SIDE, DEGREE = 6, 2  # local polynomial method: lines on either side, degree of the polynomials
+UNSURE = 20.0  # ratio of the transient's variance to the noise's variance, above which a line is dropped
+DRIVEN = 3e-3  # share of the largest power, above which a non-periodic command excites a line
+EXCITED = 1e-3  # share of the largest amplitude, above which a periodic command excites a line
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What one run says at its lines."""
+    """Spectra of one run at its lines."""
 
     frequency: np.ndarray  # Hz
     command: np.ndarray  # complex amplitude [m]
     output: np.ndarray  # complex amplitude [m], without the transient
     std: np.ndarray  # m, of the output's complex noise
-    response: np.ndarray  # complex, output over command: averaged over neighbours where not by periods
-    coherence: np.ndarray  # 0..1, share of the output that is the command's
-    noise_std: float  # m, of the position readings in time
-    odd: float | None  # output's rms at odd lines without excitation over that at excited ones
-    even: float | None  # the same of even lines
-    excess: tuple[float, float]  # power at odd and even lines without excitation over that of noise there
-    periods: int  # averaged; 0 for a command that does not repeat itself
+    response: np.ndarray  # complex, output over command; smoothed over neighbours without periods
+    coherence: np.ndarray  # 0..1, share of the output's power that the command causes
+    noise_std: float  # m, noise of a single position reading
+    odd: float | None  # rms of the output at odd lines without excitation over that at excited lines
+    even: float | None  # the same for even lines
+    excess: tuple[float, float]  # power over noise power at odd and even lines without excitation
+    periods: int  # number of averaged periods; 0 for a non-periodic command
 
 
 def repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
-    """Rows in a period and the rows where the command repeats the period before, or None.
+    """Return the rows of one period, and the rows at which the command repeats the period before, or None.
 
-    A command whose fade-in differs from the rest repeats itself after it.
+    A command that differs during its fade-in repeats itself after it.
     """
     rows = len(command)
     centred = np.where(valid, command - command[valid].mean(), 0.0)
     size = 1 << int(np.ceil(np.log2(2 * rows)))
     spectrum = np.fft.rfft(centred, size)
     likeness = np.fft.irfft(np.abs(spectrum) ** 2, size)[: rows // 2 + 1]
-    # Unbiased in the number of products, so that later repetitions are not smaller than the first.
+    # Divide by the number of products, so that later repetitions are not smaller than the first one.
     likeness = likeness / (rows - np.arange(len(likeness)))
     peaks = 1 + np.flatnonzero((likeness[1:-1] >= likeness[:-2]) & (likeness[1:-1] > likeness[2:]))
     scale = np.std(command[valid])
     for lag in peaks[(peaks >= shortest) & (likeness[peaks] > 0.5 * likeness[0])]:
-        both = valid[lag:] & valid[:-lag]
-        same = (np.abs(command[lag:] - command[:-lag]) <= 1e-4 * scale) | ~both
+        both_valid = valid[lag:] & valid[:-lag]
+        same = (np.abs(command[lag:] - command[:-lag]) <= 1e-4 * scale) | ~both_valid
         first, length = _longest(same)
-        if length >= lag and np.mean(both[first : first + length]) > 0.5:
+        if length >= lag and np.mean(both_valid[first : first + length]) > 0.5:
             return int(lag), slice(lag + first, lag + first + length)
     return None
 
 
 def _longest(flags: np.ndarray) -> tuple[int, int]:
-    """Start and length of the longest stretch of true values."""
+    """Return the start and the length of the longest sequence of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     if not len(edges):
         return 0, 0
@@ -75,12 +75,13 @@ def _longest(flags: np.ndarray) -> tuple[int, int]:
 def spectrum(
     command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float, rest: int
 ) -> Spectrum | None:
-    """The spectra of one run: by periods where the command has any, else by local polynomials.
+    """Return the spectra of one run, by periods if the command repeats itself, else by local polynomials.
 
-    `rest`: rows that a transient lasts after a gap. None where no stretch is long enough."""
-    found = repetition(command, valid)
-    if found is not None:
-        size, rows = found
+    `rest` is the number of rows that a transient lasts after a gap. Returns None if the run is too short.
+    """
+    result = repetition(command, valid)
+    if result is not None:
+        size, rows = result
         count = (rows.stop - rows.start) // size
         if count >= 2:
             rows = slice(rows.stop - count * size, rows.stop)
@@ -96,25 +97,27 @@ def spectrum(
 
 
 def _after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
-    """Rows within `rest` of the last lost one."""
+    """Return flags of the rows within `rest` rows after a lost one."""
     last = np.maximum.accumulate(np.where(~valid, np.arange(len(valid)), -rest - 1))
     return np.arange(len(valid)) - last <= rest
 
 
 def periodic(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float) -> Spectrum:
-    """From arrays of (periods, rows) [m]; every row of the period must be there in two of them."""
+    """Return the spectra from arrays of shape (periods, rows) [m].
+
+    Every row of the period must be available in at least two periods.
+    """
     count, size = command.shape
-    there = valid.sum(axis=0)
-    counted = np.maximum(there, 1)
+    valid_count = valid.sum(axis=0)
+    counted = np.maximum(valid_count, 1)
     mean = np.where(valid, output, 0.0).sum(axis=0) / counted
     input_mean = np.where(valid, command, 0.0).sum(axis=0) / counted
     rest = np.where(valid, output - mean, 0.0)
-    # Periods drift apart as a whole where the sensor does; that is no noise of the lines.
-    freedom = float(valid.sum() - np.sum(there > 0))
+    freedom = float(valid.sum() - np.sum(valid_count > 0))
     noise = float(np.sqrt(np.sum(rest**2) / max(freedom, 1.0)))
     U, Y = np.fft.rfft(input_mean) / size, np.fft.rfft(mean) / size
     spread = np.sum(np.abs(np.fft.rfft(rest, axis=1) / size) ** 2, axis=0)
-    # Of a row that n periods have, the mean's variance is 1/n of one reading's.
+    # The variance of a mean over n periods is 1/n of one reading's.
     variance = spread / max(freedom / size, 1e-9) * np.mean(1.0 / counted)
     variance = _smooth(variance)
     number = np.arange(len(U))
@@ -124,6 +127,7 @@ def periodic(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period:
 
 
 def _with_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
+    """Return the spectrum with the distortion at lines without excitation."""
     number = np.arange(len(U))
     last = number[excited].max()
     rms = np.sqrt(np.mean(np.abs(Y[excited]) ** 2))
@@ -150,7 +154,7 @@ def _with_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectr
 
 
 def _smooth(variance: np.ndarray) -> np.ndarray:
-    """Running mean over `SMOOTHED` lines, without the line at 0."""
+    """Return the running mean over `SMOOTHED` lines, without the line at 0 Hz."""
     window = min(SMOOTHED, len(variance) - 1)
     half = window // 2
     padded = np.concatenate([variance[1 : half + 1][::-1], variance[1:], variance[-half:][::-1]])
@@ -159,14 +163,14 @@ def _smooth(variance: np.ndarray) -> np.ndarray:
 
 
 def aperiodic(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum:
-    """By the local polynomial method: the output less its transient, and the noise of each line."""
+    """Return the spectra by the local polynomial method: output without transient, and its noise."""
     size = len(command)
     level = command[0]
     U, Y = np.fft.rfft(command - level) / size, np.fft.rfft(output - level) / size
     power = _smooth(np.abs(U) ** 2)
     middle = np.arange(SIDE, len(U) - SIDE)
     middle = middle[power[middle] > DRIVEN * power[1:].max()]
-    # Of periods too few to average, every other line is silent.
+    # A periodic command with too few periods to average leaves every other line without power.
     middle = middle[np.abs(U[middle]) ** 2 > DRIVEN * power[middle]]
     width = 2 * SIDE + 1
     r = np.arange(-SIDE, SIDE + 1) / SIDE
@@ -182,7 +186,7 @@ def aperiodic(command: np.ndarray, output: np.ndarray, period: float) -> Spectru
     left = right - np.einsum("lij,lj->li", q, projected)
     variance = np.sum(np.abs(left) ** 2, axis=1) / (width - 2 * (DEGREE + 1))
     output_line = Y[middle] - solved[:, DEGREE + 1]
-    # Where the command's spectrum is smooth itself, transient and response cannot be told apart.
+    # If the command's spectrum is smooth as well, transient and response cannot be separated.
     row = np.zeros(basis.shape[2])
     row[DEGREE + 1] = 1.0
     unsure = np.sum(

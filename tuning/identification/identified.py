@@ -1,4 +1,4 @@
-"""The mechanism that an identification found, as a mechanism file has it: over what the prior says."""
+"""Mechanism of an identification: the identified values replace those of the prior."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def mechanism_of(
     found: Mapping[str, np.ndarray],
     options: Options,
 ) -> dict[str, Any]:
-    """As a mechanism file has it: what was found over what the prior says."""
+    """Return the content of a mechanism file in which identified values replace those of the prior."""
     timing = campaign.timing
     document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": UNNAMED}
     document |= {} if prior is None else to_builtins(prior)
     speeds = [run.speed for run in campaign.runs if run.speed]
-    values = {one.key: one.value for one in estimates}
+    values = {estimate.key: estimate.value for estimate in estimates}
     document["source"] = _source(campaign)
     document["bodies"] = {"equivalent_mass": campaign.equivalent_mass}
     document.setdefault("approach", {"velocity": float(np.median(speeds)) if speeds else 0.005})
@@ -53,7 +53,7 @@ def mechanism_of(
         "command_hold": timing.command_hold,
     }
     rig |= {} if campaign.integrator is None else {"integrator": campaign.integrator}
-    simulator = {key[len(SIMULATOR) :]: one for key, one in values.items() if key.startswith(SIMULATOR)}
+    simulator = {key[len(SIMULATOR) :]: value for key, value in values.items() if key.startswith(SIMULATOR)}
     if simulator and model is not None:
         before = rig.get("simulator", {})
         simulator = {
@@ -64,13 +64,13 @@ def mechanism_of(
         }
         rig["simulator"] = {**simulator, "delay": max(simulator["delay"], 0.0)}
     for section in ("force_sensor", "position_sensor"):
-        told = {**rig.get(section, {})}
+        sensor = {**rig.get(section, {})}
         if section == "force_sensor" and contact is not None:
-            # What touches do not show is not there: a lag is in the delay that was found.
-            told = {key: value for key, value in told.items() if key not in ("time_constant", "dead_zone")}
+            # The estimated delay includes a lag that the contacts do not resolve.
+            sensor = {k: v for k, v in sensor.items() if k not in ("time_constant", "dead_zone")}
         prefix = f"rig.{section}."
-        told |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
-        rig[section] = {**told, "delay": max(told.get("delay", 0.0), 0.0)}
+        sensor |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
+        rig[section] = {**sensor, "delay": max(sensor.get("delay", 0.0), 0.0)}
     if "rig.contact_plane" in values:
         rig["contact_plane"] = values["rig.contact_plane"]
     document["rig"] = rig
@@ -81,30 +81,32 @@ def mechanism_of(
 
 
 def off_bound(key: str, draws: np.ndarray) -> float:
-    """Return by how much the file's value exceeds the draws' mean: a delay or a damping is at least 0."""
+    """Return the file's value minus the mean of the draws, if the lower bound 0 raises it; else 0."""
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 
 
-def _uncertainty(document, found: Mapping[str, np.ndarray], options: Options) -> dict[str, Any]:
-    """The prior's for what was not found, and what was found, with its correlation."""
-    # A damping that is 0 in every draw is no number to draw.
-    keys = [key for key, draws in found.items() if np.ptp(draws) > 0.0]
+def _uncertainty(document, draws_by_key: Mapping[str, np.ndarray], options: Options) -> dict[str, Any]:
+    """Return the identified parameters' uncertainty and correlation, and the prior's for all others."""
+    # A damping that is 0 in every draw has no uncertainty.
+    keys = [key for key, draws in draws_by_key.items() if np.ptp(draws) > 0.0]
     if not keys:
         return {}
     floors = np.array([
         options.clock if key.endswith(".delay")
-        else options.calibration * abs(float(found[key].mean())) if key.startswith("contact.stiffness")
+        else options.calibration * abs(float(draws_by_key[key].mean())) if key.startswith("contact.stiffness")
         else 0.0
         for key in keys
     ])  # fmt: skip
-    off = np.array([off_bound(key, found[key]) for key in keys])
-    tables = uncertainty_tables(keys, np.array([found[key] for key in keys]).T, floors, off)
-    # Of a simulator or a contact that was found nothing of the prior's is left.
+    off = np.array([off_bound(key, draws_by_key[key]) for key in keys])
+    tables = uncertainty_tables(keys, np.array([draws_by_key[key] for key in keys]).T, floors, off)
+    # An identified simulator or contact replaces all of the prior's entries of its section.
     sections = {f"{name.rsplit('.', 1)[0]}." for name in tables["uncertainty"]} & {SIMULATOR, "contact."}
-    gone = (*sections, *tables["uncertainty"])
-    kept = {key: one for key, one in document.get("uncertainty", {}).items() if not key.startswith(gone)}
-    return {**tables, "uncertainty": {**kept, **tables["uncertainty"]}}
+    replaced = (*sections, *tables["uncertainty"])
+    prior = {
+        key: value for key, value in document.get("uncertainty", {}).items() if not key.startswith(replaced)
+    }
+    return {**tables, "uncertainty": {**prior, **tables["uncertainty"]}}
 
 
 def _source(campaign: Campaign) -> str:

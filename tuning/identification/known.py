@@ -1,4 +1,4 @@
-"""The numbers of a mechanism file as the models that logs are set against; nothing is estimated here."""
+"""Conversion of a mechanism file to the models that logs are compared with; nothing is estimated here."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
 from tuning.identification.contact_laws import Law
 from tuning.identification.rational import Model, Structure
 
-REAL = 1e-9  # of a pole's magnitude: an imaginary part below it is rounding
+REAL = 1e-9  # imaginary part over magnitude of a pole, below which it is rounding
 
 
 def motion_model(mechanism: Mechanism) -> Model:
-    """From the command to the measured position: the delay is the motion's and the position sensor's."""
+    """Return the model from the command to the measured position, with the position sensor's delay."""
     simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
     numerator, denominator = _fraction(simulator)
     poles = np.roots(denominator)
@@ -27,12 +27,12 @@ def motion_model(mechanism: Mechanism) -> Model:
     sections = np.column_stack([np.abs(pairs), -pairs.real / np.abs(pairs)]).ravel()
     above = (np.asarray(numerator) / numerator[-1])[-2::-1]
     structure = Structure(simulator.model, len(times), len(pairs), len(above))
-    whole = delay + mechanism.rig.position_sensor.delay
-    return Model(structure, np.concatenate([np.log(times), np.log(sections), above, [whole]]))
+    total_delay = delay + mechanism.rig.position_sensor.delay
+    return Model(structure, np.concatenate([np.log(times), np.log(sections), above, [total_delay]]))
 
 
 def _fraction(simulator: Simulator) -> tuple[list[float], list[float]]:
-    """Numerator and denominator of G(s) in descending powers of s."""
+    """Return numerator and denominator of G(s) in descending powers of s."""
     if simulator.model == "first_order" and simulator.time_constant:
         return [1.0], [simulator.time_constant, 1.0]
     if simulator.model == "second_order" and simulator.natural_frequency and simulator.damping_ratio:
@@ -46,12 +46,14 @@ def _fraction(simulator: Simulator) -> tuple[list[float], list[float]]:
 
 
 def contact_law(contact: Contact) -> Law:
-    """Return the law with its shape; every entry of the lists has all coefficients of its own.
+    """Return the law with its shape; each entry of the contact lists has separate coefficients.
 
-    Raise `InputError` for a law whose force is no sum of known functions of depth and rate."""
+    Raises:
+        InputError: If the force of the law is not a sum of known functions of depth and rate.
+    """
     chosen = laws.contact_law(contact.law)
     fitted = [name for name, law in laws.LAWS.items() if type(law).regression is not ContactLaw.regression]
-    # A registered law is asked all the same: it then names the method that it lacks.
+    # A user-registered law is used in any case: its error names the missing method.
     if contact.law not in fitted and type(chosen).__module__.startswith("jaxhil."):
         raise InputError(f"contact.law: found {shown(contact.law)}, expected {', '.join(fitted)}")
     law = chosen.regression(contact)
@@ -63,7 +65,7 @@ def contact_law(contact: Contact) -> Law:
 
 
 def coefficients(contact: Contact, entry: int) -> list[float]:
-    """Return the coefficients of `contact_law` for an entry of the lists, the last of which repeats."""
+    """Return the coefficients of `contact_law` for an entry of the contact lists; the last entry repeats."""
     stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
     damping = contact.damping[min(entry, len(contact.damping) - 1)]
     return laws.contact_law(contact.law).coefficients(contact, stiffness, damping)

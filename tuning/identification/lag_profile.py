@@ -1,7 +1,7 @@
-"""Posterior of a contact behind a lagging sensor, over delays that are known roughly.
+"""Posterior of a contact behind a sensor with a lag, over delays that are approximately known.
 
-A lag blurs the jump at the onset of damped contact, so that no row makes a step in the likelihood as it does
-in `contact_profile`. At each delay the surface and the coefficients then are normal, by linear least squares.
+A lag blurs the jump at the onset of damped contact, so no row causes a step in the likelihood as in
+`contact_profile`. At each delay the surface and the coefficients are then normal, by linear least squares.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from tuning.identification.contact_profile import DRAWS, Posterior
 from tuning.identification.normal_draws import factor
 
 WIDEST = 0.01  # m, largest standard deviation of the surface
-ATTEMPTS = 50  # to draw dampings that are not negative
+ATTEMPTS = 50  # at drawing damping coefficients >= 0
 
 
 def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
-    """Return the posterior over evenly spaced delays alone, about a surface."""
+    """Return the posterior over evenly spaced delays [s], near a surface [m]."""
     step, free = delays[1] - delays[0], problem.plane is None
     surfaces, fits, deviations, changes, heights = [], [], [], [], []
     for delay in delays:
@@ -37,7 +37,7 @@ def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Pos
     total: Any = special.logsumexp(heights)
     weights = np.exp(np.array(heights) - total)
     rng = np.random.default_rng(seed)
-    # Spread evenly over the weights: less luck in the draws.
+    # Systematic resampling reduces the variance of the draws.
     picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
     picked = np.minimum(picked, len(delays) - 1)
     means = np.array([fit.coefficients for fit in fits]) + np.array(changes) * (

@@ -1,14 +1,14 @@
-"""Which contact law a mechanism has: the simplest one that predicts touches it was not fitted to.
+"""Choice of the contact law: the simplest law that predicts contacts to which it was not fitted.
 
-Every law is fitted to the odd touches and judged on the even ones, and the other way round, by the log
-likelihood of whole touches. Laws within two standard errors of the best, touch by touch, are as good, and so
-is the one that the Bayesian information criterion prefers over all rows; the one with the fewest numbers is
-taken. With fewer than four touches the criterion alone judges.
+Every law is fitted to the odd contacts and evaluated on the even ones, and vice versa (cross-validation), by
+the log likelihood of whole contacts. Acceptable laws lie within two standard errors of the best one, contact
+by contact; the law that the Bayesian information criterion prefers over all rows is also acceptable. The
+acceptable law with the fewest parameters is chosen. With fewer than four contacts only the criterion counts.
 
-A law without damping is taken only where it is named. To first order a contact shows damping less stiffness
-times the age of the force: without damping the delay would take its place, with an interval that is far too
-narrow. Kelvin and Voigt's law contains the linear one. For the same reason a law whose
-damping begins with the depth is taken only where the touches rule damping at the onset out.
+A law without damping is chosen only if the user names it. To first order a contact shows damping minus
+stiffness times the age of the force. Without damping, the delay absorbs this difference and gets an interval
+that is much too narrow. The Kelvin-Voigt law contains the linear one. For the same reason a law whose damping
+increases with the depth is chosen only if the contacts exclude damping at the onset.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from tuning.identification.contact_problem import COARSE, LONGEST, Problem, Read
 from tuning.identification.contact_profile import first_plane
 from tuning.identification.motion import Motion
 
-FEWEST = 4  # touches for judging on others than those fitted
-ERRORS = 2.0  # standard errors within which laws are as good
-CLEAR = 4.0  # standard errors beyond which damping that acts at the onset is ruled out
-ONSET = 1e-3  # s, before and after a touch's begin, by which laws are not judged
+FEWEST = 4  # contacts that cross-validation needs
+ERRORS = 2.0  # standard errors of the likelihood difference, within which laws are equally good
+CLEAR = 4.0  # standard errors beyond which damping at the onset is excluded
+ONSET = 1e-3  # s, time on either side of an onset or a release that the evaluation omits
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One law, fitted and judged."""
+    """Contact law with its fit and its evaluation."""
 
     law: Law
     delay: float  # s
     plane: float  # m
-    misfit: float  # of all touches
-    likelihood: np.ndarray  # of each touch by the fit to others, natural logarithm
-    short: tuple[float, float]  # by how much the best law is better in all, and the standard error of that
+    misfit: float  # chi-squared over all contacts
+    likelihood: np.ndarray  # log likelihood of each contact under the fit to the others
+    short: tuple[float, float]  # deficit of the total log likelihood to the best law, and its standard error
 
 
 def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -> list[Judged]:
-    """All laws (or those named), the one to take first."""
+    """Fit and evaluate all laws, or those named; return them with the chosen one first."""
     judged = []
     _, plane_there, _ = guess = _fit(motion, readings, kelvin_voigt(), plane, None)
     judging = replace(readings, counts=readings.counts & ~at_onset(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for family in families(deepest, len(readings.entries), names):
-        law, found = _search(family, lambda one: _fit(motion, readings, one, plane, guess))
-        judged.append((law, found, _by_others(motion, readings, judging, law, plane, found)))
+        law, result = _search(family, lambda candidate: _fit(motion, readings, candidate, plane, guess))
+        judged.append((law, result, _by_others(motion, readings, judging, law, plane, result)))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
     results = []
@@ -62,19 +62,22 @@ def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(Judged(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
     rows = np.log(max(readings.counts.sum(), 2))
-    preferred = min(results, key=lambda one: one.misfit + rows * one.law.complexity)
-    # The delay takes the place of a damping that a law lacks: such a law is taken only where it is named.
-    damped = [one for one in results if "damping" in one.law.names] or results
-    # So it would of a damping that begins with the depth, for one that acts at the onset.
-    least = min(one.misfit for one in results)
-    at_once = [one for one in damped if acts_at_onset(one.law)]
-    if any(one.short[0] <= CLEAR * one.short[1] + 1e-9 and one.misfit <= least + CLEAR**2 for one in at_once):
+    preferred = min(results, key=lambda fit: fit.misfit + rows * fit.law.complexity)
+    # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
+    damped = [fit for fit in results if "damping" in fit.law.names] or results
+    # The delay also absorbs damping at the onset if the law's damping starts at zero depth with zero.
+    least = min(fit.misfit for fit in results)
+    at_once = [fit for fit in damped if acts_at_onset(fit.law)]
+    if any(fit.short[0] <= CLEAR * fit.short[1] + 1e-9 and fit.misfit <= least + CLEAR**2 for fit in at_once):
         damped = at_once
-    good = [one for one in damped if one is preferred or one.short[0] <= ERRORS * one.short[1] + 1e-9]
-    good = good or [min(damped, key=lambda one: one.short[0])]
-    # Of laws with as many numbers the first in the list: by misfit, noise would choose.
-    taken = min(good, key=lambda one: one.law.complexity)
-    return [taken, *(one for one in sorted(results, key=lambda one: one.short[0]) if one is not taken)]
+    good = [fit for fit in damped if fit is preferred or fit.short[0] <= ERRORS * fit.short[1] + 1e-9]
+    good = good or [min(damped, key=lambda fit: fit.short[0])]
+    # Among laws of equal complexity the first one in the list wins: with the misfit, noise would decide.
+    taken = min(good, key=lambda fit: fit.law.complexity)
+    return [
+        taken,
+        *(fit for fit in sorted(results, key=lambda fit: fit.short[0]) if fit is not taken),
+    ]
 
 
 def acts_at_onset(law: Law) -> bool:
@@ -84,12 +87,12 @@ def acts_at_onset(law: Law) -> bool:
 
 
 Fitted = tuple[float, float, float]  # delay, plane, misfit
-# Laws that fits can find; `families` has the same order.
+# Names of the laws that can be fitted, in the order of `families`.
 NAMES = tuple(name for name, law in LAWS.items() if law.families(1.0, 1))
 
 
 def families(deepest: float, entries: int, names: Sequence[str] | None = None) -> list[Family]:
-    """Return what to try of every law, or of those named; `deepest`: of all touches [m]."""
+    """Return the families of all laws, or of those named; `deepest`: greatest depth of all contacts [m]."""
     laws = [LAWS[name] for name in NAMES if names is None or name in names]
     return [family for law in laws for family in law.families(deepest, entries)]
 
@@ -99,26 +102,29 @@ def _search(family: Family, fit: Callable[[Law], Fitted]) -> tuple[Law, Fitted]:
     if family.low == family.high:
         law = family.make(family.low)
         return law, fit(law)
-    found: Any = optimize.minimize_scalar(
+    optimum: Any = optimize.minimize_scalar(
         lambda shape: fit(family.make(shape))[2],
         bounds=(family.low, family.high),
         method="bounded",
         options={"xatol": 0.001 * (family.high - family.low)},
     )
-    # A usual value that explains as much is meant.
-    as_good = (value for value in family.usual if fit(family.make(value))[2] - found.fun < 4.0)
-    law = family.make(next(as_good, float(found.x)))
+    # A common value of the exponent or shape is preferred if it fits nearly as well.
+    as_good = (value for value in family.usual if fit(family.make(value))[2] - optimum.fun < 4.0)
+    law = family.make(next(as_good, float(optimum.x)))
     return law, fit(law)
 
 
 def _fit(motion, readings, law, plane, guess: Fitted | None) -> Fitted:
-    """Delay, plane and misfit of the best fit, without the posterior."""
+    """Return delay [s], surface [m] and misfit of the best fit, without the posterior."""
     problem = Problem(motion, readings, law, plane)
     return quick(problem, guess)
 
 
 def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitted:
-    """The best delay and plane: within `reach` of the coarse steps about a guess, or anywhere."""
+    """Return the best delay and surface from a coarse search.
+
+    The search covers `reach` coarse steps on either side of a guess, or all delays without a guess.
+    """
     if guess is None:
         start = problem.plane if problem.plane is not None else first_plane(problem, LONGEST / 4.0)
         delays = np.arange(problem.shortest, LONGEST, 2.0 * COARSE)
@@ -139,32 +145,35 @@ def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitt
 
 
 def at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
-    """Rows near the first and the last of a contact: a damped one begins with a jump, and whether a row is on
-    this or that side of it says nothing of the law."""
+    """Return a flag for each row within `ONSET` of an onset or a release, shape (rows, lanes).
+
+    The force of a damped contact jumps there; the side on which a row falls carries no information on the
+    law.
+    """
     delay, plane, _ = guess
     shortest = -max(motion.delay, 0.0)
-    flags = [motion.at(max(one, shortest))[0] > plane for one in (delay - ONSET, delay, delay + ONSET)]
+    flags = [motion.at(max(d, shortest))[0] > plane for d in (delay - ONSET, delay, delay + ONSET)]
     return np.any(flags, axis=0) & ~np.all(flags, axis=0)
 
 
-def _by_others(motion, readings, judging: Readings, law, plane, found: Fitted) -> np.ndarray:
-    """Log likelihood of each touch under the fit to the touches of the other parity."""
+def _by_others(motion, readings, judging: Readings, law, plane, start: Fitted) -> np.ndarray:
+    """Return the log likelihood of each contact under the fit to the contacts of the other parity."""
     lanes = readings.force.shape[1]
     if lanes < FEWEST:
         size = law.complexity * np.log(max(readings.counts.sum(), 2)) / 2.0
-        return np.array([-0.5 * found[2] - size])
+        return np.array([-0.5 * start[2] - size])
     likelihood = np.empty(lanes)
     for parity in (0, 1):
         mine = np.arange(lanes) % 2 == parity
         taught = replace(readings, counts=readings.counts & ~mine)
         problem = Problem(motion, taught, law, plane)
-        delay, at, _ = quick(problem, found, 1)
+        delay, at, _ = quick(problem, start, 1)
         coefficients = problem.at(delay, at).coefficients
         likelihood[mine] = -0.5 * misfits(problem, judging, delay, at, coefficients)[mine]
     return likelihood
 
 
 def misfits(problem: Problem, readings: Readings, delay, plane, coefficients) -> np.ndarray:
-    """Sum of squared whitened residuals of each touch."""
+    """Return the sum of squared whitened residuals of each contact."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

@@ -1,4 +1,4 @@
-"""The mechanism file of an identification: TOML text, with what is uncertain and how it hangs together."""
+"""Mechanism file of an identification: TOML text, with uncertainty and correlation."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ from typing import Any
 
 import numpy as np
 
-LEAST_EIGENVALUE = 1e-6  # of the correlation written: rounding must not make it singular
-FEW_DIGITS = 12  # significant, of numbers in the file
+LEAST_EIGENVALUE = 1e-6  # of the written correlation, which rounding must not make singular
+FEW_DIGITS = 12  # significant digits of numbers in the file
 
 
 def uncertainty_tables(
     keys: list[str], draws: np.ndarray, floors: np.ndarray, off: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """`[uncertainty]` and `[correlation]` from draws, (draws, keys); no standard deviation below its floor.
+    """Return `[uncertainty]` and `[correlation]` from draws.
 
-    `off`: by how much the file's value is off the mean of the draws, for each key; it counts as uncertainty.
+    The entries of a list have one standard deviation and are drawn independently; the correlation has one row
+    for all of them.
 
-    The entries of a list have one standard deviation and are drawn apart; in the correlation one number
-    stands for all of them."""
+    Args:
+        keys: Dotted keys, with indices for entries of lists.
+        draws: Draws of the parameters, (draws, keys).
+        floors: Least standard deviation of each key.
+        off: Difference between the file's value and the mean of the draws for each key; it adds to the
+            uncertainty.
+    """
     covariance = np.atleast_2d(np.cov(draws.T))
     covariance = covariance if off is None else covariance + np.outer(off, off)
     short = np.maximum(floors**2 - np.diag(covariance), 0.0)
@@ -29,8 +35,10 @@ def uncertainty_tables(
     groups = [[i for i, key in enumerate(keys) if _path(key) == name] for name in names]
     std = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(std, std)
-    # Of lists the mean over their entries: one number for all.
-    joined = np.array([[np.mean(correlation[np.ix_(one, other)]) for other in groups] for one in groups])
+    # The correlation of a list is the mean over its entries.
+    joined = np.array(
+        [[np.mean(correlation[np.ix_(first, second)]) for second in groups] for first in groups]
+    )
     np.fill_diagonal(joined, 1.0)
     values, vectors = np.linalg.eigh(joined)
     if values.min() < LEAST_EIGENVALUE:
@@ -51,7 +59,7 @@ def uncertainty_tables(
 
 
 def _path(key: str) -> str:
-    """The key without the numbers of a list's entry."""
+    """Return the key without the index of a list's entry."""
     parts = key.split(".")
     while parts[-1].isdigit():
         parts.pop()
@@ -59,16 +67,16 @@ def _path(key: str) -> str:
 
 
 def put(document: dict[str, Any], key: str, value: float) -> None:
-    """Set the number of a dotted key, lists by their entries' numbers, in a mechanism as tables."""
+    """Set the value of a dotted key, with indices for list entries, in a mechanism in form of tables."""
     *path, last = [int(part) if part.isdigit() else part for part in key.split(".")]
-    place: Any = document
+    table: Any = document
     for part in path:
-        place = place[part]
-    place[last] = value
+        table = table[part]
+    table[last] = value
 
 
 def to_toml(document: dict[str, Any], comment: str = "") -> str:
-    """A mechanism, as `jaxhil.mechanism.file.to_builtins` gives it, as TOML."""
+    """Return a mechanism from `jaxhil.mechanism.file.to_builtins` as TOML text."""
     lines = [f"# {line}" for line in comment.splitlines()]
     tables: list[tuple[str, dict[str, Any]]] = []
 
@@ -103,7 +111,7 @@ def _value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_value(one) for one in value) + "]"
+        return "[" + ", ".join(_value(item) for item in value) + "]"
     if isinstance(value, int):
         return str(value)
     if math.isinf(value):

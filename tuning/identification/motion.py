@@ -1,10 +1,10 @@
-"""Where the mechanism was while the sensors read it: the model's exact response to the logged commands.
+"""Motion of the mechanism at the times of the sensor readings, from the model and the logged commands.
 
-The response of a linear motion simulator to commands held or joined by lines is known at any time, so a
-delay of any fraction of a period is one row of numbers times the state and the command at both ends of a
-period (Van Loan 1978), as in `jaxhil.simulation.motion` within the loop. All runs advance together, a
-lane each; before its first row a run's command moved uniformly. Position and velocity so found carry no
-noise.
+The response of a linear motion simulator to held or linearly interpolated commands is known exactly at any
+time. A delay of any fraction of a period is therefore one row of coefficients times the state and the
+commands at both ends of a period (Van Loan 1978), as in `jaxhil.simulation.motion` within the loop. All runs
+advance together, one per lane; before its first row, the command of a run moved uniformly. The resulting
+position and velocity have no noise.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 
-TOLERANCE = 1e-9  # periods: nearer to a tick than this is at the tick
+TOLERANCE = 1e-9  # periods, distance within which a time counts as a tick
 
 
 class Motion:
-    """The response of one model to the commands of several runs."""
+    """Response of one model to the commands of several runs."""
 
     def __init__(
         self,
@@ -31,8 +31,15 @@ class Motion:
         longest: float,
         late: np.ndarray | None = None,
     ):
-        """`longest`: greatest delay after the model's own [s] that `at` will be asked for; `late`: what each
-        run adds to it [s], by a clock of its own; what forces were read later than their rows is less."""
+        """Compute the states of the model at all ticks.
+
+        Args:
+            model: Motion simulator.
+            runs: Runs, one per lane.
+            timing: Timing of commands and readings.
+            longest: Longest delay after the model's own [s] that `at` receives.
+            late: Delay that a separate clock adds to each run [s]; `Run.force_late` is subtracted.
+        """
         self.delay, self.period = model.delay, timing.control_period
         if any(run.force_late is not None for run in runs):
             read = [0.0 if run.force_late is None else np.nanmean(run.force_late) for run in runs]
@@ -46,7 +53,7 @@ class Motion:
         self.A, self.B, self.C = _companion(numerator, denominator, self.period)
         longest = max(self.delay, 0.0) + longest + most
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
-        # Readings of later ticks, by the way rows are written or by a delay below 0, need commands of then.
+        # Rows with readings of later ticks, and negative delays, need the commands of later ticks.
         ahead = max(1, -self.shift) + int(np.ceil((max(-self.delay, 0.0) - least) / self.period))
         command = self._commands(runs, ahead)
         latency = timing.command_latency
@@ -57,7 +64,7 @@ class Motion:
         self.states = self._advance(timing.command_hold)
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """Position [m] and velocity [m/s] that a sensor with this delay [s] sees, (rows, lanes)."""
+        """Return position [m] and velocity [m/s] that a sensor with this delay [s] reads, (rows, lanes)."""
         if self.late is None:
             return self._at(delay, slice(None))
         lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
@@ -65,21 +72,23 @@ class Motion:
 
     def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
         lag = (self.delay + delay) / self.period + self.shift
-        whole = int(np.floor(lag + TOLERANCE))
-        place = min(1.0, 1.0 - (lag - whole))
-        first = self.offset - 1 - whole
+        whole_periods = int(np.floor(lag + TOLERANCE))
+        fraction = min(1.0, 1.0 - (lag - whole_periods))
+        first = self.offset - 1 - whole_periods
         if first < 0:
             raise ValueError(f"a delay of {delay:g} s is longer than the history kept")
         taken = slice(first, first + self.rows)
         start, end, states = self.start[taken, lanes], self.end[taken, lanes], self.states[taken, :, lanes]
-        state, one, other = self._after(place)
-        position = np.concatenate([self.C @ state, [self.C @ one, self.C @ other]])
-        rate = np.concatenate([(self.C @ self.A) @ state, [self.C @ self.A @ one, self.C @ self.A @ other]])
+        state, from_start, from_end = self._after(fraction)
+        position = np.concatenate([self.C @ state, [self.C @ from_start, self.C @ from_end]])
+        rate = np.concatenate(
+            [(self.C @ self.A) @ state, [self.C @ self.A @ from_start, self.C @ self.A @ from_end]]
+        )
         if self.order == 0:
-            position, rate = np.array([1.0 - place, place]), np.array([-1.0, 1.0])
+            position, rate = np.array([1.0 - fraction, fraction]), np.array([-1.0, 1.0])
         else:
-            rate[-2] += (self.C @ self.B) * (1.0 - place)
-            rate[-1] += (self.C @ self.B) * place
+            rate[-2] += (self.C @ self.B) * (1.0 - fraction)
+            rate[-1] += (self.C @ self.B) * fraction
         x, v = (
             np.einsum("i,nil->nl", row[: self.order], states) + row[-2] * start + row[-1] * end
             for row in (position, rate / self.period)
@@ -87,21 +96,24 @@ class Motion:
         return x, v
 
     def of_positions(self) -> Motion:
-        """Return the same motion at the times of the rows, whenever forces were read."""
+        """Return the same motion at the times of the rows, without the times of the force readings."""
         rows = copy(self)
         rows.late = None
         return rows
 
     def of(self, lanes: np.ndarray) -> Motion:
-        """The motion of some of the runs, each as often as it is named."""
-        found = copy(self)
-        found.start, found.end = self.start[:, lanes], self.end[:, lanes]
-        found.states = self.states[:, :, lanes]
-        found.late = None if self.late is None else self.late[lanes]
-        return found
+        """Return the motion of the given lanes, each as often as it occurs."""
+        result = copy(self)
+        result.start, result.end = self.start[:, lanes], self.end[:, lanes]
+        result.states = self.states[:, :, lanes]
+        result.late = None if self.late is None else self.late[lanes]
+        return result
 
     def _commands(self, runs: Sequence[Run], ahead: int) -> np.ndarray:
-        """Commands with their history, (history + rows + ahead, lanes); after a run its last one is held."""
+        """Return the commands with history and continuation, (history + rows + ahead, lanes).
+
+        The last command of a run is held.
+        """
         lanes = []
         for run in runs:
             x = run.position_desired
@@ -115,37 +127,37 @@ class Motion:
             lanes.append(np.concatenate([before, x, np.full(self.rows - len(x) + ahead, x[-1])]))
         return np.array(lanes).T
 
-    def _after(self, place: float):
-        """State after a part of a period, as a map of (state, input at its start, input at its end)."""
+    def _after(self, fraction: float):
+        """Return the matrices from state and both inputs of a period to the state after a fraction of it."""
         n = self.order
         system = np.zeros((n + 2, n + 2))
         system[:n, :n], system[:n, n], system[n, n + 1] = self.A, self.B, 1.0
-        full = exponential(system * place)[:n]
+        full = exponential(system * fraction)[:n]
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def _advance(self, hold: str) -> np.ndarray:
-        """States at the start of every interval, (intervals + 1, order, lanes)."""
-        state, one, other = self._after(1.0)
+        """Return the states at the start of every interval, (intervals + 1, order, lanes)."""
+        state, from_start, from_end = self._after(1.0)
         lanes = self.end.shape[1]
         states = np.empty((len(self.end) + 1, self.order, lanes))
         if not self.order:
             return states
-        drive = one[:, None] * self.start[:, None] + other[:, None] * self.end[:, None]
+        drive = from_start[:, None] * self.start[:, None] + from_end[:, None] * self.end[:, None]
         closed = np.eye(self.order) - state
-        both = one + other
-        # z = alpha + beta n on a uniform motion, whose input grows by a step a period.
+        from_both = from_start + from_end
+        # A uniform motion, whose input grows by one step per period, has the state z = alpha + beta n.
         step = self.end[1] - self.end[0]
-        beta = np.linalg.solve(closed, np.outer(both, step))
-        ahead = both if hold == "zoh" else other
+        beta = np.linalg.solve(closed, np.outer(from_both, step))
+        ahead = from_both if hold == "zoh" else from_end
         now = self.end[0] - step if hold == "zoh" else self.start[0]
-        states[0] = np.linalg.solve(closed, np.outer(both, now) + np.outer(ahead, step) - beta)
+        states[0] = np.linalg.solve(closed, np.outer(from_both, now) + np.outer(ahead, step) - beta)
         for n in range(len(self.end)):
             states[n + 1] = state @ states[n] + drive[n]
         return states
 
 
 def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
-    """(A, B, C) with time in periods, from descending powers of s; strictly proper, order 0 is empty."""
+    """Return (A, B, C) with time in periods, from descending powers of s; empty for order 0."""
     order = len(denominator) - 1
     scale = period ** np.arange(order, -1.0, -1.0)
     below = denominator / scale
@@ -160,9 +172,11 @@ def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
 
 
 def exponential(matrix: np.ndarray) -> np.ndarray:
-    """Matrix exponential by scaling, Taylor and squaring, to rounding.
+    """Return the matrix exponential by scaling, Taylor series and squaring, accurate to rounding.
 
-    Small matrices by the hundred: the general one's choice of a method takes longer than the method."""
+    There are hundreds of small matrices; the general routine's choice of a method would take longer than the
+    method.
+    """
     halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
     scaled, total = matrix / 2.0**halvings, np.eye(len(matrix))
     for term in range(13, 0, -1):

@@ -1,9 +1,9 @@
-"""Sensors at rest: noise, bias, quantum, dead zone, and the noise's colour.
+"""Noise of sensors at rest: level, bias, quantum, dead zone and colour.
 
-A reading that is rounded to multiples of a quantum says between which two numbers the signal was; mean and
-standard deviation are those under which the counts of the multiples are most likely, which stays right where
-the noise is smaller than the quantum. Coloured noise is an autoregression (Yule and Walker's equations, the
-order by the Bayesian information criterion); its inverse makes residuals white.
+A reading that is rounded to a quantum only bounds the signal. Mean and standard deviation maximize the
+likelihood of the counts of each multiple, which remains correct if the noise is smaller than the quantum.
+Coloured noise is modelled as an autoregression (Yule-Walker equations, order by the Bayesian information
+criterion); its inverse whitens the residuals.
 """
 
 from __future__ import annotations
@@ -14,42 +14,42 @@ import numpy as np
 from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
-HIGHEST = 8  # order of the autoregression
-FEWEST_BEYOND = 20  # readings beyond a dead zone, from which they tell it
-REPEATED = 0.2  # distinct values over readings, below which values come in steps
-ROUNDED_TO_0 = 0.02  # share of exact zeros beyond those of rounding, from which a dead zone makes them
-GAP = 0.3  # of the mean reading beyond a dead zone, above which no reading of this kind is the smallest
-SILENT = 0.5  # share of exact zeros from which a reading is that of a dead zone
+HIGHEST = 8  # highest order of the autoregression
+FEWEST_BEYOND = 20  # readings beyond a dead zone that an estimate needs
+REPEATED = 0.2  # ratio of distinct values to readings, below which the readings may be rounded
+ROUNDED_TO_0 = 0.02  # share of exact zeros beyond those of rounding that indicates a dead zone
+GAP = 0.3  # largest ratio of least to mean reading of this kind of dead zone
+SILENT = 0.5  # share of exact zeros that indicates a dead zone without further tests
 
 
 @dataclass(frozen=True)
 class Noise:
-    """One sensor's readings where nothing moves."""
+    """Noise of one sensor while nothing moves."""
 
     mean: float  # of the readings, in their unit
-    std: float
+    std: float  # standard deviation, in the same unit
     mean_std: float  # standard error of the mean
-    std_std: float  # and of the standard deviation
-    quantum: float  # 0 where readings come in no steps
-    silent: bool  # a dead zone hides some or all of the readings: the mean is unknown
-    filter: tuple[float, ...]  # makes the noise white, its first coefficient 1
-    number: int  # readings
-    drift: float = 0.0  # of the readings, from the first to the last; 0 where it is lost in the noise
-    dead_zone: tuple[float, float] | None = None  # less the bias, and its standard error, where readings tell
+    std_std: float  # standard error of the standard deviation
+    quantum: float  # step of rounded readings; 0 if they are not rounded
+    silent: bool  # whether a dead zone hides readings; the mean is then unknown
+    filter: tuple[float, ...]  # whitening filter, first coefficient 1
+    number: int  # of readings
+    drift: float = 0.0  # from the first to the last reading; 0 if it is below the noise
+    dead_zone: tuple[float, float] | None = None  # dead zone minus bias, and its standard error
 
     @property
     def pole(self) -> float:
-        """Largest magnitude of the noise's poles; 0 for white noise."""
+        """Return the largest magnitude of the noise's poles; 0 for white noise."""
         return float(max(np.abs(np.roots(self.filter)), default=0.0))
 
     @property
     def innovation(self) -> float:
-        """Standard deviation [their unit] of what the filter leaves."""
+        """Return the standard deviation of the whitened noise, in the unit of the readings."""
         return self.std * float(np.sqrt(whitened_share(self.filter)))
 
 
 def at_rest(readings: np.ndarray) -> Noise:
-    """Of at least 20 readings on successive ticks, finite."""
+    """Return the noise of at least 20 finite readings on successive ticks."""
     quantum = steps(readings)
     number = len(readings)
     if _is_hidden(readings, quantum):
@@ -60,10 +60,10 @@ def at_rest(readings: np.ndarray) -> Noise:
     rounded = quantum and not drift
     mean, std = _binned(readings, quantum) if rounded else (readings.mean(), readings.std(ddof=1))
     colour = autoregression(readings - mean)
-    # The mean of correlated readings is less certain, by what the noise holds at frequency 0.
+    # The standard error of correlated readings follows from the noise spectrum at 0 Hz.
     at_zero = np.sqrt(whitened_share(colour)) / abs(np.sum(colour))
     effective = 1.0 + 2.0 * np.sum(_correlations(colour) ** 2)
-    # Rounding adds to what has to be told apart.
+    # Rounding adds to the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
     return Noise(
         float(mean),
@@ -79,20 +79,20 @@ def at_rest(readings: np.ndarray) -> Noise:
 
 
 def _is_hidden(readings: np.ndarray, quantum: float) -> bool:
-    """Tell whether more readings are exactly 0 than noise and rounding would make so."""
+    """Return whether more readings are exactly 0 than noise and rounding explain."""
     zero = readings == 0.0
     if np.mean(zero) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return True
     size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
-    # Rounding makes at most 0.4 quanta over the standard deviation of normal readings 0.
+    # Rounding turns at most a share of 0.4 quantum / std of normal readings into 0.
     return size > 0.0 and float(np.mean(zero)) > ROUNDED_TO_0 + quantum / size
 
 
 def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
-    """Return the noise's standard deviation, and the dead zone with its error, by the noise beyond it.
+    """Return the noise's standard deviation, and the dead zone with its standard error.
 
-    A normal number n is read as sign(n) max(|n| - D, 0): the maximum of the likelihood over D and the
-    standard deviation, of a bias of 0. Readings that leave a gap around 0 have a dead zone of another kind.
+    A normal value n is read as sign(n) max(|n| - D, 0). Dead zone D and standard deviation maximize the
+    likelihood, for a bias of 0. Readings with a gap around 0 have a dead zone of another kind.
     """
     size = np.abs(readings[readings != 0.0])
     zeros, number = len(readings) - len(size), len(size)
@@ -106,14 +106,14 @@ def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
         return -zeros * inside + 0.5 * np.sum(((size + dead_zone) / std) ** 2) + number * np.log(std)
 
     start = np.log([size.mean(), 2.0 * size.mean()])
-    found = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
-    dead_zone, std = np.exp(found.x)
-    # The curvature of the likelihood, by central differences.
+    optimum = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
+    dead_zone, std = np.exp(optimum.x)
+    # Central differences give the curvature of the likelihood.
     step = 1e-3
     shifts = step * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
-    both, up, down, neither, a, b, c, d = (cost(found.x + shift) for shift in shifts)
-    across = (both - up - down + neither) / 4.0
-    curvature = np.array([[a + b - 2 * found.fun, across], [across, c + d - 2 * found.fun]]) / step**2
+    plus, up, down, minus, a, b, c, d = (cost(optimum.x + shift) for shift in shifts)
+    across = (plus - up - down + minus) / 4.0
+    curvature = np.array([[a + b - 2 * optimum.fun, across], [across, c + d - 2 * optimum.fun]]) / step**2
     variance = float(np.linalg.inv(curvature)[0, 0])
     if not variance > 0.0:
         return 0.0, None
@@ -121,14 +121,14 @@ def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
 
 
 def _drift(readings: np.ndarray) -> float:
-    """From the first to the last, by a straight line, where that is more than what is left scatters."""
+    """Return the linear drift from the first to the last reading, or 0 if the scatter is larger."""
     time = np.linspace(-0.5, 0.5, len(readings))
     drift = float(time @ (readings - readings.mean()) / (time @ time))
     return drift if abs(drift) > np.std(readings - drift * time) else 0.0
 
 
 def steps(readings: np.ndarray) -> float:
-    """The quantum to whose multiples readings are rounded, 0 where there is none."""
+    """Return the quantum to which readings are rounded, or 0 if they are not."""
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 2 or len(values) > REPEATED * len(readings):
         return 0.0
@@ -146,14 +146,14 @@ def steps(readings: np.ndarray) -> float:
 
 
 def _binned(readings: np.ndarray, quantum: float) -> tuple[float, float]:
-    """Mean and standard deviation of greatest likelihood of a rounded normal number."""
+    """Return the maximum likelihood mean and standard deviation of rounded normal readings."""
     values, counts = np.unique(np.round(readings / quantum), return_counts=True)
     middle, spread = np.average(values, weights=counts), readings.std() / quantum
 
     def cost(parameters):
         mean, std = parameters[0], np.exp(parameters[1])
         high, low = (values + 0.5 - mean) / std, (values - 0.5 - mean) / std
-        # The upper tail by symmetry: differences of numbers near 1 lose digits.
+        # Use the symmetry for the upper tail, because differences of values near 1 lose digits.
         flip = low > 0.0
         high, low = np.where(flip, -low, high), np.where(flip, -high, low)
         log = special.log_ndtr(high) + np.log1p(
@@ -161,13 +161,13 @@ def _binned(readings: np.ndarray, quantum: float) -> tuple[float, float]:
         )
         return -np.sum(counts * log)
 
-    found = optimize.minimize(cost, [middle, np.log(max(spread, 0.2))], method="Nelder-Mead",
+    optimum = optimize.minimize(cost, [middle, np.log(max(spread, 0.2))], method="Nelder-Mead",
                               options={"xatol": 1e-5, "fatol": 1e-6})  # fmt: skip
-    return float(found.x[0] * quantum), float(np.exp(found.x[1]) * quantum)
+    return float(optimum.x[0] * quantum), float(np.exp(optimum.x[1]) * quantum)
 
 
 def autoregression(values: np.ndarray) -> tuple[float, ...]:
-    """Coefficients (1, -a1, -a2, ...) of the filter that makes the values white."""
+    """Return the coefficients (1, -a1, -a2, ...) of the filter that whitens the values."""
     number = len(values)
     size = 1 << int(np.ceil(np.log2(2 * number)))
     power = np.abs(np.fft.rfft(values, size)) ** 2
@@ -185,19 +185,19 @@ def autoregression(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _correlations(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
-    """Autocorrelation of the noise at lags 1, 2, ... ."""
+    """Return the autocorrelation of the noise at lags 1, 2, ... ."""
     if len(colour) == 1:
         return np.zeros(1)
     impulse = np.zeros(4 * longest)
     impulse[0] = 1.0
 
     answer = lfilter([1.0], colour, impulse)
-    every = np.correlate(answer, answer, "full")[len(answer) - 1 :]
-    return every[1 : longest + 1] / every[0]
+    correlation = np.correlate(answer, answer, "full")[len(answer) - 1 :]
+    return correlation[1 : longest + 1] / correlation[0]
 
 
 def whitened_share(colour: tuple[float, ...]) -> float:
-    """Variance after the whitening filter over that before it."""
+    """Return the variance after the whitening filter over the variance before it."""
     if len(colour) == 1:
         return 1.0
     rho = np.concatenate([[1.0], _correlations(colour)])[: len(colour)]

@@ -1,10 +1,10 @@
-"""Draws of normal numbers whose covariance may be singular to rounding."""
+"""Draws of normal parameters whose covariance may be singular to rounding."""
 
 import numpy as np
 
 
 def factor(covariance: np.ndarray) -> np.ndarray:
-    """Return L with L L' the covariance, (..., n, n); negative eigenvalues of its correlation count as 0."""
+    """Return L with L L' the covariance, (..., n, n); negative eigenvalues of its correlation become 0."""
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.where(deviation > 0.0, deviation, 1.0)
     values, vectors = np.linalg.eigh(covariance / (scale[..., :, None] * scale[..., None, :]))

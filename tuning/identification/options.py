@@ -1,4 +1,4 @@
-"""What the caller of an identification knows or wants."""
+"""Options of an identification."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from tuning.identification.rational import STRUCTURES
 
 @dataclass(frozen=True)
 class Options:
-    """What the caller knows or wants."""
+    """Options of an identification that the caller sets."""
 
-    order: int | None = None  # of the motion simulator; None lets the lines choose
-    law: str | None = None  # of the contact; None lets the touches choose
-    fixed: Mapping[str, Any] = field(default_factory=dict)  # by key, a list's too: told, not estimated
-    bayes: bool = False  # whether the prior's normal marginals are evidence beside the logs
-    hold_out: float = 0.2  # share of the touches that judge the fit to the others
-    bootstrap: int = 0  # fits to contacts drawn again, that widen intervals where contacts differ
-    limit: float = 0.01  # on the restitution, of all that the model does not explain
+    order: int | None = None  # of the motion simulator; None: the smallest order that explains the lines
+    law: str | None = None  # contact law; None: the simplest law that predicts the contacts
+    fixed: Mapping[str, Any] = field(default_factory=dict)  # specified parameters by key, also lists
+    bayes: bool = False  # whether the prior's normal marginals are combined with the logs
+    hold_out: float = 0.2  # share of the contacts that are left out to evaluate the fit
+    bootstrap: int = 0  # number of bootstrap fits; 0: none
+    limit: float = 0.01  # largest effect of all defects on the restitution
     calibration: float = 0.001  # relative uncertainty of the force sensor's scale
-    clock: float = 2e-5  # s, uncertainty of a delay that no log shows
+    clock: float = 2e-5  # s, least uncertainty of a delay: no log shows an error of the clock
     seed: int = 0
-    scheduler: str | None = None  # address of that of a cluster whose workers do the bootstrap's fits
-    kept: Pieces = NOTHING_KEPT  # of the bootstrap, those that are done
+    scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
+    kept: Pieces = NOTHING_KEPT  # checkpoints of the bootstrap
 
 
-FEWEST_FITS = 20  # whose scatter says something
-FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # told before anything is fitted
+FEWEST_FITS = 20  # bootstrap fits that an estimate of the scatter needs
+FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # values that are used before the first fit
 
 
 def check(options: Options, prior: Mechanism | None) -> None:
-    """Raises `InputError` for options that cannot be."""
+    """Raise `InputError` if the options are invalid."""
     for key in FIRST:
         if not isinstance(options.fixed.get(key, 0.0), (int, float)):
             raise InputError(f"fix: {key}: found {shown(options.fixed[key])}, allowed a number")
@@ -46,6 +46,6 @@ def check(options: Options, prior: Mechanism | None) -> None:
         raise InputError(f"law: found {shown(options.law)}, allowed {', '.join(NAMES)}")
     if 0 < options.bootstrap < FEWEST_FITS:
         raise InputError(f"bootstrap: found {options.bootstrap}, allowed 0, or {FEWEST_FITS} or more")
-    orders = sorted({one.order for one in STRUCTURES})
+    orders = sorted({structure.order for structure in STRUCTURES})
     if options.order is not None and options.order not in orders:
         raise InputError(f"order: found {options.order}, allowed {', '.join(map(str, orders))}")

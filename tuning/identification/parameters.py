@@ -1,4 +1,4 @@
-"""From a fit's own parameters to the keys of a mechanism file, value by value and draw by draw."""
+"""Conversion of a fit's parameters and draws to the keys of a mechanism file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIMULATOR = "rig.simulator."
 
 
 def simulator_section(model: Model) -> dict[str, Any]:
-    """`rig.simulator` of a mechanism file."""
+    """Return the section `rig.simulator` of a mechanism file."""
     many, values = model.structure, np.exp(model.parameters[: model.structure.order])
     delay = {"delay": float(max(model.delay, 0.0))}
     if many.order == 0:
@@ -45,15 +45,16 @@ def simulator_section(model: Model) -> dict[str, Any]:
 def simulator_draws(model: Model, covariance: np.ndarray, frequency: float, count: int, rng) -> tuple[
     dict[str, np.ndarray], np.ndarray
 ]:  # fmt: skip
-    """Draws by key, and by how much the lag at a frequency [Hz] differs in each draw [s].
+    """Return draws by key, and the deviation of the lag at a frequency [Hz] in each draw [s].
 
-    First and second order have keys of their own; of other models the delay takes all that is uncertain, the
-    lag at the contact's frequency."""
-    off = rng.standard_normal((count, len(covariance))) @ factor(covariance).T
+    First- and second-order models have keys for all their parameters. For other models only the delay is
+    uncertain: it takes the deviation of the lag at the contact frequency.
+    """
+    deviations = rng.standard_normal((count, len(covariance))) @ factor(covariance).T
     s = np.array([2j * np.pi * frequency])
     slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
-    lag = off @ slopes
-    values = model.parameters + off
+    lag = deviations @ slopes
+    values = model.parameters + deviations
     name = model.structure.name
     if name == "first_order":
         return {SIMULATOR + "time_constant": np.exp(values[:, 0]), SIMULATOR + "delay": values[:, 1]}, lag
@@ -67,42 +68,44 @@ def simulator_draws(model: Model, covariance: np.ndarray, frequency: float, coun
 
 
 def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
-    """Draws by key; a list's entries have their number behind the key."""
+    """Return draws by key; the key of an entry of a list ends in its index."""
     draws = contact.draws()
-    own = dict(zip(contact.posterior.names, draws.T, strict=True))
-    found = {"rig.force_sensor.delay": own["delay"]}
-    if "time_constant" in own:
-        found["rig.force_sensor.time_constant"] = own["time_constant"]
+    draws_by_name = dict(zip(contact.posterior.names, draws.T, strict=True))
+    result = {"rig.force_sensor.delay": draws_by_name["delay"]}
+    if "time_constant" in draws_by_name:
+        result["rig.force_sensor.time_constant"] = draws_by_name["time_constant"]
     if contact.problem.plane is None:
-        found["rig.contact_plane"] = own["plane"]
+        result["rig.contact_plane"] = draws_by_name["plane"]
     law = contact_law(contact.law.name)
     for i in contact.readings.entries:
-        fitted = {name: own[f"{name}.{i}"] for name in contact.law.names if f"{name}.{i}" in own}
-        found |= law.file_values(fitted, i)
-    if "damping" in own:
-        found["contact.damping.0"] = own["damping"]
+        fitted = {
+            name: draws_by_name[f"{name}.{i}"] for name in contact.law.names if f"{name}.{i}" in draws_by_name
+        }
+        result |= law.file_values(fitted, i)
+    if "damping" in draws_by_name:
+        result["contact.damping.0"] = draws_by_name["damping"]
     if contact.dead_zone:
-        found["rig.force_sensor.dead_zone"] = -own["bias"]
-    return found
+        result["rig.force_sensor.dead_zone"] = -draws_by_name["bias"]
+    return result
 
 
 def contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
-    """`contact` of a mechanism file from values by key."""
+    """Return the section `contact` of a mechanism file from values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
     stiffness = _entries(values, "contact.stiffness.")
     segmented = contact_law(law.name).segmented
-    section["stiffness"] = stiffness if segmented else [one for (one,) in stiffness]
+    section["stiffness"] = stiffness if segmented else [value for (value,) in stiffness]
     if damping := _entries(values, "contact.damping."):
-        section["damping"] = [max(one, 0.0) for (one,) in damping]
+        section["damping"] = [max(value, 0.0) for (value,) in damping]
     return section | {key: values[f"contact.{key}"] for key in KEYS if f"contact.{key}" in values}
 
 
 def _entries(values: dict[str, float], prefix: str) -> list[list[float]]:
-    """The values of a list's entries in order; an entry that was never met is that before it."""
-    found: dict[int, list[float]] = {}
+    """Return the values of a list's entries in order; a missing entry repeats the one before it."""
+    entries: dict[int, list[float]] = {}
     for key in sorted(key for key in values if key.startswith(prefix)):
-        found.setdefault(int(key[len(prefix) :].split(".")[0]), []).append(values[key])
-    if not found:
+        entries.setdefault(int(key[len(prefix) :].split(".")[0]), []).append(values[key])
+    if not entries:
         return []
-    first = min(found)
-    return [found[max((i for i in found if i <= j), default=first)] for j in range(max(found) + 1)]
+    first = min(entries)
+    return [entries[max((i for i in entries if i <= j), default=first)] for j in range(max(entries) + 1)]

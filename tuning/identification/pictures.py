@@ -1,6 +1,6 @@
-"""Pictures of an identification: how well the model explains the logs, and what they changed.
+"""Plots of an identification: fit of the model to the logs, and changes relative to the prior.
 
-In the units and colours of those of a run (`jaxhil.simulation.contact_plot`).
+The plots use the units and colours of the plots of a run (`jaxhil.simulation.contact_plot`).
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from tuning.identification.result import Identification
 
 DOTS: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
 WIDE = 1.96  # standard deviations of a 95 % interval
-TOUCHES = 3  # drawn over time
+TOUCHES = 3  # contacts that are plotted over time
 COLOURS = (BLUE, ORANGE, GREEN)
-LAGS, EARLIER, LATER = 25, -20, 100  # rows, of the residuals' correlations
-PLAINLY = 3.0  # standard deviations from 0 at which a relative change means something
+LAGS, EARLIER, LATER = 25, -20, 100  # rows, ranges of the residuals' correlations
+PLAINLY = 3.0  # standard deviations from 0, above which a relative change is meaningful
 
 
 def draw(found: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """The pictures by the names of their files; without free motion, or contact, not those of it.
+    """Return the plots by the names of their files; plots without data are omitted.
 
-    `entries`: the estimates with their priors, as `identification.json` has them."""
+    `entries` are the estimates with their priors, as in `identification.json`.
+    """
     figures = {}
     if found.motion is not None:
         figures["bode.png"] = bode(found.motion)
     if found.contact is not None:
-        told = next((one["prior"] for one in entries if one["key"] == "rig.force_sensor.delay"), None)
-        figures["delay.png"] = delay(found.contact, told)
+        prior = next((entry["prior"] for entry in entries if entry["key"] == "rig.force_sensor.delay"), None)
+        figures["delay.png"] = delay(found.contact, prior)
         figures["contacts.png"] = contacts(found.contact)
         figures["residuals.png"] = residuals(found.contact)
     figures["compare.png"] = compare(entries)
@@ -44,16 +45,16 @@ def draw(found: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[st
 
 @matplotlib.style.context("default")
 def bode(motion: FreeMotion) -> Figure:
-    """The measured response over the model's, with what noise and distortion there is, and coherence."""
+    """Plot the measured and the modelled response, noise, distortion and coherence over the frequency."""
     lines, fit = motion.lines, motion.fit
     order = np.argsort(lines.frequency)
     frequency = lines.frequency[order]
-    measured, modelled = ((one / lines.command)[order] for one in (lines.output, fit.model.predict(lines)))
+    measured, modelled = ((y / lines.command)[order] for y in (lines.output, fit.model.predict(lines)))
     noise = (lines.std / np.abs(lines.command))[order]
     slopes = fit.model.slopes(2j * np.pi * frequency)
     band = np.sqrt(np.maximum(np.einsum("il,ij,jl->l", slopes, motion.covariance, slopes.conj()).real, 0.0))
     figure = new_figure((11, 6.6), "Motion simulator: from the desired to the measured position")
-    (size, phase), (off, coherence) = figure.subplots(2, 2, sharex=True)
+    (size, phase), (error, coherence) = figure.subplots(2, 2, sharex=True)
     size.plot(frequency, _decibel(measured), color=BLUE, label="measured", **DOTS)
     size.plot(frequency, _decibel(modelled), color=BLACK, linewidth=1.2, label=f"model: {_name(motion)}")
     size.plot(frequency, _decibel(noise), color="0.6", linewidth=1.2, label="noise of the lines")
@@ -70,16 +71,16 @@ def bode(motion: FreeMotion) -> Figure:
     phase.set(ylabel="phase [degrees]")
     finish(phase, "lower left")
     share, chance = 100.0 * np.abs(measured / modelled - 1.0), 100.0 * noise / np.abs(modelled)
-    off.plot(frequency, share, color=BLUE, label="measured off the model", **DOTS)
-    # |complex normal| is below 1.73 standard deviations in 95 of 100 lines.
-    off.plot(frequency, np.sqrt(-np.log(0.05)) * chance, color="0.6", linewidth=1.2, label="95 % of noise")
-    off.plot(frequency, 100.0 * WIDE * band, color=BLACK, linewidth=1.2, label="95 % of the model")
-    off.set(xlabel="frequency [Hz]", ylabel="share of the response [%]", yscale="log")
-    finish(off, "best")
-    of_lines = np.concatenate([one.coherence for one in motion.spectra])[order]
+    error.plot(frequency, share, color=BLUE, label="measured off the model", **DOTS)
+    # The magnitude of complex normal noise is below 1.73 standard deviations at 95 % of the lines.
+    error.plot(frequency, np.sqrt(-np.log(0.05)) * chance, color="0.6", linewidth=1.2, label="95 % of noise")
+    error.plot(frequency, 100.0 * WIDE * band, color=BLACK, linewidth=1.2, label="95 % of the model")
+    error.set(xlabel="frequency [Hz]", ylabel="share of the response [%]", yscale="log")
+    finish(error, "best")
+    of_lines = np.concatenate([spectrum.coherence for spectrum in motion.spectra])[order]
     coherence.plot(frequency, of_lines, color=BLUE, label="coherence", **DOTS)
     coherence.set(xlabel="frequency [Hz]", ylabel="coherence [1]", ylim=(min(0.9, of_lines.min()), 1.005))
-    for axes in (off, coherence):
+    for axes in (error, coherence):
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     finish(coherence, "lower left")
     return figure
@@ -87,7 +88,7 @@ def bode(motion: FreeMotion) -> Figure:
 
 @matplotlib.style.context("default")
 def delay(contact: ContactFit, told: float | None) -> Figure:
-    """What the touches say of the force delay, and what hangs together with it."""
+    """Plot the profile likelihood of the force delay, and its correlation with the damping or the surface."""
     posterior = contact.posterior
     draws = contact.draws()
     figure = new_figure((11, 4.6), "Force delay: what the touches say of it")
@@ -101,11 +102,11 @@ def delay(contact: ContactFit, told: float | None) -> Figure:
         left.axvline(1e3 * told, color=VERMILION, linestyle="--", linewidth=1.2, label="prior")
     left.set(xlabel="force delay [ms]", ylabel="likelihood over its greatest [1]")
     finish(left, "best")
-    name = next((one for one in posterior.names if one.startswith("damping")), "plane")
-    other = draws[:, posterior.names.index(name)]
+    name = next((name for name in posterior.names if name.startswith("damping")), "plane")
+    second = draws[:, posterior.names.index(name)]
     scale, unit = (1e6, "um") if name == "plane" else (1.0, "N s/m" if name == "damping" else "SI")
-    correlation = np.corrcoef(draws[:, 0], other)[0, 1]
-    right.plot(1e3 * draws[::4, 0], scale * other[::4], color=BLUE, alpha=0.4, label="draws", **DOTS)
+    correlation = np.corrcoef(draws[:, 0], second)[0, 1]
+    right.plot(1e3 * draws[::4, 0], scale * second[::4], color=BLUE, alpha=0.4, label="draws", **DOTS)
     right.set(xlabel="force delay [ms]", ylabel=f"{name} [{unit}]")
     right.set_title(f"correlation {correlation:.3f}", fontsize=10)
     finish(right, None)
@@ -114,7 +115,7 @@ def delay(contact: ContactFit, told: float | None) -> Figure:
 
 @matplotlib.style.context("default")
 def contacts(contact: ContactFit) -> Figure:
-    """Measured force and the model's over time and over depth, of three touches."""
+    """Plot the measured and the modelled force over time and over depth, for three contacts."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _modelled(contact)
     inside = readings.counts & (depth > 0.0)
@@ -130,9 +131,9 @@ def contacts(contact: ContactFit) -> Figure:
         rows = np.arange(readings.force.shape[0])[around]
         time = 1e3 * problem.motion.period * (rows - touched[0])
         force = np.where(counts, readings.force[:, lane], np.nan)[around]
-        for axes, place in ((grid[0, column], time), (grid[1, column], 1e3 * depth[around, lane])):
-            axes.plot(place, force, color=BLUE, label="measured", **DOTS)
-            axes.plot(place, predicted[around, lane], color=BLACK, linewidth=1.2, label="model")
+        for axes, abscissa in ((grid[0, column], time), (grid[1, column], 1e3 * depth[around, lane])):
+            axes.plot(abscissa, force, color=BLUE, label="measured", **DOTS)
+            axes.plot(abscissa, predicted[around, lane], color=BLACK, linewidth=1.2, label="model")
             finish(axes, None)
         grid[0, column].set_xlabel("time since the touch [ms]")
         grid[0, column].set_title(f"touch {lane}", fontsize=10)
@@ -146,14 +147,14 @@ def contacts(contact: ContactFit) -> Figure:
 
 @matplotlib.style.context("default")
 def residuals(contact: ContactFit) -> Figure:
-    """What the contact law leaves of the force, over its noise: in time, by depth, and correlated."""
+    """Plot the whitened residuals of the force over time and depth, and their correlations."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _modelled(contact)
     left = problem.whiten(readings.force - predicted) / readings.std
     left = np.where(readings.counts, left, np.nan)
     figure = new_figure((11, 6.6), "Force less the model's, over the noise")
     figure.subplots_adjust(hspace=0.3)
-    (over_time, by_depth), (own, cross) = figure.subplots(2, 2)
+    (over_time, by_depth), (autocorrelation, cross) = figure.subplots(2, 2)
     inside = (depth > 0.0) & readings.counts
     time = problem.motion.period * (np.arange(len(left))[:, None] - np.argmax(inside, axis=0))
     shown = readings.counts & (time > -0.02)
@@ -167,7 +168,7 @@ def residuals(contact: ContactFit) -> Figure:
             axes.axhline(side, color=ORANGE, linestyle="--", linewidth=1, label="95 %" * (side > 0))
         axes.set_ylim(*(1.3 * np.array(axes.get_ylim())))
         finish(axes, "upper right")
-    _correlation(own, left, left, range(1, LAGS + 1), "with itself, later by [rows]")
+    _correlation(autocorrelation, left, left, range(1, LAGS + 1), "with itself, later by [rows]")
     command = np.where(inside, np.gradient(depth, axis=0), np.nan)
     _correlation(cross, command, left, range(EARLIER, LATER + 1), "with the speed before, by [rows]")
     return figure
@@ -175,22 +176,22 @@ def residuals(contact: ContactFit) -> Figure:
 
 @matplotlib.style.context("default")
 def compare(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Every estimate's 95 % interval and the prior's value, over the estimate."""
-    plain = [one for one in entries if one["std"] and abs(one["value"]) > PLAINLY * one["std"]]
+    """Plot every estimate's 95 % interval and the prior's value, relative to the estimate."""
+    plain = [entry for entry in entries if entry["std"] and abs(entry["value"]) > PLAINLY * entry["std"]]
     figure = new_figure((9, 1.7 + 0.3 * max(len(plain), 1)), "Estimates, and what the prior said", above=0.9)
     figure.subplots_adjust(left=0.34)
     axes = figure.subplots()
-    for row, one in enumerate(plain):
-        share = [100.0 * (one[name] / one["value"] - 1.0) for name in ("low", "high")]
+    for row, estimate in enumerate(plain):
+        share = [100.0 * (estimate[name] / estimate["value"] - 1.0) for name in ("low", "high")]
         axes.plot(share, [row, row], color=BLUE, linewidth=3, label="estimate, 95 %" if row == 0 else None)
         axes.plot([0.0], [row], color=BLUE, marker="o", markersize=5)
-    told = [(row, one) for row, one in enumerate(plain) if one["prior"] is not None]
-    if told:
-        shares = [100.0 * (one["prior"] / one["value"] - 1.0) for _, one in told]
+    with_prior = [(row, entry) for row, entry in enumerate(plain) if entry["prior"] is not None]
+    if with_prior:
+        shares = [100.0 * (entry["prior"] / entry["value"] - 1.0) for _, entry in with_prior]
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}
-        axes.plot(shares, [row for row, _ in told], label="prior", **style)
-    names = [f"{one['key']}\n{one['value']:.4g} {one['unit']}".removesuffix(" 1") for one in plain]
-    # A key is text, not a formula.
+        axes.plot(shares, [row for row, _ in with_prior], label="prior", **style)
+    names = [f"{entry['key']}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1") for entry in plain]
+    # Matplotlib would read text between dollar signs as a formula.
     axes.set_yticks(range(len(plain)), [name.replace("$", r"\$") for name in names])
     axes.tick_params(axis="y", labelsize=7)
     axes.set(xlabel="distance from the estimate [%]", ylim=(len(plain) - 0.5, -0.5))
@@ -217,22 +218,25 @@ def _name(motion: FreeMotion) -> str:
 
 
 def _distortions(motion: FreeMotion) -> list[float]:
-    """Levels of odd and even distortion, the largest of the runs; 0 where none was measured."""
+    """Return the levels of odd and even distortion, the largest of the runs; 0 if none was measured."""
     return [
-        max((level for one in motion.spectra if (level := getattr(one, parity)) is not None), default=0.0)
+        max(
+            (level for run in motion.spectra if (level := getattr(run, parity)) is not None),
+            default=0.0,
+        )
         for parity in ("odd", "even")
     ]
 
 
 def _modelled(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [m] when each force was, and the best fit's force [N], (rows, touches)."""
+    """Return the depth [m] at the time of each force and the force of the best fit [N], (rows, lanes)."""
     at, plane, inner = contact.posterior.best
     problem = contact.problem
     return problem.motion.at(at)[0] - plane, problem.force(at, plane, inner.coefficients)
 
 
 def _shown(contact: ContactFit, inside: np.ndarray) -> list[int]:
-    """Touches of the least, the middle and the greatest force, of those with rows in contact."""
+    """Return the contacts with the least, the median and the greatest peak force."""
     lanes = np.flatnonzero(inside.any(axis=0))
     peak = np.max(np.where(inside, contact.readings.force, 0.0), axis=0)[lanes]
     order = lanes[np.argsort(peak, kind="stable")]
@@ -240,19 +244,19 @@ def _shown(contact: ContactFit, inside: np.ndarray) -> list[int]:
     return list(dict.fromkeys(order[places].tolist())) if len(order) else []
 
 
-def _correlation(axes: Axes, one: np.ndarray, other: np.ndarray, lags: range, words: str) -> None:
-    """Of `one` with `other` so many rows later, all lanes together, with what chance does."""
-    found, chance = [], []
+def _correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, words: str) -> None:
+    """Plot the correlation of `x` with `y` at each lag [rows], with its 95 % band for white noise."""
+    values, chance = [], []
     for lag in lags:
-        early, late = slice(max(0, -lag), len(one) - max(0, lag)), slice(max(0, lag), len(one) - max(0, -lag))
-        a, b = one[early], other[late]
-        both = np.isfinite(a) & np.isfinite(b)
-        power = np.sqrt(np.sum(a[both] ** 2) * np.sum(b[both] ** 2))
-        found.append(np.sum(a[both] * b[both]) / power if power > 0.0 else 0.0)
-        chance.append(WIDE / np.sqrt(max(both.sum(), 1)))
+        early, late = slice(max(0, -lag), len(x) - max(0, lag)), slice(max(0, lag), len(x) - max(0, -lag))
+        a, b = x[early], y[late]
+        both_finite = np.isfinite(a) & np.isfinite(b)
+        power = np.sqrt(np.sum(a[both_finite] ** 2) * np.sum(b[both_finite] ** 2))
+        values.append(np.sum(a[both_finite] * b[both_finite]) / power if power > 0.0 else 0.0)
+        chance.append(WIDE / np.sqrt(max(both_finite.sum(), 1)))
     axes.fill_between(list(lags), -np.array(chance), chance, color=SKY, alpha=0.4, linewidth=0, label="95 %")
-    axes.plot(list(lags), found, color=BLUE, linewidth=1, marker="o", markersize=2.5, label="correlation")
-    most = 1.6 * max(*chance, *np.abs(found))  # the legend above
+    axes.plot(list(lags), values, color=BLUE, linewidth=1, marker="o", markersize=2.5, label="correlation")
+    most = 1.6 * max(*chance, *np.abs(values))  # leaves space for the legend
     axes.set_ylim(-most, most)
     axes.set(xlabel=words, ylabel="correlation of what is left [1]")
     finish(axes, "upper right")

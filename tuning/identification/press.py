@@ -1,7 +1,7 @@
-"""Surface of a contact that a press never leaves: only the force sensor's bias at rest tells where it is.
+"""Surface position of a press that never leaves the contact, from the force sensor's bias.
 
-Within a contact that is never left, a bias b and a surface that is b / K further away read the same. A run at
-rest, or free of contact, tells the bias. Without one the surface is not observable.
+Within such a contact, a bias b and a surface that is further away by b / K have the same readings. A run at
+rest or in free motion determines the bias. Without one the surface is not observable.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise
 from tuning.identification.records import Run
 
-USUAL_DELAY = 0.005  # s, of a force sensor, near enough to see whether a press leaves the contact
-LOWEST = 0.01  # share of the rows, those least deep, where a press would have left the contact
-FEWEST = 20  # rows
-LEFT = 0.2  # of the range of the force, by which it is above the line through deeper readings there
-LASTING = 0.1  # of the noise, by which the bias may differ from run to run at least
+USUAL_DELAY = 0.005  # s, typical delay of a force sensor, accurate enough to detect a release
+LOWEST = 0.01  # share of the least deep rows, at which a press may leave the contact
+FEWEST = 20  # rows for a mean
+LEFT = 0.2  # share of the range of the force above the line through deeper readings: release
+LASTING = 0.1  # least standard deviation of the bias from run to run, over the noise
 
 
 def known_bias(
     runs: Sequence[Run], motion: Motion, noise: Noise | None, plane: float | None
 ) -> tuple[float, float] | None:
-    """Return bias of the force sensor and its standard deviation [N], where the runs cannot tell it.
+    """Return the bias of the force sensor and its standard deviation [N] if the runs cannot determine it.
 
     Args:
         runs: Runs in contact.
         motion: Motion of the mechanism in these runs.
-        noise: Readings of the force sensor at rest, if there are any.
+        noise: Noise of the force sensor at rest, if it was measured.
         plane: Position of the surface [m], if it is specified.
 
     Returns:
-        None if a run leaves the contact, or if the surface is specified: the readings then tell the bias.
+        None if a run leaves the contact or the surface is specified; the readings then determine the bias.
 
     Raises:
-        InputError: If neither the runs nor readings at rest tell it.
+        InputError: If neither the runs nor readings at rest determine the bias.
     """
     if plane is not None or any(run.kind != "press" for run in runs) or _leaves(runs, motion):
         return None
@@ -54,14 +54,17 @@ def known_bias(
 def first_plane(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return where the line through the forces of a press meets the bias [m]; None if it does not rise."""
+    """Return the position [m] at which the line through the forces of a press equals the bias.
+
+    Returns None if the line does not rise.
+    """
     x, f = position[counts], force[counts] - bias[0]
     slope, at_zero = _line(x, f)
     return -at_zero / slope if slope > 0.0 else None
 
 
 def _leaves(runs: Sequence[Run], motion: Motion) -> bool:
-    """Return whether the least deep readings are above the line through deeper ones, as those outside are."""
+    """Return whether the least deep readings lie above the line through deeper ones: a release."""
     position, _ = motion.at(USUAL_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):
@@ -80,7 +83,7 @@ def _leaves(runs: Sequence[Run], motion: Motion) -> bool:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return slope and value at 0 of the line through points."""
+    """Return slope and value at 0 of the least-squares line through points."""
     away = x - np.mean(x)
     power = float(away @ away)
     slope = float(away @ y) / power if power else 0.0

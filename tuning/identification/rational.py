@@ -1,12 +1,12 @@
 """Motion simulators as products of first- and second-order sections with a delay, fitted to spectra.
 
-    H(s) = g N(s) e^{-s tau} / (prod (1 + T s) prod (1 + 2 zeta s/w + s^2/w^2)),  N = 1 + c1 s + c2 s^2
+    H(s) = N(s) e^{-s tau} / (prod (1 + T s) prod (1 + 2 zeta s/w + s^2/w^2)),  N = 1 + c1 s + c2 s^2
 
-Time constants, natural frequencies and damping ratios enter as logarithms, so that they stay positive and
-the model stays stable. The maximum likelihood fit weighs every line by its noise (Pintelon and Schoukens,
-System Identification: A Frequency Domain Approach, 2012); since the hold is part of the model, a fit's
-covariance is that of the rig's own numbers. Starts are linear fits over a grid of delays (Sanathanan and
-Koerner 1963), so that nobody has to guess. NumPy and SciPy alone.
+Time constants, natural frequencies and damping ratios are fitted as logarithms, so that they remain positive
+and the model stable. The maximum likelihood fit weights every line by its noise (Pintelon and Schoukens,
+System Identification: A Frequency Domain Approach, 2012). The model includes the hold, so the covariance of a
+fit refers to the parameters of the rig itself. Linear fits over a grid of delays give the starting values
+(Sanathanan and Koerner 1963). Only NumPy and SciPy are used.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
-SHORTEST = 1e-6  # s, of a start's time constants
+SHORTEST = 1e-6  # s, least time constant
 
 
 @dataclass(frozen=True)
 class Structure:
-    """How many sections of each kind a model has."""
+    """Numbers of sections of each kind in a model."""
 
     name: str
     first: int  # sections 1 + T s
@@ -39,7 +39,7 @@ class Structure:
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay among them."""
+        """Return the number of parameters, delay included."""
         return self.order + self.zeros + 1
 
 
@@ -56,23 +56,23 @@ STRUCTURES = (
 
 @dataclass(frozen=True)
 class Lines:
-    """Spectra at the excited lines, and how the command became the drives' input."""
+    """Spectra at the excited lines, and the conversion of the command to the drives' input."""
 
     frequency: np.ndarray  # Hz
     command: np.ndarray  # complex
     output: np.ndarray  # complex, in the command's unit
     std: np.ndarray  # of the output's complex noise: E|n|^2 = std^2
-    period: float  # s, of control
-    hold: str
-    latency: int
+    period: float  # s, control period
+    hold: str  # "zoh" or "linear"
+    latency: int  # periods
     shift: int = 0  # periods by which readings lag the command of their row
 
     @cached_property
     def copies(self) -> tuple[np.ndarray, np.ndarray]:
-        """s of every copy of each line, and what the hold makes of the command there."""
-        every = holds.frequencies(self.frequency, self.period)
-        return 2j * np.pi * every, self.command * holds.response(
-            every, self.period, self.hold, self.latency, self.shift
+        """Return s of every copy of each line, and the command there after the hold."""
+        frequencies = holds.frequencies(self.frequency, self.period)
+        return 2j * np.pi * frequencies, self.command * holds.response(
+            frequencies, self.period, self.hold, self.latency, self.shift
         )
 
     def __len__(self) -> int:
@@ -81,14 +81,14 @@ class Lines:
 
 @dataclass(frozen=True)
 class Model:
-    """A structure with its numbers: [log T ..., log w, log zeta ..., c ..., delay]."""
+    """Structure with its parameters: [log T ..., log w, log zeta ..., c ..., delay]."""
 
     structure: Structure
     parameters: np.ndarray
 
     @property
     def delay(self) -> float:
-        """Transport delay [s]."""
+        """Return the transport delay [s]."""
         return float(self.parameters[-1])
 
     @property
@@ -101,7 +101,7 @@ class Model:
 
     @cached_property
     def sections(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """N and the denominator's sections, coefficients in ascending powers of s."""
+        """Return N and the sections of the denominator, coefficients in ascending powers of s."""
         many, values = self.structure, np.asarray(self.parameters, float)
         parts = [np.array([1.0, time]) for time in np.exp(values[: many.first])]
         for w, zeta in np.exp(values[many.first : many.order]).reshape(-1, 2):
@@ -110,7 +110,7 @@ class Model:
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numerator and denominator in descending powers of s, as mechanism files have them."""
+        """Return numerator and denominator in descending powers of s, as in mechanism files."""
         numerator, parts = self.sections
         denominator = np.array([1.0])
         for part in parts:
@@ -118,12 +118,12 @@ class Model:
         return numerator[::-1], denominator[::-1]
 
     def response(self, s: np.ndarray) -> np.ndarray:
-        """H(s), the delay included."""
+        """Return H(s), delay included."""
         numerator, denominator = self.fraction
         return np.polyval(numerator, s) / np.polyval(denominator, s) * np.exp(-s * self.delay)
 
     def slopes(self, s: np.ndarray) -> np.ndarray:
-        """d log H / d parameter, shape (parameters, *s)."""
+        """Return d log H / d parameter, shape (parameters, *s)."""
         numerator, parts = self.sections
         many, rows = self.structure, []
         for part in parts[: many.first]:
@@ -136,12 +136,12 @@ class Model:
         return np.array([*rows, -s])
 
     def predict(self, lines: Lines) -> np.ndarray:
-        """The output's spectrum."""
+        """Return the spectrum of the output."""
         s, command = lines.copies
         return np.sum(self.response(s) * command, axis=0)
 
     def bandwidth(self) -> float:
-        """Lowest frequency [Hz] at which |H| has fallen by 3 dB; inf for an ideal simulator."""
+        """Return the lowest frequency [Hz] at which |H| has fallen by 3 dB; inf for an ideal simulator."""
         if self.structure.order == 0:
             return np.inf
         poles = np.abs(np.roots(self.fraction[1]))
@@ -159,15 +159,15 @@ class Model:
 
 @dataclass(frozen=True)
 class Fit:
-    """A model fitted to lines."""
+    """Model fitted to lines."""
 
     model: Model
-    covariance: np.ndarray  # of the parameters, by curvature at the noise the lines state
+    covariance: np.ndarray  # of the parameters, from the curvature at the stated noise
     residual: np.ndarray  # complex, whitened: E|r|^2 = 1
 
     @property
     def chi2(self) -> float:
-        """Sum of squared residuals over half their variance: as many degrees of freedom as real numbers."""
+        """Return chi-squared, with as many degrees of freedom as real numbers in the residual."""
         return float(2.0 * np.sum(np.abs(self.residual) ** 2))
 
     @property
@@ -180,18 +180,19 @@ class Fit:
 
 
 def fit(structure: Structure, lines: Lines) -> Fit:
-    """The maximum likelihood fit: the best of the linear starts, then Levenberg-Marquardt."""
+    """Return the maximum likelihood fit, by Levenberg-Marquardt from the best linear start."""
     candidates = sorted((_start(structure, lines, delay) for delay in _delays(lines)), key=lambda c: c[0])
-    # Neighbours on the grid of delays end at the same place; the runner-up far away may not.
+    # Neighbouring starts converge to the same minimum; the best start with a distant delay may not.
     tried = [_refine(structure, candidates[0][1], lines)]
     for _, start in candidates[1:]:
         if structure.order > 1 and abs(start[-1] - candidates[0][1][-1]) > 2.0 * lines.period:
             tried.append(_refine(structure, start, lines))
             break
-    return min(tried, key=lambda one: one.chi2)
+    return min(tried, key=lambda candidate: candidate.chi2)
 
 
 def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
+    """Return the fit that Levenberg-Marquardt reaches from a start."""
     s, command = lines.copies
     scale = np.sqrt(2.0) / lines.std
 
@@ -208,19 +209,19 @@ def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
 
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         solve: Any = optimize.least_squares
-        found = solve(residual, start, jacobian, method="lm", x_scale="jac", max_nfev=80)
-    curvature = found.jac.T @ found.jac
+        result = solve(residual, start, jacobian, method="lm", x_scale="jac", max_nfev=80)
+    curvature = result.jac.T @ result.jac
     scales = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
         scales, scales
     )
-    half, parameters = len(lines), _with_slow_poles(structure, found.x)
+    half, parameters = len(lines), _with_slow_poles(structure, result.x)
     left = residual(parameters)
     return Fit(Model(structure, parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0))
 
 
 def _with_slow_poles(structure: Structure, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters with poles beyond 1/SHORTEST moved there: no line tells how fast they are."""
+    """Return the parameters with unresolvable poles, those beyond 1/SHORTEST, moved there."""
     first, order = structure.first, structure.order
     times = np.maximum(parameters[:first], np.log(SHORTEST))
     sections = []
@@ -237,7 +238,7 @@ def _with_slow_poles(structure: Structure, parameters: np.ndarray) -> np.ndarray
 
 
 def _delays(lines: Lines) -> np.ndarray:
-    """A grid of delays [s] from 0 to what the phase of the lowest lines allows."""
+    """Return a grid of delays [s] from 0 to the largest one that the phase of the lowest lines allows."""
     s, command = lines.copies
     middle = len(s) // 2
     phase = np.unwrap(np.angle(lines.output / command[middle]))
@@ -250,7 +251,7 @@ def _delays(lines: Lines) -> np.ndarray:
 
 
 def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.ndarray]:
-    """Chi-squared and parameters of the linear fit with that delay, without the copies."""
+    """Return chi-squared and parameters of the linear fit with a given delay, without the copies."""
     s, command = lines.copies
     s, command = s[len(s) // 2], command[len(s) // 2]
     unit = 1.0 / np.abs(s).mean()
@@ -280,7 +281,7 @@ def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.
 
 
 def _sections(structure: Structure, denominator: np.ndarray, unit: float) -> list[float]:
-    """Logarithms of the sections' numbers, from a denominator in ascending powers of s `unit`."""
+    """Return the logarithms of the sections' parameters, from a denominator in rising powers of s `unit`."""
     roots = polynomial.polyroots(denominator)
     poles = np.where(roots.real > 0.0, -roots.conj(), roots) / unit
     poles = np.where(np.abs(poles) > 1.0 / SHORTEST, poles / np.abs(poles) / SHORTEST, poles)
@@ -291,8 +292,8 @@ def _sections(structure: Structure, denominator: np.ndarray, unit: float) -> lis
         values.append(-np.log(max(real.pop(), 1e-6) if real else abs(complex_ones[0])))
     pairs = [(abs(pole), max(-pole.real / abs(pole), 1e-3)) for pole in complex_ones]
     while len(real) > 1:
-        one, other = max(real.pop(), 1e-6), max(real.pop(), 1e-6)
-        pairs.append((np.sqrt(one * other), (one + other) / (2.0 * np.sqrt(one * other))))
+        first, second = max(real.pop(), 1e-6), max(real.pop(), 1e-6)
+        pairs.append((np.sqrt(first * second), (first + second) / (2.0 * np.sqrt(first * second))))
     while len(pairs) < structure.second:
         pairs.append((1.0 / unit, 1.0))
     for w, zeta in sorted(pairs)[: structure.second]:

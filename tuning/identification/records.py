@@ -1,8 +1,7 @@
-"""What readers of logs hand to the estimates: runs on a grid of ticks, and which tick's numbers a row holds.
+"""Records of a campaign: runs on the grid of control periods, and the timing of commands and readings.
 
-Everything is in SI units and in the signs of the model (`notebooks/guide/model.md`, section 1): positions
-grow towards the hardware, a force that pushes back is positive. A row that was lost has NaN for what sensors
-read.
+All values are in SI units and have the signs of the model (`notebooks/guide/model.md`, section 1): positions
+increase towards the hardware, and a repelling force is positive. Sensor readings of a lost row are NaN.
 """
 
 from __future__ import annotations
@@ -15,28 +14,28 @@ import numpy as np
 Kind = Literal["free", "press", "tap", "contact", "rest"]
 Hold = Literal["zoh", "linear"]
 Row = Literal["tick", "sent", "after"]
-# Ticks by which the logged readings lag the logged command by the way a row is written: "sent" rows hold the
-# command of the next tick, "after" rows the readings of the next one.
-UNNAMED = "identified"  # name of a mechanism that no prior names
+UNNAMED = "identified"  # name of an identified mechanism without a prior
+# Ticks by which the readings of a row lag its command: a "sent" row holds the command of the next tick, an
+# "after" row the readings of the next tick.
 ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 
 
 @dataclass(frozen=True)
 class Clock:
-    """What the stamps of a run say of its clock; a log without stamps has a perfect one."""
+    """Clock of a run's time stamps; a log without stamps has a perfect clock."""
 
-    period: float  # s, between ticks by the stamps
-    drift: float  # ppm, by which that is longer than the control period
+    period: float  # s, control period measured by the stamps
+    drift: float  # ppm, excess of that period over the nominal control period
     jitter: float  # s, standard deviation of the stamps about the ticks
-    lost: int  # rows
+    lost: int  # number of missing rows
 
 
 @dataclass(frozen=True)
 class Run:
-    """One stretch of a log; every array has one entry a row, rows that were lost included."""
+    """Segment of a log; every array has one entry per row, lost rows included."""
 
-    kind: Kind  # what was done
-    source: str  # name of the file it was read from
+    kind: Kind  # kind of experiment
+    source: str  # name of the log file
     tick: np.ndarray  # int64, control period in which the row was written
     time_stamp_error: float  # s, standard deviation of the stamps about the ticks
     position_desired: np.ndarray  # m
@@ -44,30 +43,31 @@ class Run:
     force_measured: np.ndarray | None  # N
     velocity_desired: np.ndarray | None  # m/s
     force_command: np.ndarray | None  # N
-    valid: np.ndarray  # bool, False where the row was lost or rebuilt: its residual does not count
-    contact_index: np.ndarray | None  # int64, which entry of the contact lists is met; -1 for none
-    speed: float | None  # m/s, of the approach, where the log tells it
-    begin: float = 0.0  # s, of tick 0 by the stamps
-    force_late: np.ndarray | None = None  # s, by which forces were read later than their rows
+    valid: np.ndarray  # bool, False if the row was lost or rebuilt: its residual is not used
+    contact_index: np.ndarray | None  # int64, entry of the mechanism's contact lists; -1: no contact
+    speed: float | None  # m/s, approach speed; None if unknown
+    begin: float = 0.0  # s, time of tick 0 by the stamps
+    force_late: np.ndarray | None = None  # s, time from a row to the reading of its force
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When a command acts and when a row was read: told, never estimated."""
+    """Timing of commands and readings; it is specified by the user, never estimated."""
 
     control_period: float  # s
-    command_hold: Hold  # what the drives do between ticks
-    command_latency: int  # periods
-    row: Row  # of a tick; "sent": with the next tick's command, "after": with the next tick's readings
-    clock: Clock | None = None  # that of the run whose stamps scatter most
-    computing_delay: int = 0  # periods from a reading to the command that answers it
-    two_clocks: bool = False  # whether forces were logged by a clock of their own
+    command_hold: Hold  # motion of the drives' input between ticks
+    command_latency: int  # periods until a command takes effect
+    row: Row  # convention; "sent": with the next tick's command, "after": with the next tick's readings
+    clock: Clock | None = None  # clock of the run with the largest jitter
+    computing_delay: int = 0  # periods from a reading to the command that depends on it
+    two_clocks: bool = False  # whether the forces were logged with a separate clock
 
     @property
     def shift(self) -> int:
-        """Periods by which a row's readings lag its command and that are no delay of the motion.
+        """Return the periods by which readings lag the command of their row without the motion.
 
-        A controller that answers late is to the loop what a motion is that begins late."""
+        For the loop, a computing delay has the same effect as a motion that starts later.
+        """
         return ROW_SHIFT[self.row] - self.computing_delay
 
 
@@ -77,7 +77,7 @@ class Campaign:
 
     runs: tuple[Run, ...]
     timing: Timing
-    equivalent_mass: float  # kg, of the numerical model
-    sources: dict[str, str] = field(default_factory=dict)  # SHA-256 of each file, in hex
-    notes: tuple[str, ...] = ()  # what readers wondered about
-    integrator: str | None = None  # of the numerical model, where the logs or a prior tell it
+    equivalent_mass: float  # kg, equivalent mass of the numerical model
+    sources: dict[str, str] = field(default_factory=dict)  # SHA-256 of each file by its name, in hex
+    notes: tuple[str, ...] = ()  # remarks about the logs, from reading them
+    integrator: str | None = None  # integrator of the numerical model; None if unknown

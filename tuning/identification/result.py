@@ -1,4 +1,4 @@
-"""What an identification found: numbers, their uncertainty, how they hang together, whether to trust them."""
+"""Result of an identification: estimates, their uncertainty and correlation, and the verdict."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.noise import Noise
 from tuning.identification.validation import Line
 
-UNCERTAINTY = "uncertainty of the numbers"  # name of its line
-CONFOUNDED = 0.95  # magnitude of a correlation from which two numbers are told apart badly
+UNCERTAINTY = "uncertainty of the numbers"  # name of a check
+CONFOUNDED = 0.95  # magnitude of a correlation, above which two parameters are confounded
 
 PRESS = "a press run with a multisine to 45 Hz"
 WIDER = "a multisine to 1.5 times the bandwidth or more"
-# What would separate a pair, by the keys in it.
+# Experiments that separate a pair of parameters, by its keys.
 EXPERIMENTS = {
     ("rig.force_sensor.delay", "contact.damping"): PRESS,
     ("rig.force_sensor.time_constant", "contact.damping"): PRESS,
@@ -35,30 +35,30 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """One number of the mechanism file."""
+    """Estimate of one parameter of the mechanism file."""
 
-    key: str  # dotted path, with the entry's number behind a list's
+    key: str  # dotted path; for an entry of a list it ends in the index
     value: float
-    std: float  # in the key's unit; 0 where it was told
-    low: float  # 95 % interval
-    high: float
+    std: float  # in the key's unit; 0 if it was specified
+    low: float  # lower end of the 95 % interval
+    high: float  # upper end
     unit: str
-    told: bool = False  # by the prior or the caller, not by the logs
+    told: bool = False  # whether the prior or the caller specified it
 
 
 @dataclass(frozen=True)
 class Identification:
-    """All that was found."""
+    """Complete result of an identification."""
 
     estimates: tuple[Estimate, ...]
-    draws: np.ndarray  # (draws, estimates that were not told), in their order
-    combinations: tuple[Estimate, ...]  # sums and products that the logs tell better than their parts
-    confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, what separates
+    draws: np.ndarray  # (draws, estimates that were not specified), in their order
+    combinations: tuple[Estimate, ...]  # combinations that the logs determine better than their parts
+    confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, separating experiment
     lines: tuple[Line, ...]
-    mechanism: dict[str, Any] | None  # as a mechanism file has it; None where something is missing
-    limit: float  # on e, and on e - e*, of all effects together
+    mechanism: dict[str, Any] | None  # content of a mechanism file; None if something is missing
+    limit: float  # largest allowed sum of effects, on e and on e - e*
     notes: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()  # what neither logs nor prior tell, and the run that would
+    missing: tuple[str, ...] = ()  # parameters in neither logs nor prior, each with a suitable run
     motion: FreeMotion | None = field(default=None, repr=False)
     contact: ContactFit | None = field(default=None, repr=False)
     force_noise: Noise | None = field(default=None, repr=False)
@@ -66,24 +66,24 @@ class Identification:
 
     @property
     def effect(self) -> float:
-        """On e, of all defects that are there and of what the numbers may be off by."""
+        """Return the effect on e of all detected defects and of the parameters' uncertainty."""
         return float(sum(line.counted for line in self.lines))
 
     @property
     def effect_on_error(self) -> float:
-        """On e - e*, of the same."""
+        """Return the effect on e - e* of the same."""
         return float(sum(line.counted_error for line in self.lines))
 
     @property
     def good(self) -> bool:
-        """Tell whether both effects are below the limit, and something was checked."""
+        """Return whether both effects are below the limit and at least one check was made."""
         return not self.missing and bool(self.lines) and max(self.effect, self.effect_on_error) < self.limit
 
     @property
     def worst(self) -> Line | None:
-        """The line with the largest effect, if any counts."""
-        there = [line for line in self.lines if line.there and line.counts]
-        return max(there, key=lambda line: max(line.counted, line.counted_error), default=None)
+        """Return the line with the largest effect, or None."""
+        present = [line for line in self.lines if line.there and line.counts]
+        return max(present, key=lambda line: max(line.counted, line.counted_error), default=None)
 
     @property
     def verdict(self) -> str:
@@ -104,24 +104,24 @@ class Identification:
                 f"Bad: the numbers are too uncertain: {worst.finding}; "
                 f"all together {change}, allowed below {self.limit:g}"
             )
-        place = f" ({worst.where})" if worst.where else ""
+        location = f" ({worst.where})" if worst.where else ""
         return (
-            f"Bad: the model does not explain this rig: {worst.name}{place}: {worst.finding}; "
+            f"Bad: the model does not explain this rig: {worst.name}{location}: {worst.finding}; "
             f"all defects {change}, allowed below {self.limit:g}"
         )
 
     def __getitem__(self, key: str) -> Estimate:
-        """The estimate of a key, or of a combination by its name."""
-        for one in (*self.estimates, *self.combinations):
-            if one.key == key:
-                return one
+        """Return the estimate of a key, or of a combination by its name."""
+        for estimate in (*self.estimates, *self.combinations):
+            if estimate.key == key:
+                return estimate
         raise KeyError(key)
 
 
 def confounded(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, float, str], ...]:
-    """The pairs that the logs hardly tell apart, and the experiment that would."""
+    """Return the pairs that the logs hardly separate, their correlation, and a suitable experiment."""
     moving = np.ptp(draws, axis=0) > 0.0
-    keys, draws = [key for key, one in zip(keys, moving, strict=True) if one], draws[:, moving]
+    keys, draws = [key for key, varies in zip(keys, moving, strict=True) if varies], draws[:, moving]
     if len(keys) < 2:
         return ()
     correlation = np.corrcoef(draws.T)
@@ -134,6 +134,6 @@ def confounded(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, floa
 
 
 def experiment(one: str, other: str) -> str:
-    """Return the experiment that separates two numbers, entries of lists by their keys."""
+    """Return the experiment that separates two parameters; indices of list entries are ignored."""
     one, other = (key.rstrip("0123456789").rstrip(".") for key in (one, other))
     return EXPERIMENTS.get((one, other)) or EXPERIMENTS.get((other, one), "longer runs, or wider ones")

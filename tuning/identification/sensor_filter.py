@@ -1,7 +1,8 @@
-"""A force sensor's first-order lag over one control period, in closed form.
+"""First-order lag of a force sensor over one control period, in closed form.
 
-The lag integrates the force between two readings. Where the force is smooth a parabola through both ends and
-the middle stands for it; where contact begins in between, a damped force jumps, and the part before is 0.
+The lag integrates the force between two readings. A smooth force is approximated by the parabola through its
+values at both ends and in the middle. At an onset of damped contact the force jumps; before the onset it is
+0.
 """
 
 from __future__ import annotations
@@ -10,8 +11,16 @@ import numpy as np
 
 
 def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
-    """What a lag keeps of itself over a period, and the weights of the force at the end, the middle and the
-    beginning of the period; exact where the force is a parabola. `rate`: period over the time constant."""
+    """Return the pole of a sampled first-order lag and the weights of the force in a period.
+
+    The weights are exact if the force is a parabola.
+
+    Args:
+        rate: Control period over the time constant.
+
+    Returns:
+        The pole, and the weights of the force at the end, in the middle and at the beginning of the period.
+    """
     pole = float(np.exp(-rate))
     # Moments of rate exp(-(1 - s) rate) over s = 0..1.
     first = 1.0 - pole
@@ -24,16 +33,25 @@ def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
 
 
 def onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the force just after contact began and at the end of the period, of a force that is 0 before
-    and a line after; `left`: share of the period that was left then."""
-    whole = -np.expm1(-rate * left)
-    end = 1.0 - whole / (rate * left)
-    return whole - end, end
+    """Return the weights of the force just after an onset and at the end of the period.
+
+    The force is 0 before the onset and linear in time after it.
+
+    Args:
+        rate: Control period over the time constant.
+        left: Shares of the period that remain after the onset.
+    """
+    total = -np.expm1(-rate * left)
+    end = 1.0 - total / (rate * left)
+    return total - end, end
 
 
 def onsets(last: np.ndarray, half: np.ndarray, now: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Share of the period left when the position passed the plane, 0 where it did not: positions [m] at the
-    beginning, in the middle and at the end of the period, and lines between them."""
+    """Return the share of the period after the position crosses the surface; 0 without a crossing.
+
+    `last`, `half` and `now` are positions [m] at the beginning, in the middle and at the end of the period,
+    with linear motion between them.
+    """
     late = half <= plane
     start, stop = np.where(late, half, last), np.where(late, now, half)
     with np.errstate(divide="ignore", invalid="ignore"):

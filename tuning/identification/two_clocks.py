@@ -1,9 +1,9 @@
-"""Forces that were logged by a clock of their own: how fast it is, from touches that lie apart in time.
+"""Rate of a separate force clock relative to the drives' clock, from contacts at different times.
 
-A constant between two clocks cannot be told from the force sensor's delay. A rate can: the time by which
-forces come after the motion then grows from touch to touch. It is followed in two steps, since over hours
-clocks part by more than the longest delay that is looked for: first by the middle of each touch's forces
-after its deepest place, then by what a law fitted to all touches leaves of each.
+A constant offset between the clocks cannot be separated from the force sensor's delay. A rate can: the time
+between motion and force then grows from contact to contact. Over hours the clocks diverge by more than the
+longest delay of a search. So the rate is estimated in two steps: first from the mean time of each contact's
+force after its deepest point, then from the residuals of a law fitted to all contacts.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from tuning.identification.motion import Motion
 from tuning.identification.rational import Model
 from tuning.identification.records import Run, Timing
 
-FEWEST = 3  # touches
-LOUD = 5.0  # standard deviations of the noise, beyond which a force is one
-MIDDLE = 0.5 * LONGEST  # s, where the delay is brought that clocks make meaningless
-STEP = 2.5e-4  # s, of differences by the delay
-ROUNDS = 6
-CLOSE = 1e-6  # s, of all touches: a step below it is the last one
+FEWEST = 3  # contacts
+LOUD = 5.0  # standard deviations of the noise, above which a force is detected
+MIDDLE = 0.5 * LONGEST  # s, delay that the data are shifted to, since the offset of the clocks is arbitrary
+STEP = 2.5e-4  # s, step of finite differences by the delay
+ROUNDS = 6  # iterations of law and rate
+CLOSE = 1e-6  # s, over all contacts; a smaller step ends the iteration
 UNTOLD = 'timing.clock: found "separate", allowed "stamps" or "index" where a mechanism is told'
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Of the forces' clock against the drives'."""
+    """Drift of the forces' clock relative to the drives' clock."""
 
-    rate: float  # seconds that it gains a second
-    std: float  # of the rate
-    late: np.ndarray  # s, what it adds to the delay of each run, up to a constant
+    rate: float  # s/s, time that the forces' clock gains
+    std: float  # standard deviation of the rate
+    late: np.ndarray  # s, delay that it adds in each run, up to a constant
 
 
 def refuse(timing: Timing) -> None:
-    """Raises `InputError` for logs of two clocks: what their constant is nobody knows."""
+    """Raise `InputError` for logs with two clocks, because their constant offset is unknown."""
     if timing.two_clocks:
         raise InputError(UNTOLD)
 
@@ -54,14 +54,18 @@ def drift(
     law: Law | str | None,
     plane: float | None,
 ) -> Drift:
-    """By the trend of the touches' times. Raises `InputError` for too few touches, or all at one time."""
+    """Return the drift of the forces' clock from the trend of the contacts' times.
+
+    Raises:
+        InputError: If there are too few contacts, or all at one time.
+    """
     period, longest = timing.control_period, LONGEST + timing.control_period
     time = np.array([run.begin + period * run.tick[len(run.tick) // 2] for run in runs])
     touches = np.array([run.kind in ("contact", "tap") for run in runs])
     if touches.sum() < FEWEST or not np.ptp(time[touches]):
-        found = f"{touches.sum()} touches within {np.ptp(time[touches]) if touches.any() else 0:g} s"
+        finding = f"{touches.sum()} touches within {np.ptp(time[touches]) if touches.any() else 0:g} s"
         allowed = f"{FEWEST} apart by their stamps"
-        raise InputError(f'timing.clock: found "separate" and {found}, allowed {allowed}')
+        raise InputError(f'timing.clock: found "separate" and {finding}, allowed {allowed}')
     time = time - time.mean()
     late = _roughly(Motion(model, runs, timing, longest), readings, time, touches)
     rate = std = 0.0
@@ -70,8 +74,8 @@ def drift(
         if not isinstance(law, Law):
             law = judge(motion, readings, plane, None if law is None else (law,))[0].law
         problem = Problem(motion, readings, law, plane)
-        delay, place, _ = quick(problem)
-        off, variance = differences(problem, delay, place, problem.at(delay, place).coefficients)
+        delay, surface, _ = quick(problem)
+        off, variance = differences(problem, delay, surface, problem.at(delay, surface).coefficients)
         step, std = slope(off, 1.0 / variance, time)
         late = late + step * time
         if abs(step) * np.ptp(time) < CLOSE:
@@ -84,7 +88,7 @@ def drift(
 
 
 def _roughly(motion: Motion, readings: Readings, time: np.ndarray, touches: np.ndarray) -> np.ndarray:
-    """What the clock adds to the delay of each run, by the middle of its force after its deepest place."""
+    """Return the delay that the clock adds to each run [s], from the mean time of its force."""
     level = np.median(readings.force[readings.counts])
     above = np.where(readings.counts, np.abs(readings.force - level), 0.0)
     weight = np.where(above > LOUD * readings.std, above, 0.0) ** 2
@@ -101,25 +105,25 @@ def _roughly(motion: Motion, readings: Readings, time: np.ndarray, touches: np.n
 def differences(
     problem: Problem, delay: float, plane: float, coefficients: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the readings of each run come later than by these numbers [s], and the variance of that.
+    """Return the delay of each run's readings beyond these parameters [s], and its variance.
 
-    Rows at an onset do not count: damped contact begins with a jump, whose place in a row is chance."""
+    Rows near an onset are not used, because the force of damped contact jumps there.
+    """
     readings, sooner = problem.readings, max(delay - STEP, problem.shortest)
     counts = readings.counts & ~at_onset(problem.motion, readings, (delay, plane, 0.0))
-    after, before = (problem.force(one, plane, coefficients) for one in (delay + STEP, sooner))
+    after, before = (problem.force(shifted, plane, coefficients) for shifted in (delay + STEP, sooner))
     grows = problem.whiten(after - before) / (delay + STEP - sooner)
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients))
-    grows, left = (np.where(counts, one, 0.0) / readings.std for one in (grows, left))
+    grows, left = (np.where(counts, values, 0.0) / readings.std for values in (grows, left))
     power = np.maximum(np.sum(grows**2, axis=0), 1e-300)
     return np.sum(grows * left, axis=0) / power, 1.0 / power
 
 
 def slope(values: np.ndarray, weight: np.ndarray, place: np.ndarray) -> tuple[float, float]:
-    """Of a line through values, and its standard deviation; weights are over the values' variance, and where
-    the values scatter by more, so does the slope."""
+    """Return the weighted slope and its standard error, inflated if the reduced chi-square exceeds 1."""
     from_centre = place - np.average(place, weights=weight)
     spread = float(np.sum(weight * from_centre**2))
-    found = float(np.sum(weight * from_centre * values)) / spread
-    scatter = values - np.average(values, weights=weight) - found * from_centre
+    result = float(np.sum(weight * from_centre * values)) / spread
+    scatter = values - np.average(values, weights=weight) - result * from_centre
     inflation = max(1.0, float(np.sum(weight * scatter**2)) / max(len(values) - 2, 1))
-    return found, float(np.sqrt(inflation / spread))
+    return result, float(np.sqrt(inflation / spread))

@@ -1,19 +1,19 @@
 """Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
 
 e* is the restitution of the ideal contact, e that of the rig. To first order a change dF of the contact force
-changes the rebound by its work,
+changes the rebound by its mechanical work,
 
     d e* = -(integral of dF v dt) / (M v_0^2 e*),
 
-and a force that is older by tau adds energy, tau times the integral of F^2 / M:
+and an additional delay tau of the force adds the energy tau times the integral of F^2 / M:
 
     e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*),
 
-for a linear spring (pi/2) w tau. Damping and age of the force thus cancel in e, and do not in e - e*: gains
-that are tuned on too little damping reproduce a contact with too little damping.
+which is (pi/2) w tau for a linear spring. Damping and delay of the force thus cancel in e, but not in e - e*:
+gains tuned with too little damping reproduce a contact with too little damping.
 
-A rig without compensation rebounds faster by a factor c = 1 + J tau / e*, and d e = c (d e* + J d tau); where
-gains make up for the age, c is 1. The larger effect of the two counts.
+Without compensation a rig rebounds faster by the factor c = 1 + J tau / e*, and d e = c (d e* + J d tau).
+With gains that compensate the delay, c = 1. The larger of both effects counts.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from tuning.identification import known
 from tuning.identification.contact_laws import Law
 
 DRAWS = 1024
-SURE = 0.99  # share of the draws whose effect is smaller
-STEPS = 400  # of a contact's motion, an estimate of its duration long
-LONGEST_CONTACT = 4.0  # times that estimate, after which a contact that did not end is given up
-STEP = 1e-4  # relative, of differences by a number of the motion simulator
-DEEPEST = 1.0  # m; a contact that gets there ends nowhere
+SURE = 0.99  # probability that the effect is smaller than stated
+STEPS = 400  # integration steps in the estimated duration of a contact
+LONGEST_CONTACT = 4.0  # times the estimated duration, after which the integration stops
+STEP = 1e-4  # relative step of finite differences by a parameter of the motion simulator
+DEEPEST = 1.0  # m; a deeper contact is taken to have no rebound
 FORCE_DELAY, SIMULATOR = "rig.force_sensor.delay", "rig.simulator."
-IDENTIFIED = "identified from"  # how the source of a file begins that an identification wrote
+IDENTIFIED = "identified from"  # beginning of the `source` of an identified file
 AGES = (FORCE_DELAY, "rig.force_sensor.time_constant")
 CONTACT = (
     *("contact.stiffness", "contact.damping"),
@@ -46,15 +46,15 @@ CONTACT = (
 
 
 class Effect(NamedTuple):
-    """Effects of the uncertainty, not exceeded with a probability of 99 %."""
+    """Effects of the uncertainty that are not exceeded with a probability of 99 %."""
 
     restitution: float  # change of e
     error: float  # change of e - e*
-    parts: dict[str, float]  # change by each key alone
+    parts: dict[str, float]  # change of e or e - e* by each key alone
 
 
 class _Contact(NamedTuple):
-    """One contact as the file has it, and how it changes."""
+    """Nominal contact of the file and its sensitivities."""
 
     restitution: float  # e*
     by_coefficient: np.ndarray  # slopes of e*
@@ -62,13 +62,13 @@ class _Contact(NamedTuple):
 
 
 def uncertain_effect(mechanism: Mechanism) -> Effect:
-    """Compute by how much the numbers that an identification found may change e and e - e*.
+    """Compute by how much the identified parameters may change e and e - e*.
 
-    The numbers are those of the file's `[correlation]`, or, if there is none, the normal entries of
-    `[uncertainty]`; what the file says of other numbers are variations, not the identification's doubt.
+    The parameters are those of the file's `[correlation]`, or, without it, the normal entries of
+    `[uncertainty]`. Other entries of the file describe variations, not the uncertainty of the identification.
 
     Returns:
-        The effects of which 99 % of the draws stay below, of the contact of the lists where they are largest.
+        The 99 % quantiles of the effects, for the entry of the contact lists where they are largest.
     """
     keys = _keys(mechanism)
     if not keys:
@@ -86,37 +86,37 @@ def uncertain_effect(mechanism: Mechanism) -> Effect:
         changes = {key: _change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys}
         gain = 1.0 + contact.by_age * _age(mechanism, frequency) / contact.restitution
         ideal, error = np.sum(list(changes.values()), axis=0)
-        found = Effect(
+        entry_effect = Effect(
             gain * _sure(ideal + error),
             max(_sure(error), _sure(gain * (ideal + error) - ideal)),
-            {key: _sure(one + other) for key, (one, other) in changes.items()},
+            {key: _sure(a + b) for key, (a, b) in changes.items()},
         )
-        if max(found[:2]) > max(worst[:2]):
-            worst = found
+        if max(entry_effect[:2]) > max(worst[:2]):
+            worst = entry_effect
     return worst
 
 
 def _keys(mechanism: Mechanism) -> list[str]:
-    """The numbers whose uncertainty is an identification's."""
+    """Return the keys whose uncertainty comes from an identification."""
     if not mechanism.source.startswith(IDENTIFIED):
         return []
     if mechanism.correlation is not None:
-        found = mechanism.correlation.keys
+        keys = mechanism.correlation.keys
     else:
-        found = [key for key, one in mechanism.uncertainty.items() if one.distribution == "normal"]
-    return [key for key in found if key in (*AGES, *CONTACT) or key.startswith(SIMULATOR)]
+        keys = [key for key, entry in mechanism.uncertainty.items() if entry.distribution == "normal"]
+    return [key for key in keys if key in (*AGES, *CONTACT) or key.startswith(SIMULATOR)]
 
 
 def _change(
     mechanism: Mechanism, contact: _Contact, entry: int, frequency: float, key: str, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Changes of e* and of e - e* by draws of one number."""
+    """Return the changes of e* and of e - e* for draws of one parameter."""
     nothing = np.zeros(len(values))
     if key in CONTACT:
         nominal = np.array(known.coefficients(mechanism.contact, entry))
         moved = np.array([
-            known.coefficients(_with(mechanism.contact, key.removeprefix("contact."), one), entry)
-            for one in values.tolist()
+            known.coefficients(_with(mechanism.contact, key.removeprefix("contact."), value), entry)
+            for value in values.tolist()
         ])  # fmt: skip
         return (moved - nominal) @ contact.by_coefficient, nothing
     if key in AGES:
@@ -151,10 +151,10 @@ def _lag(mechanism: Mechanism, frequency: float) -> float:
 
 
 def _age(mechanism: Mechanism, frequency: float) -> float:
-    """Return by how much the force is older than the command at a frequency [Hz], in s."""
+    """Return the total delay of the force relative to the command at a frequency [Hz], in s."""
     sensor = mechanism.rig.force_sensor
-    whole = _lag(mechanism, frequency) + sensor.delay + sensor.time_constant
-    return max(whole - mechanism.rig.position_sensor.delay, 0.0)
+    total = _lag(mechanism, frequency) + sensor.delay + sensor.time_constant
+    return max(total - mechanism.rig.position_sensor.delay, 0.0)
 
 
 def _sure(values: np.ndarray) -> float:
@@ -162,13 +162,13 @@ def _sure(values: np.ndarray) -> float:
 
 
 def _contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_Contact | None, float]:
-    """The ideal contact with one entry of the lists, and its frequency [Hz]; None where it has no rebound."""
+    """Return the ideal contact of one entry of the lists and its frequency [Hz]; None without a rebound."""
     mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
     coefficients = np.array(known.coefficients(mechanism.contact, entry))
 
     def force(depth: float, rate: float) -> float:
         functions = law.own(np.array([max(depth, 0.0)]), np.array([rate]))
-        total = float(sum(c * one[0] for c, one in zip(coefficients, functions, strict=True)))
+        total = float(sum(c * column[0] for c, column in zip(coefficients, functions, strict=True)))
         return total if law.pulls else max(total, 0.0)
 
     deepest = _deepest(force, 0.5 * mass * speed**2)
@@ -181,16 +181,16 @@ def _contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_Contact | Non
         if states[-1][0] <= 0.0:
             break
     depth, rate = np.array(states).T
-    # The last step ends out of contact: the part of it that is in contact counts.
+    # The last step ends out of contact; only its share in contact counts.
     last, past = depth[-2:]
     weights = np.full(len(depth) - 1, step)
     weights[-1] *= min(last / max(last - past, 1e-300), 1.0)
     restitution = -float(rate[-1]) / speed
     if past > 0.0 or restitution <= 0.0:
         return None, 0.0
-    middle, moving = (0.5 * (one[1:] + one[:-1]) for one in (depth, rate))
+    middle, moving = (0.5 * (values[1:] + values[:-1]) for values in (depth, rate))
     middle = np.maximum(middle, 0.0)
-    columns = np.array([np.broadcast_to(one, middle.shape) for one in law.own(middle, moving)])
+    columns = np.array([np.broadcast_to(column, middle.shape) for column in law.own(middle, moving)])
     total = coefficients @ columns
     touching = np.ones(len(middle), bool) if law.pulls else total > 0.0
     scale = mass * speed**2 * restitution
@@ -200,7 +200,7 @@ def _contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_Contact | Non
 
 
 def _deepest(force: Any, energy: float) -> float | None:
-    """The depth at which the force without damping has taken up an energy [J], to 1e-3; None if nowhere."""
+    """Return the depth at which the undamped force has absorbed `energy` [J], to 1e-3, or None."""
     depth, work = 1e-9, 0.0
     while work < energy:
         work += force(1.005 * depth, 0.0) * 0.01 * depth
@@ -211,13 +211,13 @@ def _deepest(force: Any, energy: float) -> float | None:
 
 
 def _stepped(force: Any, mass: float, state: tuple[float, float], step: float) -> tuple[float, float]:
-    """The state of depth and rate one step of Runge and Kutta's later."""
+    """Return the depth [m] and rate [m/s] after one Runge-Kutta step."""
     depth, rate = state
-    one = -force(depth, rate) / mass
-    two = -force(depth + 0.5 * step * rate, rate + 0.5 * step * one) / mass
-    three = -force(depth + 0.5 * step * (rate + 0.5 * step * one), rate + 0.5 * step * two) / mass
-    four = -force(depth + step * (rate + 0.5 * step * two), rate + step * three) / mass
+    k1 = -force(depth, rate) / mass
+    k2 = -force(depth + 0.5 * step * rate, rate + 0.5 * step * k1) / mass
+    k3 = -force(depth + 0.5 * step * (rate + 0.5 * step * k1), rate + 0.5 * step * k2) / mass
+    k4 = -force(depth + step * (rate + 0.5 * step * k2), rate + step * k3) / mass
     return (
-        depth + step * (rate + step * (one + two + three) / 6.0),
-        rate + step * (one + 2.0 * two + 2.0 * three + four) / 6.0,
+        depth + step * (rate + step * (k1 + k2 + k3) / 6.0),
+        rate + step * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0,
     )

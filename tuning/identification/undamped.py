@@ -1,10 +1,11 @@
-"""Contact without damping as an alternative to contact with some.
+"""Bayesian average over contact with and without damping.
 
-Damping and a force delay that is shorter by damping over stiffness explain touches alike, but for their
-onsets. A flat prior of damping says that there is some. Where there is none, noise at a few onsets can then
-look like damping with a small standard deviation. The draws therefore are of both alternatives, by their
-posterior probabilities (spike-and-slab prior, Mitchell and Beauchamp, "Bayesian variable selection in linear
-regression", 1988): half of the prior on no damping, half flat up to `SLAB`.
+Damping has nearly the same effect on a contact as a force delay that is shorter by damping over stiffness.
+Only the onset of contact separates the two. A flat prior on the damping excludes zero damping, so noise at a
+few onsets can look like damping with a small standard deviation. The draws therefore come from both models in
+proportion to their posterior probabilities (spike-and-slab prior, Mitchell and Beauchamp, "Bayesian variable
+selection in linear regression", 1988). The prior gives one half to no damping and spreads the other half
+evenly up to `SLAB`.
 """
 
 from __future__ import annotations
@@ -21,28 +22,34 @@ from tuning.identification.contact_profile import Posterior
 from tuning.identification.law_choice import quick
 
 DAMPING, LAG = "damping", "time_constant"
-SLAB = 0.01  # s; damping over stiffness is at most that a priori
-LEAST = 1e-4  # probability of no damping below which it is left out
-SIMPLER = 7.0  # of the log probability, the most that no damping gains by having a number less
+SLAB = 0.01  # s, upper bound of damping over stiffness in the prior
+LEAST = 1e-4  # posterior probability of no damping, below which that model is ignored
+SIMPLER = 7.0  # largest gain of log evidence that the model without damping has from one parameter less
 
-# Fits a law; returns its posterior, and the logarithm of that posterior's integral.
+# Function that fits a law and returns the posterior and the log evidence.
 Fit = Callable[[Law], tuple[Posterior, float]]
 
 
 def without_damping(law: Law) -> Law:
-    """Return a law with the damping proportional to the rate left out."""
+    """Return the law without its term proportional to the rate."""
     names = tuple(name for name in law.names if name != DAMPING)
     return replace(law, names=names, shared=lambda depth, rate: [], pulls=False)
 
 
 def averaged(problem: Problem, posterior: Posterior, evidence: float, fit: Fit) -> Posterior:
-    """Return the posterior with draws of contact without damping in it, as many as that is probable.
+    """Return the posterior with a share of its draws replaced by draws without damping.
 
-    `evidence`: the logarithm of the posterior's integral, flat over damping.
+    The share is the posterior probability of no damping.
+
+    Args:
+        problem: Problem with the damped law.
+        posterior: Posterior of that problem.
+        evidence: Logarithm of the posterior's integral under a flat prior on the damping.
+        fit: Function that fits a law and returns its posterior and its log evidence.
     """
     law = problem.law
-    own = len(law.own(np.zeros(1), np.zeros(1)))
-    if DAMPING not in law.names[own:]:
+    own_count = len(law.own(np.zeros(1), np.zeros(1)))
+    if DAMPING not in law.names[own_count:]:
         return posterior
     delay, plane, best = posterior.best
     slab = 0.5 * np.log(2.0 * np.pi) - np.log(SLAB * max(float(best.coefficients[0]), 1e-300))
@@ -51,12 +58,12 @@ def averaged(problem: Problem, posterior: Posterior, evidence: float, fit: Fit) 
     closest = quick(alone, (delay, plane, best.misfit))
     if 0.5 * (best.misfit - closest[2]) + SIMPLER < np.log(LEAST):
         return posterior
-    other, other_evidence = fit(simpler)
+    alternative, other_evidence = fit(simpler)
     share = float(special.expit(other_evidence - (evidence + slab)))
     if share < LEAST:
         return posterior
     count, names = round(share * len(posterior.draws)), posterior.names
-    columns = dict(zip(other.names, other.draws[:count].T, strict=True))
+    columns = dict(zip(alternative.names, alternative.draws[:count].T, strict=True))
     lag = columns.get(LAG, np.zeros(count))
     if LAG not in names:
         columns["delay"] = columns["delay"] + lag

@@ -1,10 +1,10 @@
-"""Whether the model explains the rig, each defect by what it can do to a contact's restitution.
+"""Checks of the model against the logs; each defect is measured by its effect on a contact's restitution.
 
-With thousands of readings every model is rejected by some test. So a line states how large the effect on the
-restitution e can be, and the test says only whether the defect is there at all. The effects are first order
-and in closed form: a phase error phi of the motion at the contact's frequency w is a delay of phi/w, and a
-delay tau changes e by (pi/2) w tau; a force r that the law does not explain changes the rebound by
--(integral of r v dt)/(M v_0 e), the balance of momentum and energy over one touch.
+With thousands of readings some test rejects every model. Therefore each line states how large the effect on
+the restitution e can be, and the test only decides whether the defect is present. The effects are of first
+order and in closed form. A phase error phi of the motion at the contact frequency w is a delay of phi/w, and
+a delay tau changes e by (pi/2) w tau. An unexplained force r changes the rebound by -(integral of r v dt)/(M
+v_0 e), from the balance of momentum and energy over one contact.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ from tuning.identification.law_choice import misfits
 from tuning.identification.records import Run
 from tuning.identification.two_clocks import differences, slope
 
-OTHER_HOLD = 2.0  # gain of the information criterion from which the other hold explains more
-RARE = 1e-3  # probability under which a defect is taken to be there
-HARMONICS = 4.0  # of the contact's frequency: up to there the motion decides what a contact does
-CERTAIN_DRAWS = 40  # of the posterior, under all of which a row is in contact or under none
-AT_THE_END = 0.93  # of the longest force delay that is looked for
-FEW_TOUCHES = 5  # of which one would show a small reading
-MOSTLY = 0.8  # share of a run's readings that are not 0, beyond which no dead zone hides the others
-CUT = 0.01  # probability of such readings below which a dead zone is taken to cut
-SEEN = 3.0  # standard deviations of the noise; readings as small occur where no dead zone cuts
+OTHER_HOLD = 2.0  # gain of the information criterion that shows a wrong hold
+RARE = 1e-3  # p-value below which a defect is present
+HARMONICS = 4.0  # multiple of the contact frequency, up to which the motion affects a contact
+CERTAIN_DRAWS = 40  # posterior draws that must agree on whether a row is in contact
+AT_THE_END = 0.93  # share of the longest force delay in the search
+FEW_TOUCHES = 5  # contacts that a check of small readings needs
+MOSTLY = 0.8  # share of readings other than 0, above which there is no dead zone
+CUT = 0.01  # p-value below which a dead zone without offset is present
+SEEN = 3.0  # standard deviations of the noise; smaller readings exclude such a dead zone
 NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
 
 
 @dataclass(frozen=True)
 class Line:
-    """One check."""
+    """Result of one check."""
 
     name: str
-    finding: str  # what was found, in words and numbers
-    there: bool  # whether the defect is more than chance
-    effect: float  # on e, if it is there
-    where: str = ""  # frequency, file and time, or entry where it is worst
-    on_error: float | None = None  # effect on e - e*, where it is not that on e
-    counts: bool = True  # whether the verdict adds it up
+    finding: str  # result in words and numbers
+    there: bool  # whether the defect exceeds chance
+    effect: float  # effect on e if the defect is present
+    where: str = ""  # worst frequency, or file and time
+    on_error: float | None = None  # effect on e - e* if it differs from that on e
+    counts: bool = True  # whether the verdict includes it
 
     @property
     def counted(self) -> float:
-        """Effect on e that the verdict adds up."""
+        """Return the effect on e in the sum of the verdict."""
         return self.effect if self.there and self.counts else 0.0
 
     @property
     def counted_error(self) -> float:
-        """Effect on e - e* that the verdict adds up."""
+        """Return the effect on e - e* in the sum of the verdict."""
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.there and self.counts else 0.0
 
 
 def of_motion(motion: FreeMotion, frequency: float) -> list[Line]:
-    """Checks of the motion simulator's model; `frequency` of contacts [Hz]."""
+    """Check the model of the motion simulator at a contact frequency [Hz]."""
     lines = [_misfit(motion, frequency), _gain(motion), _hold(motion, frequency)]
     return [*lines, *_distortion(motion)]
 
@@ -97,12 +97,12 @@ def _gain(motion: FreeMotion) -> Line:
 
 
 def _hold(motion: FreeMotion, frequency: float) -> Line:
-    other = "linear" if motion.lines.hold == "zoh" else "zoh"
+    other_hold = "linear" if motion.lines.hold == "zoh" else "zoh"
     half = 0.5 * motion.lines.period
     return Line(
         "command hold",
         f"the information criterion is {abs(motion.other_hold):.3g} "
-        f"{'less' if motion.other_hold > 0 else 'more'} with {other}",
+        f"{'less' if motion.other_hold > 0 else 'more'} with {other_hold}",
         motion.other_hold > OTHER_HOLD,
         float(np.pi**2 * frequency * half),
     )
@@ -122,9 +122,9 @@ def sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
 def _distortion(motion: FreeMotion) -> list[Line]:
     lines = []
     for parity, name in ((0, "odd"), (1, "even")):
-        levels = [level for one in motion.spectra if (level := (one.odd, one.even)[parity]) is not None]
+        levels = [level for run in motion.spectra if (level := (run.odd, run.even)[parity]) is not None]
         if levels:
-            excess = max(one.excess[parity] for one in motion.spectra)
+            excess = max(run.excess[parity] for run in motion.spectra)
             lines.append(
                 Line(
                     f"{name} nonlinearity of the motion",
@@ -139,7 +139,7 @@ def _distortion(motion: FreeMotion) -> list[Line]:
 def of_contact(
     contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
 ) -> list[Line]:
-    """Checks of the contact's model on the touches `held`, a flag each."""
+    """Check the contact model on the contacts flagged in `held`."""
     lines = [_left(contact, runs, held), *_at_the_end(contact), *_dead_zone(contact, runs)]
     if contact.drift is None:
         errors, stds = restitution_errors(contact, runs, mass)
@@ -150,9 +150,10 @@ def of_contact(
 
 
 def of_touches_left_out(contact: ContactFit, runs: list[Run], mass: float, held: np.ndarray) -> list[Line]:
-    """Check on the touches `held` what a fit to the others leaves of them; the verdict does not count it.
+    """Check the fit on the contacts flagged in `held`, which it did not use.
 
-    The verdict is that of the file written, whose numbers are those of all touches."""
+    The verdict excludes these lines, because the written file uses all contacts.
+    """
     left = _left(contact, runs, held)
     lines = [replace(left, name="contact law, touches not fitted", counts=False)]
     errors, stds = restitution_errors(contact, runs, mass)
@@ -163,15 +164,15 @@ def of_touches_left_out(contact: ContactFit, runs: list[Run], mass: float, held:
     return lines
 
 
-def _left(contact: ContactFit, runs: list[Run], held: np.ndarray) -> Line:
+def _left(contact: ContactFit, runs: list[Run], chosen: np.ndarray) -> Line:
     delay, plane, inner = contact.posterior.best
     readings = contact.readings
     readings = replace(readings, counts=readings.counts & certain_rows(contact))
-    every = misfits(contact.problem, readings, delay, plane, inner.coefficients)[held]
-    count = np.maximum(readings.counts.sum(axis=0)[held], 1)
-    ratio = float(every.sum() / count.sum())
-    # The force's rms error over the touch, as a share of its rms, is at most what it can do to e.
-    force = np.where(readings.counts, readings.force, 0.0)[:, held]
+    misfit = misfits(contact.problem, readings, delay, plane, inner.coefficients)[chosen]
+    count = np.maximum(readings.counts.sum(axis=0)[chosen], 1)
+    ratio = float(misfit.sum() / count.sum())
+    # The effect on e is at most the rms error of the force over its rms.
+    force = np.where(readings.counts, readings.force, 0.0)[:, chosen]
     beyond = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
     return Line(
         "contact law",
@@ -181,13 +182,15 @@ def _left(contact: ContactFit, runs: list[Run], held: np.ndarray) -> Line:
             < RARE
         ),
         float(np.sqrt(beyond)),
-        _place(contact, runs, held, every / count),
+        _place(contact, runs, chosen, misfit / count),
     )
 
 
 def certain_rows(contact: ContactFit) -> np.ndarray:
-    """Rows that are in contact, or out of it, whatever the delay and the plane are within their uncertainty:
-    damped contact begins with a jump, and a row on its other side says nothing of the law."""
+    """Return the rows whose contact state is the same for all delays and surfaces within their uncertainty.
+
+    The force of damped contact jumps at the onset; a row on its other side carries no information on the law.
+    """
     count = len(contact.problem.names)
     flags = [
         contact.problem.touching(draw[0], draw[1], draw[2 : 2 + count])
@@ -211,19 +214,20 @@ def sign_of_force(contact: ContactFit) -> Line:
 
 
 def _at_the_end(contact: ContactFit) -> list[Line]:
-    """A delay at the end of those that were looked at is none."""
+    """Return a failed check if the delay is at the upper end of the search."""
     delay = contact.posterior.mean[0]
     if delay < AT_THE_END * LONGEST:
         return []
-    found = f"{1e3 * delay:.4g} ms, the longest that was looked for"
-    return [Line("force delay", found, True, 1.0)]
+    finding = f"{1e3 * delay:.4g} ms, the longest that was looked for"
+    return [Line("force delay", finding, True, 1.0)]
 
 
 def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
-    """Check that readings of touches that are 0 out of contact begin and end near 0.
+    """Check that the readings of contacts that are 0 out of contact begin and end near 0.
 
-    Where none is small, a dead zone cuts small forces and leaves the others as they are; that of mechanism
-    files takes its size from every force."""
+    If no reading is small, a dead zone suppresses small forces and passes the others unchanged. The dead zone
+    of mechanism files differs: it is subtracted from every force.
+    """
     smallest, steps, peaks = [], [], []
     for lane, run in enumerate(runs):
         force = np.abs(contact.readings.force[: len(run.tick), lane])
@@ -236,18 +240,19 @@ def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
         return []
     least, std = min(smallest), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
-    # The last reading of a touch that ends smoothly lies anywhere between 0 and the last step.
-    likely = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
-    if least <= max(SEEN * std, 2.5 * quantum) or likely > CUT:
+    # The last reading of a smooth release is uniform between 0 and the last step.
+    probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
+    if least <= max(SEEN * std, 2.5 * quantum) or probability > CUT:
         return []
-    found = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
-    return [Line("dead zone of the force sensor", found, True, float(least / np.median(peaks)))]
+    finding = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
+    return [Line("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
 
 
 def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the force that the law does not explain changes e of each touch, and the noise's part.
+    """Return the change of e by the unexplained force in each contact, and its standard deviation by noise.
 
-    NaN where the numerical model was not a free body, or did not rebound, or the log has not all of it."""
+    Both are NaN if the numerical model was not a free body, did not rebound, or the log is incomplete.
+    """
     delay, plane, inner = contact.posterior.best
     predicted = contact.problem.force(delay, plane, inner.coefficients)
     readings, period = contact.readings, contact.problem.motion.period
@@ -269,7 +274,7 @@ def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tup
         left = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
         errors[lane] = -float(np.sum(left * speed)) * period / scale / before
-        # Coloured noise adds up by what it holds at low frequencies.
+        # Only the low frequencies of coloured noise add up.
         slow = readings.std / abs(float(np.sum(readings.whitening)))
         stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
     return errors, stds
@@ -290,14 +295,14 @@ def _restitution(
 
 
 def _place(contact: ContactFit, runs: list[Run], chosen: np.ndarray, values: np.ndarray) -> str:
-    """Return file and time of the run with the largest of values, one for each chosen run."""
+    """Return file and time of the run with the largest of the values, which are those of the chosen runs."""
     run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
     first = run.tick[int(np.argmax(run.valid))]
     return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"
 
 
 def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[Line]:
-    """Whether the force over the law's, or its delay, grows or falls from touch to touch."""
+    """Check that neither the scale of the force nor its delay changes from contact to contact."""
     delay, plane, inner = contact.posterior.best
     problem, std = contact.problem, contact.readings.std
     predicted = np.where(contact.readings.counts, problem.force(delay, plane, inner.coefficients), 0.0)
@@ -310,8 +315,8 @@ def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> 
     number = np.flatnonzero(used) / max(touches - 1, 1)
     share = np.sum(predicted * force, axis=0)[used] / power[used]
     grown, grown_std = slope(share, power[used] / std**2, number)
-    off, variance = differences(problem, delay, plane, inner.coefficients)
-    later, later_std = slope(off[used], 1.0 / variance[used], number)
+    delay_changes, variance = differences(problem, delay, plane, inner.coefficients)
+    later, later_std = slope(delay_changes[used], 1.0 / variance[used], number)
     angle = 2.0 * np.pi * frequency
     first = "from the first touch to the last"
     return [

@@ -1,1 +1,1 @@
-"""Excitations for a rig whose numbers are roughly known: what logs should be taken."""
+"""Design of excitations for a rig with roughly known parameters."""

@@ -1,9 +1,9 @@
-"""The two runs that tell a rig's numbers best: a multisine clear of the mechanism, and one pushed against it.
+"""Design of two runs that identify a rig best: a multisine in free motion and a pressed multisine.
 
-What matters is what wrong numbers do to the error e - e* of a compensation; its derivatives are those of the
-simulated loop. The runs' powers are chosen together (`powers`): free motion tells the motion simulator, a
-press stiffness, damping and force delay given that. A share of the power lies evenly over all lines, so that
-a model of the wrong order, or a nonlinearity, shows.
+The criterion is the error e - e* of a compensation that wrong parameters cause; its derivatives come from the
+simulated loop. The powers of both runs are optimized together (`powers`): free motion determines the motion
+simulator, and a press then determines stiffness, damping and force delay. A share of the power is spread
+evenly over all lines, which reveals a wrong model order or a nonlinearity.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from tuning.identification import hold, known
 from tuning.identification.design import powers, waveform
 from tuning.identification.mechanism_file import put
 
-PERIOD, PERIODS = 5.0, 12  # s, of which the first is dropped
-FADE, APPROACH, CLEAR = 1.0, 2.0, 0.001  # s, s, m
-HIGHEST = 45.0  # Hz, or 3 bandwidths where that is more
+PERIOD, PERIODS = 5.0, 12  # s, and number of periods; the first one is dropped
+FADE, APPROACH, CLEAR = 1.0, 2.0, 0.001  # s, s, and m: distance to the surface at the start of a press
+HIGHEST = 45.0  # Hz, highest line; 3 bandwidths if that is more
 EVEN = 0.2  # share of the power that lies evenly over the lines
-CREST = 1.6  # wanted of the waves
-PRELOAD, SWING = 0.45, 0.4  # of the greatest force: mean and peak about it while pressed
-ALSO = 0.01  # weight of the numbers' own relative errors beside their effect on e
-PHASES = (0.0, 0.25, 0.5, 0.75)  # of the contacts that e is taken from
-NOISE = 5e-6, 0.5  # m and N, where the mechanism states none
-USED = 0.9  # of the limits of speed and acceleration
+CREST = 1.6  # crest factor that the limits assume
+PRELOAD, SWING = 0.45, 0.4  # mean force, and amplitude about it, over the greatest force
+ALSO = 0.01  # weight of the parameters' relative errors in addition to their effect on e
+PHASES = (0.0, 0.25, 0.5, 0.75)  # phases of the contacts at which e is evaluated
+NOISE = 5e-6, 0.5  # m and N, noise if the mechanism states none
+USED = 0.9  # share of the limits of speed, acceleration and force
 OWN_KEYS = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -44,30 +44,30 @@ OWN_KEYS = {
 
 @dataclass(frozen=True)
 class Excitation:
-    """One run."""
+    """Command of one run, and its multisine."""
 
-    position: np.ndarray  # m, of the command: from where it starts, or (press) from the nominal plane
-    frequency: np.ndarray  # Hz, of the lines
-    amplitude: np.ndarray  # m
-    crest: float  # peak over rms, of what is nearest to its limit
+    position: np.ndarray  # m, command relative to its start, or, for a press, to the nominal surface
+    frequency: np.ndarray  # Hz, lines of the multisine
+    amplitude: np.ndarray  # m, at each line
+    crest: float  # peak over rms of the signal that is closest to its limit
 
 
 @dataclass(frozen=True)
 class Design:
-    """Both runs and what they will tell."""
+    """Both runs and the accuracy that they are expected to give."""
 
     free: Excitation
     press: Excitation
-    keys: tuple[str, ...]  # of the numbers told
-    values: np.ndarray  # of the mechanism
-    std: np.ndarray  # predicted
-    slopes: np.ndarray  # d(e - e*) by the numbers, (contacts and phases, keys)
+    keys: tuple[str, ...]  # identified parameters
+    values: np.ndarray  # of the parameters in the mechanism
+    std: np.ndarray  # predicted standard deviations
+    slopes: np.ndarray  # derivatives of e - e* by the parameters, (contacts and phases, keys)
     covariance: np.ndarray
-    flat: float  # error of e with flat spectra within the same limits, over that with these
+    flat: float  # ratio of the error of e with flat spectra to that of this design
 
     @property
     def error(self) -> float:
-        """rms of e - e* that errors of these standard deviations, and their correlations, make."""
+        """Return the rms of e - e* for parameter errors with this covariance."""
         return float(np.sqrt(np.mean(np.sum(self.slopes @ self.covariance * self.slopes, axis=1))))
 
 
@@ -75,11 +75,21 @@ Slopes = Callable[[Sequence[str]], np.ndarray]
 
 
 def design(mechanism: Mechanism, stroke: float, slopes_by: Slopes, seed: int = 0) -> Design:
-    """For a rig of about these numbers; `stroke`: largest excursion to either side [m]; `slopes_by` gives
-    d(e - e*) by keys of the mechanism, (contacts, keys), as `error_slopes` does.
+    """Design both runs for a rig with approximately known parameters.
 
-    Speed and acceleration stay within `rig.simulator`'s limits, the force within the sensor's range and what
-    the approach makes. Raises `InputError` for a law or a simulator that this cannot be done for."""
+    Speed and acceleration stay within the limits of `rig.simulator`. The force stays within the sensor's
+    range and the force that the approach causes.
+
+    Args:
+        mechanism: Mechanism with the approximate parameters.
+        stroke: Largest excursion to either side [m].
+        slopes_by: Function that returns the derivatives of e - e* by keys of the mechanism, (contacts, keys),
+            such as `error_slopes`.
+        seed: Seed of the random phases.
+
+    Raises:
+        InputError: If the contact law or the simulator is not supported.
+    """
     plan = _Plan(mechanism, stroke)
     slopes = slopes_by(plan.keys)
     effect = slopes.T @ slopes / len(slopes)
@@ -88,24 +98,24 @@ def design(mechanism: Mechanism, stroke: float, slopes_by: Slopes, seed: int = 0
     groups = [plan.free, plan.press]
     best = powers.best_powers(groups, weight)
     even = [powers.flat_powers(group) for group in groups]
-    mixed = [(1.0 - EVEN) * one + EVEN * other for one, other in zip(best, even, strict=True)]
-    waves, found, crests = [], [], []
+    mixed = [(1.0 - EVEN) * optimal + EVEN * flat for optimal, flat in zip(best, even, strict=True)]
+    waves, scaled_powers, crests = [], [], []
     for power, limits in zip(mixed, plan.limits, strict=True):
         amplitude = np.sqrt(2.0 * power)
         angle = waveform.phases(amplitude, plan.lines, plan.rows, limits, seed)
         signals = waveform.made(amplitude, plan.lines, plan.rows, angle, limits)
-        shares = [np.abs(one).max() for one in signals]
+        shares = [np.abs(signal).max() for signal in signals]
         waves.append(plan.wave(amplitude, angle) / max(shares))
         crests.append(waveform.crest_factor(signals[int(np.argmax(shares))]))
-        found.append(power / max(shares) ** 2)
-    covariance = powers.inverse(powers.information(groups, found))
+        scaled_powers.append(power / max(shares) ** 2)
+    covariance = powers.inverse(powers.information(groups, scaled_powers))
     errors = [
         np.sqrt(np.trace(weight @ powers.inverse(powers.information(groups, p)))) for p in (even, mixed)
     ]
     runs = [plan.repeated(waves[0]), plan.pressed(waves[1])]
     free, press = (
         Excitation(position, plan.frequency, np.sqrt(2.0 * power), crest)
-        for position, power, crest in zip(runs, found, crests, strict=True)
+        for position, power, crest in zip(runs, scaled_powers, crests, strict=True)
     )
     return Design(
         free,
@@ -122,21 +132,21 @@ def design(mechanism: Mechanism, stroke: float, slopes_by: Slopes, seed: int = 0
 def error_slopes(
     mechanism: Mechanism, compensator: str, gains: dict[str, float], keys: Sequence[str]
 ) -> np.ndarray:
-    """d(e - e*) by each key, (contacts and phases, keys), of the loop without noise."""
+    """Return the derivatives of e - e* by each key, (contacts and phases, keys), without noise."""
     document, rows = to_builtins(mechanism), []
     for key in ("noise_std", "quantum", "dead_zone", "bias"):
         document["rig"]["force_sensor"][key] = 0.0
     for key in ("noise_std", "quantum"):
         document["rig"]["position_sensor"][key] = 0.0
     for section in ("simulator", "force_sensor"):
-        # Derivatives by a delay are those of one that is there.
+        # The derivative by a delay needs a delay above 0.
         document["rig"][section]["delay"] = max(document["rig"][section]["delay"], 1e-6)
     names = [_bracketed(key) for key in keys]
     for phase in PHASES:
         document["approach"]["phase"] = phase
-        one = from_builtins(document, mechanism.name)
-        found = jaxhil.jacobian(one, compensator, gains, of="error", by=names)
-        rows.append(np.array([found[name] for name in names]).T)
+        phased = from_builtins(document, mechanism.name)
+        derivatives = jaxhil.jacobian(phased, compensator, gains, of="error", by=names)
+        rows.append(np.array([derivatives[name] for name in names]).T)
     slopes = np.concatenate(rows)
     slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
     if not len(slopes):
@@ -147,12 +157,12 @@ def error_slopes(
 
 
 def _bracketed(key: str) -> str:
-    """A key with entries of lists as the mechanism's paths have them."""
+    """Return a key in the notation of the mechanism's paths, with entries of lists in brackets."""
     return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
 
 class _Plan:
-    """Lines, what they tell, and their limits, of both runs."""
+    """Lines of both runs, with their information and their limits."""
 
     def __init__(self, mechanism: Mechanism, stroke: float):
         rig = mechanism.rig
@@ -171,16 +181,18 @@ class _Plan:
         self.depth, greatest = _press_depth(mechanism)
         self.plane = rig.contact_plane
         sensors = zip((rig.position_sensor, rig.force_sensor), NOISE, strict=True)
-        stds = [np.hypot(one.noise_std, one.quantum / np.sqrt(12.0)) or usual for one, usual in sensors]
-        told = self._told(mechanism)
-        self.keys, self.values = tuple(told), np.array(list(told.values()))
-        # A number that is 0 counts by what would matter.
-        small = [self.period if key.endswith("delay") else 10.0 for key in told]
+        stds = [
+            np.hypot(sensor.noise_std, sensor.quantum / np.sqrt(12.0)) or usual for sensor, usual in sensors
+        ]
+        parameters = self._told(mechanism)
+        self.keys, self.values = tuple(parameters), np.array(list(parameters.values()))
+        # Parameters that are 0 need a scale for their relative errors.
+        small = [self.period if key.endswith("delay") else 10.0 for key in parameters]
         self.scales = np.maximum(np.abs(self.values), small)
         motion, force = self._responses(mechanism)
         self.free, self.press = (
-            self._group(mechanism, place, response, std, response_limits, periods)
-            for place, response, std, response_limits, periods in (
+            self._group(mechanism, index, response, std, response_limits, periods)
+            for index, response, std, response_limits, periods in (
                 (0, motion, stds[0], self._limits(rig, stroke), PERIODS - 1),
                 (1, force, stds[1], [*self._limits(rig, stroke), (force, SWING * greatest)], PERIODS),
             )
@@ -188,7 +200,7 @@ class _Plan:
         self.limits = (self._limits(rig, stroke), [*self._limits(rig, stroke), (force, SWING * greatest)])
 
     def _told(self, mechanism: Mechanism) -> dict[str, float]:
-        """The numbers that the runs tell, by key."""
+        """Return the parameters that the runs identify, by key."""
         document, simulator = to_builtins(mechanism), mechanism.rig.simulator.model
         keys = [*(f"rig.simulator.{name}" for name in OWN_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_slope_keys(mechanism, self.depth)]
@@ -197,7 +209,7 @@ class _Plan:
         return {key: _get(document, key) for key in keys}
 
     def _responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-        """Of the position and of the pressed force reading to the command, at the lines."""
+        """Return the responses of the position and of the pressed force to the command, at the lines."""
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = known.motion_model(mechanism).response(self.s) * self.hold
         late = self.s * (sensor.delay - position.delay)
@@ -206,51 +218,51 @@ class _Plan:
             1.0 + self.s * sensor.time_constant
         )
 
-    def _group(self, mechanism, place, response, std, limits, periods) -> powers.Group:
-        """What unit power at each line tells, and the share of each limit that it takes."""
+    def _group(self, mechanism, index, response, std, limits, periods) -> powers.Group:
+        """Return the information of unit power at each line, and the share of each limit that it uses."""
         slopes = []
         for key, scale in zip(self.keys, self.scales, strict=True):
             document, step = to_builtins(mechanism), 1e-6 * scale
             put(document, key, _get(document, key) + step)
-            slopes.append((self._responses(from_builtins(document, key))[place] - response) / step)
-        whole = np.array(slopes)
-        told = np.einsum("il,jl->lij", whole.conj(), whole).real * periods * self.rows / std**2
+            slopes.append((self._responses(from_builtins(document, key))[index] - response) / step)
+        jacobian = np.array(slopes)
+        fisher = np.einsum("il,jl->lij", jacobian.conj(), jacobian).real * periods * self.rows / std**2
         use = np.array([np.abs(factor) ** 2 * (CREST / limit) ** 2 for factor, limit in limits])
-        return powers.Group(told, use)
+        return powers.Group(fisher, use)
 
     def _limits(self, rig, stroke: float) -> list[tuple[np.ndarray, float]]:
-        """Response to the command of what is limited, and its largest value."""
-        found = [(np.ones_like(self.s), stroke)]
+        """Return the response from the command to each limited signal, and its limit."""
+        limits = [(np.ones_like(self.s), stroke)]
         for power, limit in ((1, rig.simulator.velocity_limit), (2, rig.simulator.acceleration_limit)):
             if np.isfinite(limit):
-                found.append((self.s**power, USED * limit))
-        return found
+                limits.append((self.s**power, USED * limit))
+        return limits
 
     def wave(self, amplitude: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """One period of the lines."""
+        """Return one period of the multisine."""
         return waveform.wave(amplitude, self.lines, self.rows, angle)
 
     def repeated(self, wave: np.ndarray) -> np.ndarray:
-        """All periods, coming and going."""
+        """Return all periods, with a smooth start and end."""
         return waveform.repeated(wave, PERIODS, round(FADE / self.period))
 
     def pressed(self, wave: np.ndarray) -> np.ndarray:
-        """From clear of the mechanism to the preload, all periods, and back."""
+        """Return the approach from clear of the surface to the preload, all periods, and the way back."""
         low, high = self.plane - CLEAR, self.plane + self.depth
         rows = round(APPROACH / self.period)
-        there = waveform.ramp(low, high, rows)
-        return np.concatenate([there, high + self.repeated(wave), waveform.ramp(high, low, rows)])
+        approach = waveform.ramp(low, high, rows)
+        return np.concatenate([approach, high + self.repeated(wave), waveform.ramp(high, low, rows)])
 
 
 def _get(document: dict, key: str) -> float:
-    place: object = document
+    value: object = document
     for part in key.split("."):
-        place = place[int(part) if part.isdigit() else part]  # type: ignore[index]
-    return float(place)  # type: ignore[arg-type]
+        value = value[int(part) if part.isdigit() else part]  # type: ignore[index]
+    return float(value)  # type: ignore[arg-type]
 
 
 def _slope_keys(mechanism: Mechanism, depth: float) -> list[str]:
-    """The stiffness that a press at this depth feels."""
+    """Return the key of the stiffness that is effective in a press at this depth."""
     contact = mechanism.contact
     if not contact_law(contact.law).segmented:
         return ["contact.stiffness.0"]
@@ -263,7 +275,7 @@ def _force(mechanism: Mechanism, depth: np.ndarray, rate: float = 0.0) -> np.nda
 
 
 def _tangent(mechanism: Mechanism, depth: float) -> tuple[float, float]:
-    """Slope of the force by depth [N/m] and by rate [N s/m] there."""
+    """Return the slope of the force by depth [N/m] and by rate [N s/m] at a depth [m]."""
     step = 1e-3 * depth
     low, high = _force(mechanism, np.array([depth - step, depth + step]))
     back, forth = (float(_force(mechanism, np.array([depth]), rate)[0]) for rate in (-step, step))
@@ -271,7 +283,7 @@ def _tangent(mechanism: Mechanism, depth: float) -> tuple[float, float]:
 
 
 def _press_depth(mechanism: Mechanism) -> tuple[float, float]:
-    """Depth of the preload [m], and the greatest force [N]: the sensor's, or that of the approach."""
+    """Return the preload's depth [m] and the greatest force [N], limited by the sensor or the approach."""
     energy = 0.5 * mechanism.bodies.mass * mechanism.approach.velocity**2
 
     def left(depth: float) -> float:

@@ -1,14 +1,14 @@
-"""How a multisine's power is best spread over its lines.
+"""Optimal distribution of a multisine's power over its lines.
 
-Lines of power p_l give the information I = sum_l p_l M_l on the parameters theta, and what is to be small is
-trace(A I^-1): with A = J^T J, J = d e / d theta, the variance of the errors e that the parameters' errors
-make (Silvey, Optimal Design, 1980). Limits are linear: sum_l g_il p_l <= 1, on stroke, speed, acceleration,
-force. At the best powers every line in use gains per unit of what it uses the same,
+Lines of power p_l give the information I = sum_l p_l M_l on the parameters theta. The criterion is trace(A
+I^-1) with A = J^T J, J = d e / d theta: the variance of the errors e that the parameters' errors cause
+(Silvey, Optimal Design, 1980). Limits on stroke, speed, acceleration and force are linear: sum_l g_il p_l <=
+1. At the optimum, every line in use has the same ratio of gain to use of the limits,
 
     trace(A I^-1 M_l I^-1) = sum_i lambda_i g_il,
 
-with lambda_i = 0 for limits that are not met; multiplicative updates go there from powers that are all > 0
-(Silvey, Titterington and Torsney 1978; Yu 2010 for the square root).
+with lambda_i = 0 for inactive limits. Multiplicative updates converge to it from powers > 0 (Silvey,
+Titterington and Torsney 1978; Yu 2010 for the square root).
 """
 
 from __future__ import annotations
@@ -23,42 +23,42 @@ ROUNDS = 400
 
 @dataclass(frozen=True)
 class Group:
-    """The lines of one run."""
+    """Lines of one run."""
 
-    information: np.ndarray  # (lines, parameters, parameters), of unit power
-    use: np.ndarray  # (limits, lines), share of each limit that unit power takes
+    information: np.ndarray  # (lines, parameters, parameters), per unit power
+    use: np.ndarray  # (limits, lines), share of each limit per unit power
 
 
 def best_powers(groups: Sequence[Group], weight: np.ndarray) -> list[np.ndarray]:
-    """Powers of each group's lines that make trace(A I^-1) least, A the `weight`, within its limits."""
+    """Return the powers of each group that minimize trace(A I^-1) within its limits; A is `weight`."""
     powers = [flat_powers(group) for group in groups]
     prices = [np.ones(len(group.use)) for group in groups]
     for _ in range(ROUNDS):
         spread = inverse(information(groups, powers))
         worth = spread @ weight @ spread
-        for place, group in enumerate(groups):
+        for index, group in enumerate(groups):
             gain = np.einsum("ij,lji->l", worth, group.information)
-            power = powers[place] * np.sqrt(np.maximum(gain, 0.0) / (prices[place] @ group.use))
+            power = powers[index] * np.sqrt(np.maximum(gain, 0.0) / (prices[index] @ group.use))
             used = group.use @ power
-            powers[place] = power / used.max()
-            prices[place] *= used / used.max()
-            prices[place] /= prices[place].sum()
+            powers[index] = power / used.max()
+            prices[index] *= used / used.max()
+            prices[index] /= prices[index].sum()
     return powers
 
 
 def flat_powers(group: Group) -> np.ndarray:
-    """The same power at all lines, as much as the limits allow."""
+    """Return equal powers at all lines, as large as the limits allow."""
     lines = group.use.shape[1]
     return np.full(lines, 1.0 / (group.use @ np.ones(lines)).max())
 
 
 def information(groups: Sequence[Group], powers: Sequence[np.ndarray]) -> np.ndarray:
-    """Of all lines together."""
-    parts = [np.einsum("l,lij->ij", p, one.information) for one, p in zip(groups, powers, strict=True)]
+    """Return the information matrix of all lines together."""
+    parts = [np.einsum("l,lij->ij", p, group.information) for group, p in zip(groups, powers, strict=True)]
     return np.sum(parts, axis=0)
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix whose parameters are in units far apart."""
+    """Return the inverse of a symmetric matrix whose parameters have very different units."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return np.linalg.pinv(matrix / np.outer(size, size), rcond=1e-14, hermitian=True) / np.outer(size, size)

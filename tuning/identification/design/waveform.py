@@ -1,7 +1,7 @@
 """Multisines of low crest factor: phases for given amplitudes, and commands that begin and end at rest.
 
-Phases start from Schroeder's (1970) and from random ones; then means of growing even powers of the wave are
-made small, whose limit is its peak (Guillaume, Schoukens, Pintelon and Kollar 1991).
+The phases start from Schroeder's (1970) and from random ones. Then means of increasing even powers of the
+wave are minimized, which converge to its peak (Guillaume, Schoukens, Pintelon and Kollar 1991).
 """
 
 from __future__ import annotations
@@ -12,37 +12,45 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-Limited = tuple[np.ndarray | complex, float]  # a response to the wave, at its lines, and a limit
+Limited = tuple[np.ndarray | complex, float]  # response of a signal to the wave, at its lines, and its limit
 PLAIN: Limited = (1.0 + 0.0j, 1.0)
 
-STARTS = 1  # of random phases
-DOUBLINGS = 3, 5  # means of the 8th, then of the 32nd power
-STEPS = 40  # of the solver, for each
+STARTS = 1  # number of random starts
+DOUBLINGS = 3, 5  # base-2 logarithms of the powers: the 8th, then the 32nd
+STEPS = 40  # solver iterations for each power
 
 
 def phases(
     amplitude: np.ndarray, lines: np.ndarray, rows: int, limited: Sequence[Limited] = (PLAIN,), seed: int = 0
 ) -> np.ndarray:
-    """Phases [rad] of the lines (numbers of periods in `rows`) that keep peaks low.
+    """Return phases [rad] of the lines that keep peaks low.
 
-    `limited`: what is made of the wave, by its response at the lines, and the largest value it may have; the
-    largest of all peaks over their limits is made small."""
+    The largest ratio of a peak to its limit is minimized.
+
+    Args:
+        amplitude: Amplitude at each line.
+        lines: Number of periods in `rows` for each line.
+        rows: Rows of one period.
+        limited: Limited signals: the response from the wave at the lines, and the limit.
+        seed: Seed of the random starts.
+    """
     power = amplitude**2 / np.sum(amplitude**2)
-    # Schroeder: the phase's slope by frequency goes with the power below it.
+    # Schroeder: the group delay at a line is proportional to the power below it.
     schroeder = -2.0 * np.pi * np.cumsum(np.cumsum(power) - power) * np.gradient(lines.astype(float))
     rng = np.random.default_rng(seed)
     starts = [schroeder, *rng.uniform(0.0, 2.0 * np.pi, (STARTS, len(lines)))]
-    tried = [_lowered(amplitude, lines, rows, limited, one) for one in starts]
+    tried = [_lowered(amplitude, lines, rows, limited, angles) for angles in starts]
     return min(
-        tried, key=lambda one: max(np.abs(s).max() for s in made(amplitude, lines, rows, one, limited))
+        tried,
+        key=lambda candidate: max(np.abs(s).max() for s in made(amplitude, lines, rows, candidate, limited)),
     )
 
 
 def _lowered(amplitude, lines, rows, limited, angle) -> np.ndarray:
-    size = max(np.abs(one).max() for one in made(amplitude, lines, rows, angle, limited))
+    size = max(np.abs(signal).max() for signal in made(amplitude, lines, rows, angle, limited))
 
     def mean(angle, doublings):
-        """Logarithm of the mean of a power of all signals, and its derivative by the phases."""
+        """Return the logarithm of the mean of a power of all signals, and its derivative by the phases."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
             limited, made(amplitude, lines, rows, angle, limited), strict=True
@@ -57,32 +65,32 @@ def _lowered(amplitude, lines, rows, limited, angle) -> np.ndarray:
         return np.log(total) / power, slope / total
 
     for doublings in DOUBLINGS:
-        found: Any = optimize.minimize(
+        result: Any = optimize.minimize(
             mean, angle, (doublings,), method="L-BFGS-B", jac=True, options={"maxiter": STEPS}
         )
-        angle = found.x
+        angle = result.x
     return angle
 
 
 def made(amplitude, lines, rows, angle, limited: Sequence[Limited]) -> list[np.ndarray]:
-    """One period of what is made of the wave, over its limits."""
+    """Return one period of each limited signal over its limit."""
     return [wave(amplitude * np.abs(r) / limit, lines, rows, angle + np.angle(r)) for r, limit in limited]
 
 
 def wave(amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray) -> np.ndarray:
-    """One period: sum of amplitude_l cos(2 pi l n / rows + angle_l)."""
+    """Return one period, the sum of amplitude_l cos(2 pi l n / rows + angle_l)."""
     spectrum = np.zeros(rows // 2 + 1, complex)
     spectrum[lines] = 0.5 * rows * amplitude * np.exp(1j * angle)
     return np.fft.irfft(spectrum, rows)
 
 
 def crest_factor(values: np.ndarray) -> float:
-    """Peak over rms."""
+    """Return the peak over the rms."""
     return float(np.abs(values).max() / np.sqrt(np.mean(values**2)))
 
 
 def repeated(period: np.ndarray, times: int, fade: int) -> np.ndarray:
-    """The period `times` over, with `fade` rows in front and behind through which it comes and goes."""
+    """Return the period repeated `times`, with `fade` further rows at each end for a smooth start and end."""
     whole = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
     rise = np.sin(0.5 * np.pi * np.arange(fade) / fade) ** 2
     whole[:fade] *= rise
@@ -91,5 +99,5 @@ def repeated(period: np.ndarray, times: int, fade: int) -> np.ndarray:
 
 
 def ramp(begin: float, end: float, rows: int) -> np.ndarray:
-    """From one position to another, at rest at both ends."""
+    """Return a motion from one position to another, at rest at both ends."""
     return begin + (end - begin) * np.sin(0.5 * np.pi * np.arange(rows + 1) / rows) ** 2

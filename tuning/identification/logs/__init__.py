@@ -1,1 +1,1 @@
-"""A rig's log files, read, checked and put on the grid of ticks. Needs no jax."""
+"""Reading of a rig's log files: checks and conversion to the grid of ticks, without jax."""

@@ -1,7 +1,7 @@
-"""Log files and their mapping, read, checked and put on the grid of ticks: a campaign.
+"""Campaign from log files and their mapping: reading, checks and conversion to the grid of ticks.
 
-A run has at most one contact: a log of several is cut midway between them. A contact that no channel numbers
-is numbered by its place in the file, as the lists of a mechanism file are.
+A run has at most one contact: a log with several is divided midway between them. Without a channel of contact
+numbers, contacts are numbered by their order in the file, like the lists of a mechanism file.
 """
 
 from __future__ import annotations
@@ -35,18 +35,28 @@ from tuning.identification.logs.scales import SMOOTH, check_velocity
 from tuning.identification.records import Campaign, Kind, Run, Timing
 
 TOUCHING = ("tap", "contact")
-SCRAP = 50  # rows, fewer of which between two gaps say nothing
-JUMP = 0.5  # of the fastest motion, by which the velocity changes from a run to the next one in the same log
+SCRAP = 50  # rows, least length of a segment between gaps
+JUMP = 0.5  # jump of the velocity between runs of a log, over the 95 % quantile of the speed
 
 
 def read_campaign(
     logs: Sequence[Path], mapping: LogMapping | None = None, prior: Mechanism | None = None
 ) -> Campaign:
-    """All runs of the log files, in the order of the mapping's runs and, in each, in that of the files.
+    """Read all runs of the log files, in the order of the mapping's runs and, within each, of the files.
 
-    Without a mapping the columns have our own names, and every file is a run of contacts. What a mapping does
-    not say of timing and masses is the prior's. Raises `InputError`, one line: file, row or column, what was
-    found and what is allowed.
+    Without a mapping the columns must have the names of `jaxhil simulate --log`, and every file is a run of
+    contacts. The prior provides the timing and masses that the mapping omits.
+
+    Args:
+        logs: Paths of the log files.
+        mapping: Mapping of columns to channels, or None.
+        prior: Mechanism, or None.
+
+    Returns:
+        The runs with their timing.
+
+    Raises:
+        InputError: If a log cannot be read or fails a check; the message names file, row or column.
     """
     mapping = mapping or own_mapping()
     if not logs:
@@ -59,7 +69,7 @@ def read_campaign(
             patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
             raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
     runs: list[Run] = []
-    notes: dict[str, list[str]] = {}  # which logs each is of
+    notes: dict[str, list[str]] = {}  # labels of the logs of each note
     clocks = []
     for entry in mapping.runs:
         for path in logs:
@@ -72,22 +82,22 @@ def read_campaign(
     integrator = integrator_of_all(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
         check_rows_of(runs, timing, integrator)
-    timing = replace(timing, clock=max(clocks, key=lambda one: one.jitter))
+    timing = replace(timing, clock=max(clocks, key=lambda reading_clock: reading_clock.jitter))
     sources = {path.name: _sha256(path) for path in logs}
     return Campaign(tuple(runs), timing, mass, sources, _joined(notes), integrator)
 
 
 def _joined(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return each note once, after the name of the first log that it is of and the number of the others."""
-    found = []
+    """Return each note once, with the name of its first log and the number of further logs."""
+    lines = []
     for note, labels in notes.items():
         more = len(set(labels)) - 1
-        found.append(f"{labels[0]}{f' and {more} more' * (more > 0)}: {note}")
-    return tuple(found)
+        lines.append(f"{labels[0]}{f' and {more} more' * (more > 0)}: {note}")
+    return tuple(lines)
 
 
 class _Reading:
-    """One file's runs, under one entry of the mapping."""
+    """Runs of one file under one entry of the mapping."""
 
     def __init__(
         self,
@@ -101,19 +111,19 @@ class _Reading:
         self.label, self.notes = one_line(str(path)) or "''", list[str]()
         self.kind: Kind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
-        # Contacts met so far; last tick and resting force of one that a gap cut off.
+        # Contacts so far; last tick and resting force of a contact that a gap interrupts.
         self._met, self._open = 0, None
         self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
-        # Of the contact lists the last entry repeats.
+        # The last entry of the contact lists repeats.
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
         columns, stamps, self._begin, notes = columns_of(log, mapping, timing.control_period)
         self.notes += notes
-        kept = _kept(stamps, entry, timing.control_period)
+        used = _kept(stamps, entry, timing.control_period)
         if stamps is not None:
-            self._begin += float(stamps[kept][0]) if len(stamps[kept]) else 0.0
-        stamps, columns = None if stamps is None else stamps[kept], {n: c[kept] for n, c in columns.items()}
+            self._begin += float(stamps[used][0]) if len(stamps[used]) else 0.0
+        stamps, columns = None if stamps is None else stamps[used], {n: c[used] for n, c in columns.items()}
         rows = len(next(iter(columns.values())))
         if rows < checks.FEWEST_ROWS:
             allowed = f"at least {checks.FEWEST_ROWS}"
@@ -133,7 +143,7 @@ class _Reading:
         self.runs = self._cut(channels, modes)
 
     def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[Run]:
-        """The runs: between longer gaps, changes of mode, jumps from one run to the next, and contacts."""
+        """Return the runs, divided at gaps, changes of mode, jumps between runs, and contacts."""
         tick, x = self.ticks.tick, channels["position_desired"]
         assert x is not None
         cuts = _jumps(x, channels["contact_index"])
@@ -156,7 +166,7 @@ class _Reading:
         return runs
 
     def _stretch(self, stretch: Stretch, kind: Kind) -> list[Run]:
-        """The runs of a stretch, checked: one for each contact, or the whole."""
+        """Check a segment and return its runs: one for each contact, or a single one."""
         period, force = self._timing.control_period, stretch.channels["force_measured"]
         self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
         self._ignore(stretch, "velocity_desired", check_velocity(self.label, stretch, period))
@@ -172,16 +182,16 @@ class _Reading:
             return [self._run(stretch, kind, slice(None), None, None)]
         if not touched:
             self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
-        middles = [(one[1] + two[0]) // 2 for one, two in pairwise(touched)]
+        middles = [(contact[1] + two[0]) // 2 for contact, two in pairwise(touched)]
         parts = [slice(*edges) for edges in pairwise([0, *middles, len(stretch.tick)])]
         first = self._met - len(touched)
         return [
-            self._run(stretch, kind, part, one, min(first + number, self._last))
-            for number, (part, one) in enumerate(zip(parts, touched, strict=False))
+            self._run(stretch, kind, part, contact, min(first + number, self._last))
+            for number, (part, contact) in enumerate(zip(parts, touched, strict=False))
         ]
 
     def _command_holds(self, stretch: Stretch, touched: list[tuple[int, int]]) -> bool:
-        """Tell whether a force command moves the model; take one that cannot out, with a note."""
+        """Return whether the force command moves the model; ignore the channel with a note if it cannot."""
         if stretch.channels["force_command"] is None:
             return False
         timing = self._timing
@@ -195,13 +205,13 @@ class _Reading:
         return holds
 
     def _ignore(self, stretch: Stretch, channel: str, note: str | None) -> None:
-        """Take a channel out of a stretch where a note says why."""
+        """Remove a channel of a segment if there is a note with the reason."""
         if note is not None:
             self.notes.append(note)
             stretch.channels[channel] = None
 
     def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
-        """The contacts of a stretch, and how many there were so far; one may go on over a gap."""
+        """Return the contacts of a segment, and count them; a contact may continue after a gap."""
         period, rest = self._timing.control_period, None
         if self._open is not None and (tick[0] - self._open[0]) * period < segments.APART:
             rest = self._open[1]
@@ -215,8 +225,10 @@ class _Reading:
     def _run(
         self, stretch: Stretch, kind: Kind, part: slice, touched: tuple[int, int] | None, number: int | None
     ) -> Run:
-        """A part of a stretch, with the contact of that number where no channel tells it."""
-        channels = {name: None if one is None else one[part] for name, one in stretch.channels.items()}
+        """Return a part of a segment as a run, with the contact's number if no channel contains it."""
+        channels = {
+            name: None if values is None else values[part] for name, values in stretch.channels.items()
+        }
         tick, index = stretch.tick[part], channels["contact_index"]
         if index is None and number is not None:
             index = np.full(len(tick), number, np.int64)
@@ -241,8 +253,8 @@ class _Reading:
 
 
 def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
-    said, rig = mapping.timing, None if prior is None else prior.rig
-    period = said.control_period or (rig and rig.control_period)
+    spec, rig = mapping.timing, None if prior is None else prior.rig
+    period = spec.control_period or (rig and rig.control_period)
     if period is None and mapping.channels.time.rate is not None:
         period = 1.0 / mapping.channels.time.rate
     if period is None:
@@ -252,14 +264,14 @@ def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
         raise InputError(
             f"channels.time.rate: found {rate:g} Hz, allowed 1 / control_period, {1 / period:g} Hz"
         )
-    hold = said.command_hold or (rig.command_hold if rig else "linear")
-    latency = said.command_latency if said.command_latency is not None else rig.command_latency if rig else 0
-    late, separate = said.computing_delay, said.clock == "separate"
-    return Timing(period, hold, latency, said.row, None, late, separate)
+    hold = spec.command_hold or (rig.command_hold if rig else "linear")
+    latency = spec.command_latency if spec.command_latency is not None else rig.command_latency if rig else 0
+    late, separate = spec.computing_delay, spec.clock == "separate"
+    return Timing(period, hold, latency, spec.row, None, late, separate)
 
 
 def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
-    """Rows from begin to end."""
+    """Return the rows from the begin to the end of an entry."""
     if stamps is None:
         return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
     first = int(np.searchsorted(stamps, entry.begin)) if entry.begin else 0
@@ -267,7 +279,7 @@ def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
 
 
 def _modes(values: np.ndarray | None, mapping: LogMapping, kind: Kind, label: str) -> np.ndarray | None:
-    """What was done, row by row, as places in `KINDS`."""
+    """Return the kind of experiment at each row as an index into `KINDS`, or None without a mode channel."""
     channel = mapping.channels.mode
     if values is None or channel is None:
         return None
@@ -275,17 +287,17 @@ def _modes(values: np.ndarray | None, mapping: LogMapping, kind: Kind, label: st
     kinds = []
     for name in named.tolist():
         word = name[:-2] if name.endswith(".0") else name
-        found = channel.values.get(word, word)
-        if found not in KINDS:
+        kind_name = channel.values.get(word, word)
+        if kind_name not in KINDS:
             row = int(np.flatnonzero(inverse == len(kinds))[0]) + 1
             allowed = f"one of {', '.join([*channel.values, *KINDS])}"
             raise InputError(f"{label}: row {row}: mode: found {shown(word)}, allowed {allowed}")
-        kinds.append(KINDS.index(found))
+        kinds.append(KINDS.index(kind_name))
     return np.array(kinds)[inverse]
 
 
 def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    """Rows at which another contact begins somewhere else, as the runs of a simulation follow one another."""
+    """Return the rows at which another contact begins at another position, as in simulations."""
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
@@ -295,8 +307,8 @@ def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
 
 
 def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
-    """Of the approach to a contact [m/s]."""
-    # The force was there for some ticks before it was beyond the noise.
+    """Return the approach speed of a contact [m/s], or None."""
+    # The contact begins some ticks before its force exceeds the noise.
     before = begin - SMOOTH
     if before < SMOOTH:
         return None
@@ -304,11 +316,11 @@ def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
 
 
 def _sha256(path: Path) -> str:
-    """Of a file; of a folder, of its files' names and contents."""
+    """Return the hash of a file, or of the names and contents of a folder's files."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    whole = hashlib.sha256()
-    for part in sorted(one for one in path.rglob("*") if one.is_file()):
-        whole.update(f"{_sha256(part)} {part.relative_to(path).as_posix()}\n".encode())
-    return whole.hexdigest()
+    digest = hashlib.sha256()
+    for part in sorted(entry for entry in path.rglob("*") if entry.is_file()):
+        digest.update(f"{_sha256(part)} {part.relative_to(path).as_posix()}\n".encode())
+    return digest.hexdigest()

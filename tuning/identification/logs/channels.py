@@ -1,4 +1,4 @@
-"""Channels of a log in SI units, at the rows of the desired position, as its mapping names them."""
+"""Channels of a log in SI units, at the rows of the desired position, according to its mapping."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ NUMBERS = (
     "contact_index",
 )
 
-STAMPS = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # names of columns of stamps in a group
+STAMPS = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # column names of stamps in a group
 
 
 def columns_of(
     log: Log, mapping: LogMapping, period: float
 ) -> tuple[Columns, np.ndarray | None, float, list[str]]:
-    """The channels that are there, in SI units, the stamps [s] from the first, that one, and notes."""
+    """Return the available channels in SI units, the stamps from the first one [s], that one, and notes."""
     channels = mapping.channels
     wanted: dict[str, str] = {}
     for name in (*NUMBERS, "mode"):
@@ -36,7 +36,7 @@ def columns_of(
         if channel is not None and (required or channel.column in log.names):
             wanted[name] = channel.column
     stamps = [channels.time.column, *(getattr(channels, name).time for name in wanted if name != "mode")]
-    read = log.read(list(dict.fromkeys([*wanted.values(), *(one for one in stamps if one is not None)])))
+    read = log.read(list(dict.fromkeys([*wanted.values(), *(name for name in stamps if name is not None)])))
     columns: Columns = {}
     for name, column in wanted.items():
         values = read[column]
@@ -63,49 +63,50 @@ def columns_of(
 def _clocks(
     log: Log, mapping: LogMapping, wanted: Mapping[str, str], read: Columns
 ) -> dict[str, np.ndarray | None] | None:
-    """Stamps of each channel where not all have the same; None where the rows of the log are those of all."""
+    """Return the stamps of each channel if they differ; None if all channels share the rows of the log."""
     named = {name: getattr(getattr(mapping.channels, name), "time", None) for name in wanted}
     if any(named.values()):
         return _named_clocks(log.label, mapping, named, read)
     _check_stamps_beside(log, mapping, wanted)
-    own = log.clocks(list(wanted.values()))
-    clocks = {name: own.get(column) for name, column in wanted.items()}
+    stamps_by_column = log.clocks(list(wanted.values()))
+    clocks = {name: stamps_by_column.get(column) for name, column in wanted.items()}
     master = clocks[joining.MASTER]
-    other = [wanted[name] for name, one in clocks.items() if not joining.same_clock(one, master)]
-    if not other:
+    different = [wanted[name] for name, t in clocks.items() if not joining.same_clock(t, master)]
+    if not different:
         return None
-    time, since = mapping.channels.time, f"{shown(other[0])} has a clock of its own"
+    time, since = mapping.channels.time, f"{shown(different[0])} has a clock of its own"
     if mapping.timing.clock == "index":
         raise InputError(f'{log.label}: timing.clock: found "index", allowed "stamps", since {since}')
     if time.column is not None and time.column not in log.stamps:
-        allowed = ", ".join(sorted(one_line(one, 40) for one in log.stamps)[:4])
-        found = f"column {shown(time.column)}"
-        raise InputError(f"{log.label}: time: found {found}, allowed one of {allowed}, since {since}")
+        allowed = ", ".join(sorted(one_line(column, 40) for column in log.stamps)[:4])
+        found_text = f"column {shown(time.column)}"
+        raise InputError(f"{log.label}: time: found {found_text}, allowed one of {allowed}, since {since}")
     return clocks
 
 
 def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
-    """Raise `InputError` if a group of columns has stamps of its own that are not those of the rows.
+    """Raise `InputError` if a group of columns has stamps that differ from those of the rows.
 
-    Groups are those of HDF5, MAT and TDMS, by the names of columns."""
+    The names of columns define the groups of HDF5, MAT and TDMS files.
+    """
     time = mapping.channels.time
     if time.column is None or log.stamps:
         return
     for name, column in wanted.items():
         for stamps in _stamps_beside(column, time.column, log.names):
             read = log.read([time.column, stamps])
-            rows, own = read[time.column], read[stamps]
-            if rows.dtype == object or own.dtype == object or min(len(rows), len(own)) < 2:
+            rows, times = read[time.column], read[stamps]
+            if rows.dtype == object or times.dtype == object or min(len(rows), len(times)) < 2:
                 continue
-            step, other = float(np.median(np.diff(rows))), float(np.median(np.diff(own)))
-            if not (step > 0.0 and other > 0.0):
+            step, group_step = float(np.median(np.diff(rows))), float(np.median(np.diff(times)))
+            if not (step > 0.0 and group_step > 0.0):
                 continue
-            # Stamps may be in another unit of time.
-            power = round(float(np.log10(other / step)) / 3.0)
-            own = own * 1000.0**-power
-            if abs(other * 1000.0**-power / step - 1.0) > clock.RATE:
-                continue  # of another kind, such as a count
-            if len(rows) == len(own) and np.max(np.abs(own - rows)) <= joining.AT_A_ROW * step:
+            # The stamps may have another unit of time.
+            power = round(float(np.log10(group_step / step)) / 3.0)
+            times = times * 1000.0**-power
+            if abs(group_step * 1000.0**-power / step - 1.0) > clock.RATE:
+                continue  # not a time, for example a count
+            if len(rows) == len(times) and np.max(np.abs(times - rows)) <= joining.AT_A_ROW * step:
                 continue
             raise InputError(
                 f"{log.label}: column {shown(column)}: found stamps of its own in {shown(stamps)} that are "
@@ -114,20 +115,20 @@ def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str
 
 
 def _stamps_beside(column: str, time: str, names: Sequence[str]) -> list[str]:
-    """Return columns named like stamps in the groups of a column that do not hold those of the rows."""
-    found = []
-    for other in names:
-        name = re.split(r"[/.]", other)[-1]
-        parent = other[: len(other) - len(name)]
+    """Return stamp columns in the groups of a column that do not contain the stamps of the rows."""
+    result = []
+    for candidate in names:
+        name = re.split(r"[/.]", candidate)[-1]
+        parent = candidate[: len(candidate) - len(name)]
         if parent and column.startswith(parent) and not time.startswith(parent) and STAMPS.search(name):
-            found.append(other)
-    return [one for one in found if one != column]
+            result.append(candidate)
+    return [name for name in result if name != column]
 
 
 def _named_clocks(
     label: str, mapping: LogMapping, named: Mapping[str, str | None], read: Columns
 ) -> dict[str, np.ndarray | None]:
-    """Stamps [s] of each channel by the columns that the mapping names, from the first one of them all."""
+    """Return the stamps [s] of each channel from the columns in the mapping, relative to the first of all."""
     time = mapping.channels.time
     if mapping.timing.clock == "index":
         name = next(name for name, column in named.items() if column)
@@ -147,6 +148,7 @@ def _named_clocks(
 
 
 def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
+    """Return the stamps [s] from the first one, and that one; None without a column of stamps."""
     time = mapping.channels.time
     if time.column is None:
         return None, 0.0
@@ -157,6 +159,6 @@ def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray 
         allowed = "numbers, or a time_format beside the column"
         raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
     checks.check_rows(label, "time", stamps)
-    # The first stamp may count from an epoch: what is left has digits to spare.
+    # The first stamp may count from an epoch; subtracting it before the conversion saves digits.
     factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
     return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0

@@ -1,8 +1,8 @@
-"""Whether channels are what they are said to be: unit, sign, convention, one for the other.
+"""Checks that channels agree with their mapping: unit, sign and row convention.
 
-A wrong sign or unit, or a row that holds another tick's command, would make a good fit of a rig that there is
-not. The numerical model is known exactly, so that its own motion tells: commands follow from the logged force
-command by Newton's law, and the change of speed in a contact from the measured force.
+A wrong sign, a wrong unit or a row with another tick's command would give a good fit of a rig that does not
+exist. The numerical model is known exactly, so its motion reveals such errors: the commands follow from the
+logged force command by Newton's law, and the change of speed in a contact from the measured force.
 """
 
 from __future__ import annotations
@@ -14,34 +14,36 @@ from tuning.identification.logs import segments
 from tuning.identification.logs.rows import Stretch
 from tuning.identification.logs.scales import SMOOTH, at_rest, check_gain, check_impulse
 
-FEWEST_ROWS = 200
-APART = 0.01  # s, between two contacts on one side
-PULLED = 0.3  # share of a change of momentum that readings must explain
-CLIPPED = 10  # repeats of the largest reading, from which it is a limit
-LARGEST_NUMBER = 1e30  # nanoseconds since an epoch are 1e18
+FEWEST_ROWS = 200  # rows, shortest log
+APART = 0.01  # s, least time between two contacts on the far side
+PULLED = 0.3  # share of the change of momentum that shows a contact on the far side
+CLIPPED = 10  # repetitions of the largest reading that show clipping
+LARGEST_NUMBER = 1e30  # largest valid number; nanoseconds since an epoch are 1e18
 LARGEST_STROKE = 1.0  # m
 SMALLEST_STROKE = 1e-5  # m
 FASTEST = 5.0  # m/s
-MOST_LAG = 400  # ticks, of a reading behind its command
-HELD = 0.4  # share of rows that repeat a reading, beyond which it is one that is held
-LONGEST_HELD = 20  # rows
-ALWAYS = 0.9  # share of the changes that come as far apart as most
-FOLLOWS = 0.3  # correlation of speeds, below which a reading does not follow its command
-SAMPLE = 200_000  # rows looked at, where some say as much as all
+MOST_LAG = 400  # ticks, largest delay of a reading behind its command
+HELD = 0.4  # share of repeated readings, above which a note warns of held readings
+LONGEST_HELD = 20  # rows, longest regular repetition
+ALWAYS = 0.9  # share of changes at the most common distance that shows regular repetition
+FOLLOWS = 0.3  # correlation of speeds, below which a note says that the reading does not follow
+SAMPLE = 200_000  # rows that are sufficient
 
 
 def check_rows(label: str, name: str, values: np.ndarray) -> None:
-    """All are numbers that can be read from a sensor or a clock."""
+    """Raise `InputError` if a value cannot be a reading of a sensor or a clock."""
     bad = np.flatnonzero(~(np.abs(values) <= LARGEST_NUMBER))
     if len(bad):
-        row, found = int(bad[0]) + 1, float(values[bad[0]])
+        row, value = int(bad[0]) + 1, float(values[bad[0]])
         allowed = f"a finite number of at most {LARGEST_NUMBER:g}"
-        raise InputError(f"{label}: row {row}: {name}: found {found:g}, allowed {allowed}")
+        raise InputError(f"{label}: row {row}: {name}: found {value:g}, allowed {allowed}")
 
 
 def check_motion(label: str, kind: str, stretch: Stretch, period: float, hold: str) -> list[str]:
-    """Position channels of one stretch: size, excitation, one against the other; drives with the `hold`
-    "linear" get a command every row. Returns notes."""
+    """Check the position channels of a segment: size, excitation, and agreement; return notes.
+
+    With the `hold` "linear" the command must change in every row.
+    """
     x, measured = (_of(stretch, name)[stretch.valid] for name in ("position_desired", "position_measured"))
     if kind == "rest":
         return []
@@ -71,27 +73,29 @@ def check_force(
     mass: float,
     command_holds: bool = False,
 ) -> list[str]:
-    """Check sign and unit of the measured force: of contacts by the change of speed, of a press by motion.
+    """Check the sign and unit of the measured force by the change of speed, or of a press by the motion.
 
-    `command_holds`: whether force_command was found to move the model.
+    `command_holds` says whether force_command moves the model.
 
-    Returns notes, such as that not every row has a reading of its own."""
+    Returns:
+        Notes, for example that the force does not have a new reading in every row.
+    """
     force = _of(stretch, "force_measured")
-    found = force[stretch.valid]
-    if np.ptp(found) == 0.0:
-        raise InputError(f"{label}: force_measured: found {found[0]:g} N in every row, allowed a reading")
+    readings = force[stretch.valid]
+    if np.ptp(readings) == 0.0:
+        raise InputError(f"{label}: force_measured: found {readings[0]:g} N in every row, allowed a reading")
     if kind == "press":
         measured = _of(stretch, "position_measured")[stretch.valid]
-        if np.corrcoef(found, measured)[0, 1] < -0.5:
+        if np.corrcoef(readings, measured)[0, 1] < -0.5:
             raise _wrong_sign(label, "falls where the hardware is pushed deeper")
-        return _late(label, found)
-    top = np.abs(found) >= np.max(np.abs(found))
+        return _late(label, readings)
+    top = np.abs(readings) >= np.max(np.abs(readings))
     clipped = bool(np.count_nonzero(top[1:] & top[:-1]) >= CLIPPED)
     if kind == "contact":
         pull = np.minimum(force - at_rest(force, touched), 0.0)
         _check_one_side(label, pull, _of(stretch, "position_desired"), period, mass)
     check_impulse(label, kind, stretch, touched, period, mass, command_holds, clipped)
-    notes = _late(label, found)
+    notes = _late(label, readings)
     if clipped:
         notes.append(
             f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
@@ -100,7 +104,7 @@ def check_force(
 
 
 def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, mass: float) -> None:
-    """Raise `InputError` if a contact turns falling positions round, as the far side of a clearance does."""
+    """Raise `InputError` if a contact reverses a retracting motion, like the far surface of a clearance."""
     for begin, end in segments.contacts(pull, period, 0.0, apart=APART):
         begin, end = begin - SMOOTH, end + SMOOTH
         if begin < SMOOTH or end + SMOOTH >= len(x):
@@ -115,7 +119,7 @@ def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, 
 
 
 def _late(label: str, force: np.ndarray) -> list[str]:
-    """A note where readings come more seldom than rows."""
+    """Return a note if there are fewer readings than rows."""
     rows = changes_every(force)
     if rows == 1:
         return []
@@ -123,27 +127,27 @@ def _late(label: str, force: np.ndarray) -> list[str]:
 
 
 def changes_every(values: np.ndarray) -> int:
-    """Every how many rows the values change, where that is always the same; else 1."""
+    """Return the regular number of rows between changes of the values, or 1."""
     steps = np.diff(values[:SAMPLE])
     apart = np.diff(np.flatnonzero(steps))
     if len(apart) < FEWEST_ROWS // 10:
         return 1
     usual = int(np.median(apart))
-    # Rounded values of a steady motion change as regularly, by one unit of their last digit.
+    # Rounded values of a steady motion also change regularly, by one unit of their last digit.
     coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _resolution(values)
-    held = 1 < usual <= LONGEST_HELD and np.mean(apart == usual) > ALWAYS and not coarse
-    return usual if held else 1
+    is_held = 1 < usual <= LONGEST_HELD and np.mean(apart == usual) > ALWAYS and not coarse
+    return usual if is_held else 1
 
 
 def _resolution(values: np.ndarray) -> float:
-    """What all steps are multiples of; 0 where there is no such number."""
+    """Return the step of which all differences are multiples, or 0."""
     steps = np.diff(np.unique(values[np.isfinite(values)][:SAMPLE]))
     least = float(np.min(steps, initial=np.inf))
     return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
 
 
 def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) -> None:
-    """Strokes and speeds of rigs: metres taken for millimetres, and the other way round, stand out."""
+    """Raise `InputError` for strokes or speeds that indicate a wrong unit."""
     for name, values in (("position_desired", x), ("position_measured", measured)):
         stroke = float(np.ptp(values))
         if not SMALLEST_STROKE <= stroke <= LARGEST_STROKE:
@@ -155,15 +159,15 @@ def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) 
             raise InputError(f"{label}: {name}: found speeds of {speed:.3g} m/s, allowed {allowed}")
     ratio = float(np.ptp(measured) / np.ptp(x))
     if not 0.02 <= ratio <= 50:
-        found = f"a stroke {ratio:.3g} times that of position_desired"
+        stroke_text = f"a stroke {ratio:.3g} times that of position_desired"
         raise InputError(
-            f"{label}: position_measured: found {found}, allowed a like one (is its unit right?)"
+            f"{label}: position_measured: found {stroke_text}, allowed a like one (is its unit right?)"
         )
 
 
 def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """The reading follows its command, the same way round."""
-    command, reading = ((one[SMOOTH:] - one[:-SMOOTH])[:SAMPLE] for one in (x, measured))
+    """Check that the reading follows its command with the same sign; return notes."""
+    command, reading = ((values[SMOOTH:] - values[:-SMOOTH])[:SAMPLE] for values in (x, measured))
     command, reading = command - np.mean(command), reading - np.mean(reading)
     scale = float(np.linalg.norm(command) * np.linalg.norm(reading))
     if scale == 0.0:
@@ -172,8 +176,9 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
     lags = lags[np.abs(lags) < len(command) // 2]
     size = 2 ** int(np.ceil(np.log2(2 * len(command))))
     spectrum = np.fft.rfft(reading, size) * np.conj(np.fft.rfft(command, size))
-    found = np.fft.irfft(spectrum, size)[lags] / scale
-    lag, strength = int(lags[np.argmax(np.abs(found))]), float(found[np.argmax(np.abs(found))])
+    correlation = np.fft.irfft(spectrum, size)[lags] / scale
+    best = np.argmax(np.abs(correlation))
+    lag, strength = int(lags[best]), float(correlation[best])
     if abs(strength) < FOLLOWS:
         return [f"{label}: position_measured: hardly follows position_desired (correlation {strength:.2g})"]
     if strength < 0:
@@ -181,30 +186,32 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
             f"{label}: position_measured: found one that moves against the command, allowed the other sign"
         )
     if lag <= -2:
-        found = f"one that leads position_desired by {-lag} ticks"
+        finding = f"one that leads position_desired by {-lag} ticks"
         raise InputError(
-            f"{label}: position_measured: found {found}, allowed one that follows (are the two swapped?)"
+            f"{label}: position_measured: found {finding}, allowed one that follows (are the two swapped?)"
         )
     check_gain(label, kind, x, measured)
     return []
 
 
 def _held(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """A note where readings stay the same while the command moves by more than they are rounded to."""
+    """Return a note if readings are constant while the command moves by more than their resolution."""
     moving = np.abs(np.diff(x)) > _resolution(measured)
     if np.count_nonzero(moving) < FEWEST_ROWS // 2:
         return []
     share = float(np.mean(np.diff(measured)[moving] == 0.0))
     if share < HELD:
         return []
-    held = 1 / (1 - share) if share < 1 else np.inf
-    said = f"the same in {100 * share:.0f} % of rows, as if each reading was held for {held:.2g} of them"
-    return [f"{label}: position_measured: {said}: its delay is then longer by half of that"]
+    rows_held = 1 / (1 - share) if share < 1 else np.inf
+    message = (
+        f"the same in {100 * share:.0f} % of rows, as if each reading was held for {rows_held:.2g} of them"
+    )
+    return [f"{label}: position_measured: {message}: its delay is then longer by half of that"]
 
 
-def _wrong_sign(label: str, what: str) -> InputError:
+def _wrong_sign(label: str, problem: str) -> InputError:
     return InputError(
-        f"{label}: force_measured: found one that {what}, allowed the other sign: F > 0 pushes back"
+        f"{label}: force_measured: found one that {problem}, allowed the other sign: F > 0 pushes back"
     )
 
 

@@ -1,12 +1,11 @@
-"""Logs in formats of other tools, each read by that format's own library; imported when one is met.
+"""Logs in third-party formats, each read by the library of that format, which is imported on demand.
 
-Every function takes a path and returns the names of the columns, a function that reads some of them and,
-where the format has stamps for each of them, one that returns these. Fields of structures are joined by a dot
-(`log.force`); the columns of a matrix are counted from 1 (`log.signals_2`). Stamps that count from an epoch
-are in s from the first one of the log.
+Every function takes a path and returns a `Reader`. Fields of structures are joined by a dot (`log.force`);
+the columns of a matrix are counted from 1 (`log.signals_2`). Stamps that count from an epoch are in s from
+the first one of the log.
 """
 
-# Whoever has no such log need not have the library.
+# The libraries are optional.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ Columns = dict[str, np.ndarray]
 
 
 class Reader(NamedTuple):
-    """A log that was opened."""
+    """Open log: names of its columns, and functions that read them."""
 
     names: list[str]  # of its columns
     read: Callable[[Sequence[str]], Columns]
-    # Stamps [s] of columns that were read, from one zero; None where the format knows no clocks of columns.
+    # Stamps [s] of columns that were read, with a common zero; None if the format has none.
     clocks: Callable[[Sequence[str]], dict[str, np.ndarray | None]] | None = None
-    stamps: Collection[str] = ()  # columns that are such stamps
+    stamps: Collection[str] = ()  # columns that contain such stamps
 
 
 def mat(path: Path) -> Reader:
-    """MATLAB's MAT files, of version 5 and 7.3."""
+    """Open a MATLAB MAT file, version 5 or 7.3."""
     from pymatreader import read_mat
 
     def flat(name: str, value: Any) -> Columns:
@@ -41,8 +40,8 @@ def mat(path: Path) -> Reader:
             return _joined(name, value, flat)
         return _columns(name, value)
 
-    found = read_mat(str(path))
-    columns = _joined("", {name: one for name, one in found.items() if not name.startswith("__")}, flat)
+    content = read_mat(str(path))
+    columns = _joined("", {name: value for name, value in content.items() if not name.startswith("__")}, flat)
     if not columns:
         export = "export signals as arrays, or as a structure with time"
         raise ValueError(f"found no numbers, allowed arrays or structures of them: {export}")
@@ -50,39 +49,41 @@ def mat(path: Path) -> Reader:
 
 
 def hdf5(path: Path) -> Reader:
-    """HDF5: every dataset of numbers, by its path without the first slash."""
+    """Open an HDF5 file; a column is a numeric dataset, named by its path without the first slash."""
     import h5py
 
     places: dict[str, tuple[str, str | None, int | None]] = {}
     with h5py.File(path, "r") as file:
 
-        def visit(name: str, one: Any) -> None:
-            if not isinstance(one, h5py.Dataset) or one.ndim not in (1, 2):
+        def visit(name: str, item: Any) -> None:
+            if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2):
                 return
-            if one.dtype.names:
-                places.update({f"{name}.{part}": (name, part, None) for part in one.dtype.names})
-            elif one.ndim == 1:
+            if item.dtype.names:
+                places.update({f"{name}.{part}": (name, part, None) for part in item.dtype.names})
+            elif item.ndim == 1:
                 places[name] = name, None, None
             else:
-                places.update({f"{name}_{place + 1}": (name, None, place) for place in range(one.shape[1])})
+                places.update(
+                    {f"{name}_{column + 1}": (name, None, column) for column in range(item.shape[1])}
+                )
 
         file.visititems(visit)
 
     def read(wanted: Sequence[str]) -> Columns:
         with h5py.File(path, "r") as file:
-            found = {}
+            columns = {}
             for column in wanted:
-                name, part, place = places[column]
+                name, part, index = places[column]
                 data: Any = file[name]
-                values = data[:, place] if place is not None else data[part] if part else data[()]
-                found[column] = _numbers(column, values)
-            return found
+                values = data[:, index] if index is not None else data[part] if part else data[()]
+                columns[column] = _numbers(column, values)
+            return columns
 
     return Reader(list(places), read)
 
 
 def bag(path: Path) -> Reader:
-    """ROS 2 bags, sqlite3 or MCAP: `/topic.field`, and `/topic.time`, when the message was recorded."""
+    """Open a ROS 2 bag, sqlite3 or MCAP; columns are `/topic.field` and `/topic.time`, the recording time."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -97,7 +98,7 @@ def bag(path: Path) -> Reader:
     columns, topics, stamps = {}, {}, {}
     zero = min((fields["time"][0] for fields in rows.values()), default=0)
     for topic, fields in rows.items():
-        # Nanoseconds since an epoch have more digits than a float.
+        # Subtract in integers: nanoseconds since an epoch have more digits than a float.
         stamps[topic] = 1e-9 * (np.array(fields["time"]) - zero)
         for name, values in fields.items():
             if len(values) == len(fields["time"]):
@@ -113,26 +114,26 @@ def bag(path: Path) -> Reader:
 
 
 def mdf(path: Path) -> Reader:
-    """ASAM MDF: channels by their names, and `time`, the master of the first one that is read."""
+    """Open an ASAM MDF file; `time` is the master of the first channel that is read."""
     from asammdf import MDF
 
     with MDF(path) as file:
         groups = {name: places[0][0] for name, places in file.channels_db.items() if name != "time"}
     names = list(groups)
-    masters: dict[int, np.ndarray] = {}  # of each group, once it was read
+    masters: dict[int, np.ndarray] = {}  # stamps of each group that was read
 
     def read(wanted: Sequence[str]) -> Columns:
-        found = {}
+        columns = {}
         with MDF(path) as file:
             signals = [name for name in wanted if name != "time"]
             for name in signals or names[:1]:
                 signal = file.get(name)
                 masters.setdefault(groups[name], np.asarray(signal.timestamps, float))
                 if name in wanted:
-                    found[name] = _numbers(name, signal.samples)
+                    columns[name] = _numbers(name, signal.samples)
             if "time" in wanted:
-                found["time"] = masters[groups[(signals or names)[0]]]
-        return found
+                columns["time"] = masters[groups[(signals or names)[0]]]
+        return columns
 
     def clocks(wanted: Sequence[str]) -> dict[str, np.ndarray | None]:
         return {name: masters[groups[name]] for name in wanted if name != "time"}
@@ -141,7 +142,7 @@ def mdf(path: Path) -> Reader:
 
 
 def tdms(path: Path) -> Reader:
-    """NI TDMS: `group/channel`, and `group/channel.time` where the channel has a rate of its own."""
+    """Open an NI TDMS file; `group/channel.time` exists if the channel has its own rate."""
     from nptdms import TdmsFile
 
     channels, group_of = {}, {}
@@ -150,13 +151,13 @@ def tdms(path: Path) -> Reader:
         for channel in group.channels():
             channels[f"{group.name}/{channel.name}"] = channel
             group_of[f"{group.name}/{channel.name}"] = group.name
-    waves = {name: one for name, one in channels.items() if one.properties.get("wf_increment")}
-    begins = {name: one.properties.get("wf_start_time") for name, one in waves.items()}
-    begins = {name: _nanoseconds(one) for name, one in begins.items() if one is not None}
+    waves = {name: channel for name, channel in channels.items() if channel.properties.get("wf_increment")}
+    begins = {name: channel.properties.get("wf_start_time") for name, channel in waves.items()}
+    begins = {name: _nanoseconds(stamp) for name, stamp in begins.items() if stamp is not None}
     zero = min(begins.values(), default=0)
 
     def wave(name: str) -> tuple[float, float, int]:
-        """When a channel's first reading is [s], the distance of the others, and how many there are."""
+        """Return a channel's first time [s], the distance of its readings [s], and their number."""
         if begins and name not in begins:
             raise ValueError(f"column {shown(name)}: found no wf_start_time, allowed one, as others have")
         properties = waves[name].properties
@@ -165,20 +166,20 @@ def tdms(path: Path) -> Reader:
 
     def stamps(name: str) -> np.ndarray | None:
         if name not in waves:
-            # A channel that says nothing goes by the others of its group, where these agree.
-            group = [one for one in waves if group_of[one] == group_of[name]]
-            if len({wave(one) for one in group}) != 1 or len(waves[group[0]]) != len(channels[name]):
+            # A channel without a rate has that of the other channels of its group, if these agree.
+            group = [member for member in waves if group_of[member] == group_of[name]]
+            if len({wave(member) for member in group}) != 1 or len(waves[group[0]]) != len(channels[name]):
                 return None
             name = group[0]
         begin, step, rows = wave(name)
         return begin + step * np.arange(rows)
 
     def read(wanted: Sequence[str]) -> Columns:
-        found = {}
+        columns = {}
         for name in wanted:
-            own = stamps(name.removesuffix(".time")) if name in timed else None
-            found[name] = own if own is not None else _numbers(name, channels[name][:])
-        return found
+            own_stamps = stamps(name.removesuffix(".time")) if name in timed else None
+            columns[name] = own_stamps if own_stamps is not None else _numbers(name, channels[name][:])
+        return columns
 
     timed = [f"{name}.time" for name in waves]
     return Reader(
@@ -205,7 +206,7 @@ def _joined(name: str, parts: Mapping[str, Any], flat: Callable[[str, Any], Colu
 
 
 def _columns(name: str, value: Any) -> Columns:
-    """Those of a vector or a matrix of numbers; none of anything else."""
+    """Return the columns of a numeric vector or matrix, else nothing."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -214,30 +215,30 @@ def _columns(name: str, value: Any) -> Columns:
         return {}
     if array.ndim == 1:
         return {name: array.astype(float)}
-    return {f"{name}_{place + 1}": column.astype(float) for place, column in enumerate(array.T)}
+    return {f"{name}_{index + 1}": column.astype(float) for index, column in enumerate(array.T)}
 
 
 def _fields(message: Any, name: str = "") -> list[tuple[str, float]]:
-    """The numbers of a message, by their paths."""
-    found: list[tuple[str, float]] = []
+    """Return the numbers of a message with their paths."""
+    fields: list[tuple[str, float]] = []
     for part, value in vars(message).items():
         path = f"{name}.{part}".lstrip(".")
         if part.startswith("__"):
             continue
         if isinstance(value, (bool, int, float, np.number)):
-            found.append((path, float(value)))
+            fields.append((path, float(value)))
         elif hasattr(value, "__dataclass_fields__"):
-            found += _fields(value, path)
+            fields += _fields(value, path)
         elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-            found += [(f"{path}_{place + 1}", float(one)) for place, one in enumerate(value.ravel())]
-    return found
+            fields += [(f"{path}_{index + 1}", float(number)) for index, number in enumerate(value.ravel())]
+    return fields
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:
     array = np.asarray(values)
     if array.dtype.kind == "M":
-        whole = array.astype("datetime64[ns]").astype(np.int64)
-        return 1e-9 * (whole - whole[:1])
+        nanoseconds = array.astype("datetime64[ns]").astype(np.int64)
+        return 1e-9 * (nanoseconds - nanoseconds[:1])
     if array.dtype.kind not in "biuf" or array.ndim != 1:
         raise ValueError(
             f"column {shown(name)}: found {array.dtype} of {array.ndim} axes, allowed numbers, one a row"

@@ -1,8 +1,8 @@
-"""A draft of a mapping, from the names of columns and from what is in them: to be read before it is used.
+"""Draft of a mapping file, from the names and the contents of columns; the user has to check it.
 
-Names tell which channel a column is and, in brackets or behind an underscore, its unit; numbers tell the unit
-where no name does, and the signs: contact is deepest where the force is largest, and a force that pushes back
-is positive.
+The name of a column indicates its channel and, in brackets or after an underscore, its unit. The values
+indicate a missing unit and the signs: contact is deepest where the force is largest, and a repelling force is
+positive.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tuning.identification.logs.readers import Columns, Log, open_log
 from tuning.identification.logs.segments import resting, threshold
 from tuning.identification.logs.units import OF_CHANNEL
 
-# Words of names, the most telling first: a column is what its first match says.
+# Patterns of names, the most specific first: the first match decides the channel of a column.
 WORDS = {
     "time": r"^t$|time|stamp|clock",
     "velocity_desired": r"^v_?d$|vel\w*_?(des|cmd|com|ref)|(des|cmd|com|ref)\w*_?vel",
@@ -35,18 +35,18 @@ WORDS = {
     "position_measured": r"^x_?m$|^x_?a$|pos|meas|actual|feedback|disp|lvdt|encoder|^x$",
 }
 REQUIRED = ("position_desired", "position_measured")
-TYPICAL = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}  # largest, in SI units
-LOOK = 200_000  # rows
-SIZES = (("s", 1.0), ("ms", 1e-3), ("us", 1e-6))
-# Hz, that control loops run at.
+# Typical largest values in SI units.
+TYPICAL = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}
+LOOK = 200_000  # rows that are read
+# Hz, common rates of control loops.
 RATES = (100, 125, 200, 250, 400, 500, 800, 1000, 1024, 1250, 1600, 2000, 2048, 2500, 4000, 5000, 8000)
-SLOWEST = 0.02  # s, between rows
+SLOWEST = 0.02  # s, largest time between rows
 
 _UNITS = {unit for units in OF_CHANNEL.values() for unit in units if unit != "m"}
 
 
 class Guess(NamedTuple):
-    """A channel's column, unit and sign, and what they are guessed from."""
+    """Column, unit and sign of a channel, with the reason of the guess."""
 
     column: str
     unit: str | None
@@ -55,7 +55,11 @@ class Guess(NamedTuple):
 
 
 def draft(paths: Sequence[Path]) -> str:
-    """The text of a mapping file for these logs. Raises `InputError` where not even that can be told."""
+    """Return the text of a mapping file for these logs.
+
+    Raises:
+        InputError: If there is no log, or no column for a required channel.
+    """
     if not paths:
         raise InputError("logs: found none, allowed one or more files")
     logs = {path: open_log(path) for path in paths}
@@ -63,45 +67,45 @@ def draft(paths: Sequence[Path]) -> str:
     columns = _columns(first.names)
     for name in REQUIRED:
         if name not in columns:
-            some = ", ".join(one_line(one, 40) for one in first.names[:12])
-            raise InputError(f"{first.label}: found no column named like {name} among {some}, allowed one")
+            names = ", ".join(one_line(column, 40) for column in first.names[:12])
+            raise InputError(f"{first.label}: found no column named like {name} among {names}, allowed one")
     kinds = {path: _kind(path, log, columns) for path, log in logs.items()}
-    # Signs show where there is contact.
+    # Only a log with contact reveals the signs.
     best = next((path for path, kind in kinds.items() if kind == "contact"), paths[0])
     guesses = _guesses(logs[best], columns)
     return "\n".join([*_head(guesses), *_timing(logs[best], guesses), *_runs(paths, kinds), ""])
 
 
 def _columns(names: Sequence[str]) -> dict[str, str]:
-    """The column of each channel that is named like one."""
-    found: dict[str, str] = {}
+    """Return the column of each channel whose name matches."""
+    result: dict[str, str] = {}
     for name in names:
         bare = _bare(name)
         for channel, words in WORDS.items():
             if re.search(words, bare):
-                found.setdefault(channel, name)
+                result.setdefault(channel, name)
                 break
-    return found
+    return result
 
 
 def _bare(name: str) -> str:
-    """In small letters, without the unit."""
+    """Return the name in lower case and without its unit."""
     bare = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name).strip().lower().replace(" ", "_").replace("-", "_")
     head, _, tail = bare.rpartition("_")
     return head if head and any(tail == unit.lower() for unit in _UNITS) else bare
 
 
 def _unit(name: str, channel: str) -> str | None:
-    """That the name ends in: in brackets, or behind an underscore (`x_m` is measured, not in metres)."""
-    found = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|_([A-Za-z]+)$", name)
-    if found is None or found.group(2) == "m":
+    """Return the unit at the end of a name, in brackets or after an underscore; `x_m` has no unit."""
+    match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|_([A-Za-z]+)$", name)
+    if match is None or match.group(2) == "m":
         return None
-    word = (found.group(1) or found.group(2)).replace("\u00b5", "u").lower()
+    word = (match.group(1) or match.group(2)).replace("\u00b5", "u").lower()
     return next((unit for unit in OF_CHANNEL.get(channel, {}) if unit.lower() == word), None)
 
 
 def _kind(path: Path, log: Log, columns: Mapping[str, str]) -> str:
-    """What was done, by the file's name, else by its numbers."""
+    """Return the kind of the run, by the file's name, else by its values."""
     named = [kind for kind in KINDS if kind in path.stem.lower()]
     if named:
         return named[0]
@@ -116,13 +120,13 @@ def _kind(path: Path, log: Log, columns: Mapping[str, str]) -> str:
 
 
 def _looked_at(log: Log, names: Sequence[str]) -> Columns:
-    """The first rows that are whole."""
+    """Return the first rows without missing values."""
     read = log.read(names)
     rows = min(LOOK, *(len(values) for values in read.values()))  # columns of other clocks may be longer
     read = {name: values[:rows] for name, values in read.items()}
-    whole = [np.abs(one) <= checks.LARGEST_NUMBER for one in read.values() if one.dtype != object]
-    kept = np.all(whole, axis=0) if whole else slice(None)
-    read = {name: values[kept] for name, values in read.items()}
+    valid = [np.abs(values) <= checks.LARGEST_NUMBER for values in read.values() if values.dtype != object]
+    used = np.all(valid, axis=0) if valid else slice(None)
+    read = {name: values[used] for name, values in read.items()}
     rows = len(next(iter(read.values())))
     if rows < checks.FEWEST_ROWS:
         raise InputError(f"{log.label}: found {rows} rows of numbers, allowed at least {checks.FEWEST_ROWS}")
@@ -130,16 +134,17 @@ def _looked_at(log: Log, names: Sequence[str]) -> Columns:
 
 
 def _guesses(log: Log, columns: Mapping[str, str]) -> dict[str, Guess]:
+    """Return column, unit and sign of each channel."""
     read = _looked_at(log, list(dict.fromkeys(columns.values())))
     signs = _signs(read, columns)
-    found = {}
+    result = {}
     for channel, column in columns.items():
         unit, why = _unit(column, channel), "by its name"
         values = read[column]
         if unit is None and channel == "time" and values.dtype != object:
             step = float(np.median(np.diff(values)))
             unit = next(
-                (one for one, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)) if step * size <= 0.02), "ns"
+                (name for name, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)) if step * size <= 0.02), "ns"
             )
             why += f"; rows are {step:.4g} {unit} apart"
         elif (
@@ -152,12 +157,12 @@ def _guesses(log: Log, columns: Mapping[str, str]) -> dict[str, Guess]:
             unit = "um" if size > 1000 * TYPICAL[channel] else "mm"
             unit += "/s" * (channel == "velocity_desired")
             why += f"; {size:.3g} from least to greatest"
-        found[channel] = Guess(column, unit, signs.get(channel, 1), why)
-    return found
+        result[channel] = Guess(column, unit, signs.get(channel, 1), why)
+    return result
 
 
 def _signs(read: Columns, columns: Mapping[str, str]) -> dict[str, int]:
-    """Of positions, such that they grow towards where the force is; of forces, such that these push back."""
+    """Return signs with which positions increase towards the contact and contact forces are positive."""
 
     def of(channel: str) -> np.ndarray | None:
         values = read.get(columns.get(channel, ""))
@@ -165,7 +170,7 @@ def _signs(read: Columns, columns: Mapping[str, str]) -> dict[str, int]:
 
     force, x, measured = of("force_measured"), of("position_desired"), of("position_measured")
     if x is None or measured is None:
-        return {}  # texts, which are refused when they are read
+        return {}  # Texts are rejected when the log is read.
     signs = {}
     towards = 1
     if force is not None:
@@ -191,11 +196,11 @@ def _head(guesses: Mapping[str, Guess]) -> list[str]:
     if "time" not in guesses:
         lines.append("time = { rate = 1000.0 }  # Hz: no column is named like one of stamps")
     for channel in [name for name in (*OF_CHANNEL, "mode", "contact_index") if name in guesses]:
-        one = guesses[channel]
-        said = [f"column = {json.dumps(one.column, ensure_ascii=False)}"]
-        said += [f'unit = "{one.unit}"'] if one.unit else []
-        said += [f"sign = {one.sign}"] if one.sign < 0 else []
-        lines.append(f"{channel} = {{ {', '.join(said)} }}  # {one.why}")
+        guess = guesses[channel]
+        items = [f"column = {json.dumps(guess.column, ensure_ascii=False)}"]
+        items += [f'unit = "{guess.unit}"'] if guess.unit else []
+        items += [f"sign = {guess.sign}"] if guess.sign < 0 else []
+        lines.append(f"{channel} = {{ {', '.join(items)} }}  # {guess.why}")
     return lines
 
 
@@ -226,6 +231,6 @@ def _runs(paths: Sequence[Path], kinds: Mapping[Path, str]) -> list[str]:
         pattern = f"{kind}*{suffix}"
         mine = {path.name for path in paths if fnmatch(path.name, pattern)}
         files = json.dumps(pattern if mine == set(names) else names, ensure_ascii=False)
-        others = ", ".join(one for one in KINDS if one != kind)
-        lines += ["", "[[runs]]", f"files = {files}", f'kind = "{kind}"  # or {others}']
+        other_kinds = ", ".join(name for name in KINDS if name != kind)
+        lines += ["", "[[runs]]", f"files = {files}", f'kind = "{kind}"  # or {other_kinds}']
     return lines

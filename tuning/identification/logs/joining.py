@@ -1,11 +1,10 @@
-"""Channels with clocks of their own, brought to the rows of the desired position.
+"""Resampling of channels with separate clocks to the rows of the desired position.
 
-Some formats stamp every channel, or every group of channels, by itself: such a channel may begin later, be
-sampled faster, or lose rows of its own. Rows are those of the desired position. A reading that was taken at
-a row's time is that row's; between two readings it is the line through them. Forces jump at the begin of a
-contact, which such a line would smear: of forces read as often as rows, a row has the nearest one, and by how
-much that is later than the row. A row for which a channel has no reading, since it begins later, ends earlier
-or lost rows, counts as lost.
+In some formats every channel, or every group of channels, has its own time stamps. Such a channel may begin
+later, have a higher rate, or lose other rows. The rows are those of the desired position. A reading at the
+time of a row is used unchanged; otherwise readings are interpolated linearly. The force jumps at the onset of
+contact, and interpolation would smear the jump: if forces have the rate of the rows, the nearest reading is
+used, together with its delay behind the row. A row without a reading of some channel counts as lost.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from jaxhil.errors import InputError, shown
 from tuning.identification.logs import clock
 
 MASTER = "position_desired"
-SLOWEST = 1.5  # control periods between readings, beyond which rows would have to be made up
-GAP = 1.5  # times the usual distance of readings, beyond which some were lost
-AT_A_ROW = 0.02  # periods: readings nearer to a row than this are taken at it
+SLOWEST = 1.5  # control periods between readings, above which rows would lack data
+GAP = 1.5  # times the median distance of readings, above which readings are missing
+AT_A_ROW = 0.02  # periods, distance to a row within which a reading counts as simultaneous
 STEPS = "contact_index", "mode"  # channels that hold their value between readings
-JUMPS, LATE = "force_measured", "force_late"  # the channel that jumps, and that of its delay behind rows [s]
-AS_OFTEN = 0.01  # relative difference of a channel's rate from that of the rows, up to which it is the same
+JUMPS, LATE = "force_measured", "force_late"  # channel that jumps; its delay behind the rows [s]
+AS_OFTEN = 0.01  # relative difference of two rates that count as equal
 
 
 def same_clock(one: np.ndarray | None, other: np.ndarray | None) -> bool:
@@ -34,10 +33,10 @@ def same_clock(one: np.ndarray | None, other: np.ndarray | None) -> bool:
 
 
 def check_lengths(label: str, columns: Mapping[str, np.ndarray], named: Mapping[str, str]) -> None:
-    """Raise `InputError` unless columns without clocks of their own are of one length."""
-    if len({len(one) for one in columns.values()}) > 1:
-        found = ", ".join(f"{len(one)} in {shown(named.get(name, name))}" for name, one in columns.items())
-        raise InputError(f"{label}: found columns of unlike length ({found}), allowed one row a tick")
+    """Raise `InputError` if columns that share a clock have different lengths."""
+    if len({len(values) for values in columns.values()}) > 1:
+        lengths = ", ".join(f"{len(x)} in {shown(named.get(name, name))}" for name, x in columns.items())
+        raise InputError(f"{label}: found columns of unlike length ({lengths}), allowed one row a tick")
 
 
 def join(
@@ -52,23 +51,23 @@ def join(
     Args:
         label: Name of the log in messages.
         columns: Values of each channel.
-        clocks: Stamps of each channel [s], from a zero that all share.
+        clocks: Stamps of each channel [s], with a common zero.
         named: Column of each channel, for messages.
         period: Control period [s].
 
     Returns:
-        Values of each channel at the rows, `LATE` among them where forces are those nearest to the rows; the
-        rows' stamps [s]; and notes.
+        Values of each channel at the rows, with `LATE` if the nearest forces are used; the stamps of the rows
+        [s]; and notes.
 
     Raises:
-        InputError: If a channel has no clock, or one that the rows cannot be found in.
+        InputError: If a channel has no clock, or its clock does not cover any row.
     """
     for name, stamps in clocks.items():
         _check_clock(label, named[name], stamps, len(columns[name]))
     master = clocks[MASTER]
     assert master is not None
     times = clock.regular(master, period, label, _stamps_of(named[MASTER]))
-    joined, notes, kept = {}, [], np.ones(len(times), bool)
+    joined, notes, full = {}, [], np.ones(len(times), bool)
     places: list[tuple[np.ndarray, _Places]] = []
     for name, values in columns.items():
         stamps = clocks[name]
@@ -76,23 +75,23 @@ def join(
         if same_clock(stamps, master):
             joined[name] = values
             continue
-        found = next((found for other, found in places if same_clock(other, stamps)), None)
-        if found is None:
-            found = _Places(label, named[name], stamps, times, period)
-            places.append((stamps, found))
-            notes.append(f"{label}: {found.note(named[MASTER])}")
-        if name == JUMPS and found.as_often:
-            joined[name], joined[LATE] = found.nearest(values)
+        places_of = next((item for times_of, item in places if same_clock(times_of, stamps)), None)
+        if places_of is None:
+            places_of = _Places(label, named[name], stamps, times, period)
+            places.append((stamps, places_of))
+            notes.append(f"{label}: {places_of.note(named[MASTER])}")
+        if name == JUMPS and places_of.as_often:
+            joined[name], joined[LATE] = places_of.nearest(values)
         else:
-            joined[name] = found.of(values, name in STEPS or values.dtype == object)
-        kept &= found.there
-    if not kept.any():
-        spans = [f"{shown(named[name])} {one[0]:.6g} to {one[-1]:.6g} s" for name, one in clocks.items()
-                 if one is not None]  # fmt: skip
+            joined[name] = places_of.of(values, name in STEPS or values.dtype == object)
+        full &= places_of.there
+    if not full.any():
+        spans = [f"{shown(named[name])} {t[0]:.6g} to {t[-1]:.6g} s" for name, t in clocks.items()
+                 if t is not None]  # fmt: skip
         raise InputError(f"{label}: found no time at which all channels were read ({', '.join(spans)})")
-    if not kept.all():
-        notes.append(f"{label}: {np.count_nonzero(~kept)} rows at which a channel was not read are left out")
-    return {name: values[kept] for name, values in joined.items()}, master[kept], notes
+    if not full.all():
+        notes.append(f"{label}: {np.count_nonzero(~full)} rows at which a channel was not read are left out")
+    return {name: values[full] for name, values in joined.items()}, master[full], notes
 
 
 def _stamps_of(column: str) -> str:
@@ -100,7 +99,7 @@ def _stamps_of(column: str) -> str:
 
 
 def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -> None:
-    """Raise `InputError` unless there are as many stamps as rows, and they increase."""
+    """Raise `InputError` if there is not one stamp per row, or the stamps do not increase."""
     if stamps is None:
         allowed = "some, since other columns have their own"
         raise InputError(f"{label}: column {shown(column)}: found no stamps, allowed {allowed}")
@@ -111,14 +110,14 @@ def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) 
     bad = np.flatnonzero(~(np.diff(stamps) > 0.0) | ~np.isfinite(stamps[1:]))
     if len(bad):
         row = int(bad[0]) + 2
-        found = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
+        finding = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
         raise InputError(
-            f"{label}: row {row}: {_stamps_of(column)}: found {found}, allowed time that increases"
+            f"{label}: row {row}: {_stamps_of(column)}: found {finding}, allowed time that increases"
         )
 
 
 class _Places:
-    """Places of the rows among the readings of another clock."""
+    """Positions of the rows among the readings of another clock."""
 
     def __init__(self, label: str, column: str, stamps: np.ndarray, times: np.ndarray, period: float):
         self._column = column
@@ -129,36 +128,36 @@ class _Places:
                 f"allowed the control period, {period:g} s, or less"
             )
         self._rate, self._period = usual, period
-        # Where stamps scatter the samples do not.
+        # The stamps scatter, but the samples are regular.
         stamps = clock.regular(stamps, period, label, _stamps_of(column))
         self._begins = float(stamps[0] - times[0])
-        place = np.interp(times, stamps, np.arange(len(stamps), dtype=float))
+        index = np.interp(times, stamps, np.arange(len(stamps), dtype=float))
         slack = AT_A_ROW * usual
         self.there = (times >= stamps[0] - slack) & (times <= stamps[-1] + slack)
-        nearest = np.rint(place)
-        off = np.abs(times - stamps[nearest.astype(np.int64)])
-        self._exact = bool(np.all((off <= AT_A_ROW * period) | (off > 0.5 * usual) | ~self.there))
+        nearest = np.rint(index)
+        distance = np.abs(times - stamps[nearest.astype(np.int64)])
+        self._exact = bool(np.all((distance <= AT_A_ROW * period) | (distance > 0.5 * usual) | ~self.there))
         if self._exact:
-            self.there &= off <= AT_A_ROW * period
+            self.there &= distance <= AT_A_ROW * period
             self._before = nearest.astype(np.int64)
             self._share = np.zeros(0)
             return
         self._nearest, self._late = nearest.astype(np.int64), stamps[nearest.astype(np.int64)] - times
-        before = np.minimum(place.astype(np.int64), len(stamps) - 2)
+        before = np.minimum(index.astype(np.int64), len(stamps) - 2)
         self.there &= stamps[before + 1] - stamps[before] <= GAP * usual
-        self._before, self._share = before, place - before
+        self._before, self._share = before, index - before
 
     @property
     def as_often(self) -> bool:
-        """Tell whether readings are as far apart as rows, at other times."""
+        """Return whether the readings have the rate of the rows, but other times."""
         return not self._exact and abs(self._rate / self._period - 1.0) < AS_OFTEN
 
     def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values nearest to the rows, and by how much later they were read [s]."""
+        """Return the readings nearest to the rows, and their delay behind the rows [s]."""
         return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:
-        """Values at the rows; `steps`: they hold until the next reading."""
+        """Return the values at the rows; with `steps`, a value holds until the next reading."""
         if self._exact:
             return values[self._before]
         if steps:
@@ -166,7 +165,7 @@ class _Places:
         return values[self._before] * (1.0 - self._share) + values[self._before + 1] * self._share
 
     def note(self, master: str) -> str:
-        """Say what was done."""
+        """Return a note on the resampling."""
         how = "taken at their own times" if self._exact else "interpolated between their own times"
         how += ", forces taken at the nearest" if self.as_often else ""
         begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} that"

@@ -1,4 +1,4 @@
-"""The mapping file of logs, `jaxhil/log/1`: which column is which channel, in which unit, and what was done.
+"""Mapping file of logs, `jaxhil/log/1`: channels, units and kinds of experiments.
 
     schema = "jaxhil/log/1"
     [channels]                  # a column's name, or a table: column, unit, scale, sign, offset
@@ -7,8 +7,8 @@
     [text]                      # skip_rows, delimiter, decimal, of text files
     [[runs]]                    # files (patterns), kind
 
-What timing and bodies leave out is that of the mechanism file that is given beside it. A number of a column
-means sign (scale number + offset), in the unit that is named.
+The prior mechanism file provides values that timing and bodies omit. A number of a column means sign (scale
+number + offset), in the named unit.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ Pattern = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A column of numbers, and what they mean."""
+    """Numeric column and its conversion to SI units."""
 
-    column: Name  # its name
-    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI where none is named
-    scale: Annotated[float, says("of the column's number", "")] = 1.0  # in the unit; of counts, in SI units
+    column: Name  # name of the column
+    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI unit if not specified
+    scale: Annotated[float, says("of the column's number", "")] = 1.0  # in the unit; for counts in SI units
     sign: Annotated[int, says("of the whole", "", ge=-1, le=1)] = 1
     offset: Annotated[float, says("added to the scaled number", "")] = 0.0  # in the unit
-    time: Name | None = None  # column of its own stamps, in the unit of those of the rows
+    time: Name | None = None  # column of separate stamps, in the unit of the rows' stamps
 
 
 class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The stamps of the rows, or that there are none."""
+    """Time stamps of the rows, or their rate if there are no stamps."""
 
-    column: Name | None = None  # its name
-    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s where none is named
+    column: Name | None = None  # name of the column
+    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s if not specified
     rate: Annotated[float, says("of rows without stamps", "Hz", gt=0.0)] | None = None
-    time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None  # as strptime has it
+    time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None  # format of `strptime`
 
 
 class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A column that says what was done, row by row."""
+    """Column with the kind of experiment in each row."""
 
-    column: Name  # its name
-    values: dict[str, Kind] = field(default_factory=dict)  # what its entries mean, where they are other words
+    column: Name  # name of the column
+    values: dict[str, Kind] = field(default_factory=dict)  # kind of each entry with another word
 
 
 class Channels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which column is which channel."""
+    """Columns of all channels."""
 
     time: TimeChannel
     position_desired: Channel
@@ -75,7 +75,7 @@ class Channels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class LogTiming(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a command acts and when a row was read."""
+    """Timing of commands and readings in the logs."""
 
     control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)] | None = None
     command_hold: CommandHold | None = None
@@ -86,34 +86,34 @@ class LogTiming(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     computing_delay: Annotated[
         int, says("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
-    clock: Literal["stamps", "index", "separate"] = "stamps"  # separate: of the drives alone
+    clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": those of the drives alone
 
 
 class Text(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How text files are written."""
+    """Format of text files."""
 
     skip_rows: Annotated[int, says("lines above that of the columns' names", ge=0, le=10_000)] = 0
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = (
-        None  # told from the names if not given
+        None  # found in the line of names if not specified
     )
     decimal: Literal[".", ","] = "."
 
 
 class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What was done in some of the files."""
+    """Files of one kind of experiment."""
 
-    files: Annotated[list[Pattern], Meta(min_length=1, max_length=1000)]  # patterns of their names
+    files: Annotated[list[Pattern], Meta(min_length=1, max_length=1000)]  # patterns of the files' names
     kind: Kind
     begin: Annotated[float, says("of the run, from the first row", "s", ge=0.0)] = 0.0
     end: Annotated[float, says("of the run, from the first row", "s", gt=0.0)] | None = None
 
     def names(self, path: Path) -> bool:
-        """Whether a file is one of these."""
+        """Return whether a pattern matches the file."""
         return any(PurePath(path).match(pattern) for pattern in self.files)
 
 
 class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the columns of some logs mean."""
+    """Mapping of logs: channels, timing, masses, text format and runs."""
 
     schema: Literal["jaxhil/log/1"]
     channels: Channels
@@ -124,7 +124,11 @@ class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
-    """The mapping of a TOML file. Raises `InputError`, one line, for whatever is wrong."""
+    """Return the mapping of a TOML file.
+
+    Raises:
+        InputError: If the file is missing or invalid.
+    """
     label = one_line(os.fspath(path)) or "''"
     try:
         data = read_bytes(Path(path), label, "a mapping")
@@ -134,7 +138,11 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
 
 
 def mapping_of(raw: Mapping[str, Any], label: str) -> LogMapping:
-    """The mapping of a parsed table; `label` is what an error calls it. Raises `InputError`."""
+    """Return the mapping of a parsed table; `label` names it in messages.
+
+    Raises:
+        InputError: If the table is invalid.
+    """
     try:
         mapping = to_struct(LogMapping, _spelled_out(raw))
         _check(mapping)
@@ -144,7 +152,7 @@ def mapping_of(raw: Mapping[str, Any], label: str) -> LogMapping:
 
 
 def own_mapping(kind: Kind = "contact") -> LogMapping:
-    """The mapping of logs with our names of columns, as `jaxhil simulate --log` writes them."""
+    """Return the mapping of logs with the column names of `jaxhil simulate --log`."""
     names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
     return mapping_of(
@@ -153,7 +161,7 @@ def own_mapping(kind: Kind = "contact") -> LogMapping:
 
 
 def si(channel: Channel, name: str) -> tuple[float, float]:
-    """Factor and offset that make SI units of the column's numbers."""
+    """Return the factor and the offset that convert the column's values to SI units."""
     if channel.unit == COUNTS or name not in OF_CHANNEL:
         unit = 1.0
     else:
@@ -163,20 +171,22 @@ def si(channel: Channel, name: str) -> tuple[float, float]:
 
 
 def _spelled_out(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """With tables in the place of bare names, and lists in that of single patterns."""
-    whole = dict(raw)
-    if isinstance(channels := whole.get("channels"), Mapping):
-        named = {key: {"column": one} if isinstance(one, str) else one for key, one in channels.items()}
+    """Return the table with bare names replaced by tables and single patterns by lists."""
+    tables = dict(raw)
+    if isinstance(channels := tables.get("channels"), Mapping):
+        named = {
+            key: {"column": entry} if isinstance(entry, str) else entry for key, entry in channels.items()
+        }
         if "time" not in named and "rate" in named:
             named["time"] = {"rate": named.pop("rate")}
-        whole["channels"] = named
-    if isinstance(runs := whole.get("runs"), Sequence) and not isinstance(runs, str):
-        whole["runs"] = [
+        tables["channels"] = named
+    if isinstance(runs := tables.get("runs"), Sequence) and not isinstance(runs, str):
+        tables["runs"] = [
             {**run, "files": [run["files"]]} if isinstance(run, Mapping) and isinstance(run.get("files"), str)
             else run
             for run in runs
         ]  # fmt: skip
-    return whole
+    return tables
 
 
 def _check(mapping: LogMapping) -> None:
@@ -187,8 +197,8 @@ def _check(mapping: LogMapping) -> None:
             continue
         allowed = [*units, *([COUNTS] if name != "time" else [])]
         if channel.unit not in allowed:
-            said = f"one of {', '.join(allowed)}{close_match(channel.unit, allowed)}"
-            raise KeyProblem(("channels", name, "unit"), shown(channel.unit), said)
+            expected = f"one of {', '.join(allowed)}{close_match(channel.unit, allowed)}"
+            raise KeyProblem(("channels", name, "unit"), shown(channel.unit), expected)
         if channel.unit == COUNTS and channel.scale == 1.0:
             raise KeyProblem(("channels", name, "scale"), "none", "how much a count is, in SI units")
     for name in channels.__struct_fields__:
@@ -199,31 +209,31 @@ def _check(mapping: LogMapping) -> None:
             raise KeyProblem(("channels", name, "scale"), "0.0", "another number")
     time = channels.time
     if (time.column is None) == (time.rate is None):
-        found = "neither" if time.rate is None else "both"
-        raise KeyProblem(("channels", "time"), found, "either a column of stamps or the rate of the rows")
+        finding = "neither" if time.rate is None else "both"
+        raise KeyProblem(("channels", "time"), finding, "either a column of stamps or the rate of the rows")
     if time.column is None or time.time_format is not None:
         for name in channels.__struct_fields__:
-            own = getattr(getattr(channels, name), "time", None)
-            if own is not None:
-                said = "none, since channels.time is no column of numbers"
-                raise KeyProblem(("channels", name, "time"), shown(own), said)
+            stamps_column = getattr(getattr(channels, name), "time", None)
+            if stamps_column is not None:
+                expected = "none, since channels.time is no column of numbers"
+                raise KeyProblem(("channels", name, "time"), shown(stamps_column), expected)
     _check_rest(mapping)
 
 
 def _check_rest(mapping: LogMapping) -> None:
-    for place, run in enumerate(mapping.runs):
+    for index, run in enumerate(mapping.runs):
         if run.end is not None and run.end <= run.begin:
-            raise KeyProblem(("runs", place, "end"), shown(run.end), f"a number > begin, {run.begin:g} s")
+            raise KeyProblem(("runs", index, "end"), shown(run.end), f"a number > begin, {run.begin:g} s")
     bodies = mapping.bodies
     if bodies is not None:
-        given = {key for key in bodies.__struct_fields__ if getattr(bodies, key) is not None}
-        if given not in ({"equivalent_mass"}, {"chaser_mass", "target_mass"}):
+        specified = {key for key in bodies.__struct_fields__ if getattr(bodies, key) is not None}
+        if specified not in ({"equivalent_mass"}, {"chaser_mass", "target_mass"}):
             either = "either equivalent_mass, or both chaser_mass and target_mass"
-            raise KeyProblem(("bodies",), " and ".join(sorted(given)) or "neither", either)
+            raise KeyProblem(("bodies",), " and ".join(sorted(specified)) or "neither", either)
 
 
 def masses_of(mapping: LogMapping, prior: Mechanism | None) -> float | None:
-    """Equivalent mass [kg] of the numerical model, by the mapping or else by the prior."""
+    """Return the equivalent mass [kg] of the numerical model, from the mapping or else from the prior."""
     if mapping.bodies is not None:
         return mapping.bodies.mass
     return None if prior is None else prior.bodies.mass

@@ -1,7 +1,7 @@
-"""Columns of numbers out of a log file, by its format; only those that are asked for are read.
+"""Columns of a log file by its format; only the requested columns are read.
 
-Text and Parquet need nothing more. MAT, HDF5, ROS 2 bags, MDF4 and TDMS are read by `foreign`, with libraries
-that `jaxhil[logs]` installs.
+Text and Parquet files need no further library. `foreign` reads MAT, HDF5, ROS 2 bags, MDF4 and TDMS with the
+libraries of `jaxhil[logs]`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.mechanism.conversion import close_match
 from tuning.identification.logs.mapping import Text
 
-Columns = dict[str, np.ndarray]  # numbers in float64, texts as objects, stamps in s from the first
+Columns = dict[str, np.ndarray]  # float64 numbers, text objects, or stamps in s from the first one
 
 Clocks = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
 
 PLAIN = Text()
-DELIMITERS = "\t;,"  # that are looked for in the line of names, in this order
-BLOCK = 1 << 22  # bytes that are parsed at a time
-MORE_ROWS = 1 << 19  # by which columns grow
-LONGEST_LINE = 1 << 20
-SHOWN = 12  # columns in a message
+DELIMITERS = "\t;,"  # candidates in the line of names, in this order
+BLOCK = 1 << 22  # bytes that are parsed together
+MORE_ROWS = 1 << 19  # rows by which columns grow
+LONGEST_LINE = 1 << 20  # bytes
+SHOWN = 12  # column names in a message
 
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 _PARQUET = (".parquet", ".pq")
@@ -50,25 +50,29 @@ _FOREIGN = {
 
 
 class Log(NamedTuple):
-    """A log file: the names of its columns, and how to read some of them."""
+    """Log file: the names of its columns, and functions that read them."""
 
-    label: str  # what errors call it
+    label: str  # its name in messages
     names: list[str]
     read: Callable[[Sequence[str]], Columns]
-    # Stamps [s] of columns, from one zero, after they were read; None for a column without any of its own.
+    # Stamps [s] of columns that were read, with a common zero; None for a column without separate stamps.
     clocks: Clocks = dict.fromkeys
-    stamps: Collection[str] = ()  # columns that are such clocks
+    stamps: Collection[str] = ()  # columns that contain such stamps
 
 
 def open_log(path: Path, text: Text = PLAIN) -> Log:
-    """The log of a file, or of a folder that is a ROS 2 bag. Raises `InputError`, one line."""
+    """Return the log of a file, or of a folder with a ROS 2 bag.
+
+    Raises:
+        InputError: If the log does not exist, has an unknown format or cannot be read.
+    """
     label = one_line(os.fspath(path)) or "''"
     if not path.exists():
         raise InputError(f"{label}: found no such file, allowed a log")
     suffix = ".db3" if (path / "metadata.yaml").is_file() else path.suffix.lower()
-    known = (*_TEXT, *_PARQUET, *_FOREIGN)
-    if suffix not in known:
-        raise InputError(f"{label}: found a name that ends in {shown(suffix)}, allowed {', '.join(known)}")
+    suffixes = (*_TEXT, *_PARQUET, *_FOREIGN)
+    if suffix not in suffixes:
+        raise InputError(f"{label}: found a name that ends in {shown(suffix)}, allowed {', '.join(suffixes)}")
     if path.is_dir() and suffix != ".db3":
         raise InputError(f"{label}: found a directory, allowed a log")
     if not (path.is_file() or path.is_dir()):
@@ -92,7 +96,7 @@ def open_log(path: Path, text: Text = PLAIN) -> Log:
 
 @contextmanager
 def reading(label: str) -> Iterator[None]:
-    """What cannot be read is an `InputError`, one line. Readers of other formats raise whatever they like."""
+    """Convert every exception of a reader to an `InputError` with one line."""
     try:
         yield
     except InputError:
@@ -114,15 +118,17 @@ def _clocks(label: str, clocks: Clocks | None) -> Clocks:
 
 
 def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns]):
-    """Return a function that reads columns that are there once."""
+    """Return a reading function that raises `InputError` for missing or ambiguous columns."""
 
     def checked(wanted: Sequence[str]) -> Columns:
         for name in wanted:
             if name not in names:
-                some = ", ".join(one_line(one, 40) for one in names[:SHOWN]) + ", ..." * (len(names) > SHOWN)
+                examples = ", ".join(one_line(column, 40) for column in names[:SHOWN]) + ", ..." * (
+                    len(names) > SHOWN
+                )
                 hint = one_line(close_match(name, names))
                 raise InputError(
-                    f"{label}: column {shown(name)}: found none of this name, allowed {some}{hint}"
+                    f"{label}: column {shown(name)}: found none of this name, allowed {examples}{hint}"
                 )
             if names.count(name) > 1:
                 raise InputError(f"{label}: column {shown(name)}: found {names.count(name)}, allowed one")
@@ -143,12 +149,12 @@ def _text_log(path: Path, label: str, text: Text) -> Log:
         raise InputError(
             f"{label}: found no line of columns' names, allowed one after {text.skip_rows} lines"
         )
-    line, following = (_decoded(one, text.skip_rows == 0).strip("\r\n") for one in (raw, second))
-    delimiter = text.delimiter or next((one for one in DELIMITERS if one in line), ",")
+    line, following = (_decoded(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second))
+    delimiter = text.delimiter or next((character for character in DELIMITERS if character in line), ",")
     names = [name.strip() for name in next(csv.reader(io.StringIO(line), delimiter=delimiter))]
     headless = all(_is_number(name, text.decimal) for name in names)
     if headless:
-        names = [str(place + 1) for place in range(len(names))]
+        names = [str(index + 1) for index in range(len(names))]
     skipped = text.skip_rows + (not headless)
 
     def read(wanted: Sequence[str]) -> Columns:
@@ -161,17 +167,17 @@ def _text_log(path: Path, label: str, text: Text) -> Log:
 
 
 def _numeric(line: str, names: Sequence[str], name: str, delimiter: str, text: Text) -> bool:
-    """Whether the column holds a number in this line."""
+    """Return whether the column contains a number in this line."""
     cells = next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
-    place = list(names).index(name)
-    return place >= len(cells) or not cells[place].strip() or _is_number(cells[place], text.decimal)
+    index = list(names).index(name)
+    return index >= len(cells) or not cells[index].strip() or _is_number(cells[index], text.decimal)
 
 
 def _read_text(
     path: Path, names: list[str], wanted: Sequence[str], texts: Sequence[str], skipped: int, delimiter: str,
     decimal: str,
 ) -> Columns:  # fmt: skip
-    unique = [f"{place} {name}" for place, name in enumerate(names)]
+    unique = [f"{index} {name}" for index, name in enumerate(names)]
     chosen = {name: unique[names.index(name)] for name in wanted}
     kinds = {chosen[name]: pa.string() if name in texts else pa.float64() for name in wanted}
 
@@ -186,17 +192,17 @@ def _read_text(
             strings_can_be_null=False,
         ),
     )
-    # A table of a long log takes three times the memory of its numbers, and parts of columns twice. Of
-    # threads one alone counts the rows, so that a message names the bad one.
+    # Growing columns save memory: a whole table takes three times the memory of its numbers. A single
+    # thread counts the rows, so that messages name the bad one.
     columns: Columns = {name: np.empty(0, object if name in texts else float) for name in chosen}
     rows = 0
     for batch in batches:
         until = rows + batch.num_rows
-        for name, place in chosen.items():
+        for name, unique_name in chosen.items():
             column = columns[name]
             if len(column) < until:
                 column.resize(until + MORE_ROWS, refcheck=False)
-            column[rows:until] = _array(pa.chunked_array([batch.column(place)]), name)
+            column[rows:until] = _array(pa.chunked_array([batch.column(unique_name)]), name)
         rows = until
     return {name: column[:rows] for name, column in columns.items()}
 
@@ -205,9 +211,9 @@ def _parquet_log(path: Path, label: str) -> Log:
     names = list(parquet.read_schema(path).names)
 
     def read(wanted: Sequence[str]) -> Columns:
-        # Column by column: a table of a long log beside its numbers takes twice the memory.
-        found = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
-        return {name: _array(column, name) for name, column in zip(wanted, found, strict=True)}
+        # Read column by column: a whole table next to its numbers takes twice the memory.
+        columns = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
+        return {name: _array(column, name) for name, column in zip(wanted, columns, strict=True)}
 
     return Log(label, names, _checked(label, names, read))
 
@@ -222,8 +228,8 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
         if column.null_count:
             raise ValueError(f"column {shown(name)}: found {column.null_count} empty cells, allowed none")
         unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
-        whole = column.cast(pa.int64() if kind.bit_width == 64 else pa.int32()).to_numpy().astype(np.int64)
-        return unit * (whole - whole[:1]).astype(float)
+        integers = column.cast(pa.int64() if kind.bit_width == 64 else pa.int32()).to_numpy().astype(np.int64)
+        return unit * (integers - integers[:1]).astype(float)
     if pa.types.is_boolean(kind):
         column = column.cast(pa.int8())
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy())

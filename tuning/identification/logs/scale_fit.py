@@ -1,12 +1,12 @@
-"""Robust fit of one signal as a multiple of another one, with the error of the factor."""
+"""Robust fit of one signal as a multiple of another one, with the standard error of the factor."""
 
 from __future__ import annotations
 
 import numpy as np
 
-FAR = 6.0  # times the median error, beyond which a row is left out
-KEPT = 0.7  # share of rows that a fit must keep
-ROUNDS = 4  # of leaving rows out
+FAR = 6.0  # times the median error, above which a row is excluded
+KEPT = 0.7  # share of rows that a fit must include
+ROUNDS = 4  # iterations of excluding rows
 
 
 class Scale:
@@ -14,37 +14,38 @@ class Scale:
 
     def __init__(self, slope: float, left: float, rms: float, error: float, rows: float):
         self.slope = slope
-        self.left = left  # rms of what it leaves, over the signal's own
-        self.rms = rms  # of what it leaves
+        self.left = left  # rms of the residual over the rms of the signal
+        self.rms = rms  # rms of the residual
         self.error = error  # standard error of the slope
-        self.rows = rows  # that were kept, less those that others tell by the correlation of errors
+        self.rows = rows  # effective number of rows: fewer if the errors are correlated
 
 
 def scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> Scale | None:
-    """Fit signal = slope * unit, rows that are far off left out; None if one of them is 0 throughout.
+    """Fit signal = slope * unit without outliers; return None if one of both is 0 throughout.
 
-    Errors of rows up to twice `width` apart may be correlated."""
-    kept = np.ones(len(signal), bool)
+    Errors of rows up to twice `width` apart may be correlated.
+    """
+    used = np.ones(len(signal), bool)
     slope = 0.0
     for _ in range(ROUNDS):
-        power = float(unit[kept] @ unit[kept])
-        if power == 0.0 or not np.any(signal[kept]):
+        power = float(unit[used] @ unit[used])
+        if power == 0.0 or not np.any(signal[used]):
             return None
-        slope = float(signal[kept] @ unit[kept]) / power
+        slope = float(signal[used] @ unit[used]) / power
         error = np.abs(signal - slope * unit)
         again = error <= FAR * max(float(np.median(error)), 1e-300)
-        if np.mean(again) < KEPT or np.array_equal(again, kept):
+        if np.mean(again) < KEPT or np.array_equal(again, used):
             break
-        kept = again
-    left = signal[kept] - slope * unit[kept]
-    rms, own = (float(np.sqrt(np.mean(values**2))) for values in (left, signal[kept]))
-    power, alike = float(unit[kept] @ unit[kept]), _correlated(left, 2 * width)
+        used = again
+    left = signal[used] - slope * unit[used]
+    rms, signal_rms = (float(np.sqrt(np.mean(values**2))) for values in (left, signal[used]))
+    power, alike = float(unit[used] @ unit[used]), _correlated(left, 2 * width)
     error = rms * np.sqrt(alike / power) if power else np.inf
-    return Scale(slope, rms / own if own else np.inf, rms, error, len(left) / alike)
+    return Scale(slope, rms / signal_rms if signal_rms else np.inf, rms, error, len(left) / alike)
 
 
 def _correlated(values: np.ndarray, longest: int) -> float:
-    """Return the number of values that say as much as one that is independent of the others."""
+    """Return the number of correlated values that are equivalent to one independent value."""
     power = float(values @ values)
     if power == 0.0:
         return 1.0

@@ -1,8 +1,8 @@
-"""Checks of the scale of forces, positions and velocities by the momentum of the numerical model.
+"""Checks of the scales of forces, positions and velocities, from the momentum of the numerical model.
 
-The numerical model is a free body in a contact, so that its change of momentum is the impulse of the force
-command exactly. The impulse of the measured force differs from it by what the compensator adds, which is much
-less than the factor between two units. A velocity is the difference of positions.
+The numerical model is a free body during a contact, so its change of momentum is exactly the impulse of the
+force command. The impulse of the measured force differs by the action of the compensator, which is much less
+than the factor between two units. A velocity is the difference of positions.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from jaxhil.errors import InputError
 from tuning.identification.logs.rows import Stretch
 from tuning.identification.logs.scale_fit import scale
 
-SMOOTH = 10  # ticks, over which speeds are taken
-IMPULSE = 0.5, 2.0  # measured over momentum; the compensators of jaxhil reach 0.97 to 1.45
-NEAR = 0.25  # relative distance to a unit's factor, for compensators that change the impulse by tenths
-WIDE = 0.2, 5.0  # the same where readings are clipped, or where the model need not be a free body
-CERTAIN = 5.0  # standard deviations
-SPEED_ERROR = 0.02  # of the velocity against the difference of positions
-EXPLAINED = 0.3  # of the motion, which a velocity channel may leave unexplained
-GAIN = 0.5, 2.0  # measured over desired position in slow motion
-SAMPLE, FEW = 50_000, 10_000  # rows that say as much as all
-MANY = 500  # contacts, likewise
-MOST_LAG = 100  # rows, of a slow motion behind its command
-BESIDE = 60  # rows before and after a contact, of which the force at rest is taken
+SMOOTH = 10  # ticks, span of a difference that gives a speed
+IMPULSE = 0.5, 2.0  # measured impulse over change of momentum; jaxhil's compensators reach 0.97 to 1.45
+NEAR = 0.25  # relative tolerance of a unit's factor, since compensators change the impulse
+WIDE = 0.2, 5.0  # as `IMPULSE`, for clipped readings or a model that may not be a free body
+CERTAIN = 5.0  # standard errors added to the tolerances
+SPEED_ERROR = 0.02  # relative tolerance of the velocity against the difference of positions
+EXPLAINED = 0.3  # largest relative residual of a usable velocity channel or position fit
+GAIN = 0.5, 2.0  # allowed ratio of measured to desired position in slow motion
+SAMPLE, FEW = 50_000, 10_000  # rows that are sufficient
+MANY = 500  # contacts that are sufficient
+MOST_LAG = 100  # rows, largest delay of a slow motion behind its command
+BESIDE = 60  # rows before and after a contact that give the force at rest
 
-# What a force is multiplied by where it is read in a wrong unit, and which.
+# Factors by which a wrong unit of the force multiplies it.
 _FORCE_FACTORS = {
     1.0 / 4.4482216152605: "force in lbf, read as N",
     4.4482216152605: "force in N, read as lbf",
@@ -36,7 +36,7 @@ _FORCE_FACTORS = {
     1e3: "force in N, read as kN (or mN as N)",
     1e6: "force in mN, read as kN",
 }
-# What the impulse over the momentum is multiplied by where positions or the mass are in a wrong unit.
+# Factors by which a wrong unit of positions or mass multiplies the impulse over the momentum.
 _MOMENTUM_FACTORS = {
     2.54: "positions in in, read as cm",
     1.0 / 2.54: "positions in cm, read as in",
@@ -59,30 +59,31 @@ _LENGTH_FACTORS = {
 
 
 def likely_units(factors: tuple[float, ...], tolerance: float, momentum: bool = True) -> str:
-    """Name the mistaken units that explain a force that is so many times the right one, as a question.
+    """Return a question that names the wrong units that may explain a factor of the force.
 
     Args:
-        factors: Estimates of the force found over the one expected, the best one first.
-        tolerance: Relative distance up to which a unit's factor explains one of them.
+        factors: Estimates of the ratio of the force to its expected value, the best one first.
+        tolerance: Relative tolerance of a unit's factor.
         momentum: Whether positions or the mass may be in a wrong unit instead.
 
     Returns:
         Text such as " (force in lbf, read as N?)", the nearest factors first; "" if none is near.
     """
-    every = [*_FORCE_FACTORS.items(), *(_MOMENTUM_FACTORS.items() if momentum else ())]
-    return _question(every, factors, tolerance)
+    factors_of_units = [*_FORCE_FACTORS.items(), *(_MOMENTUM_FACTORS.items() if momentum else ())]
+    return _question(factors_of_units, factors, tolerance)
 
 
 def likely_lengths(factor: float, tolerance: float) -> str:
-    """Name the mistaken units of a length that is `factor` times the right one, as `likely_units`."""
+    """Return a question that names the wrong units that may explain a factor of a length."""
     return _question(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
-def _question(every: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
+def _question(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
+    """Return the texts of the nearest factors as a question, or ""."""
     near: list[str] = []
     for factor in factors:
-        off = sorted((abs(np.log(factor / other)), what) for other, what in every if factor > 0.0)
-        near += [what for distance, what in off if distance <= np.log1p(tolerance)]
+        off = sorted((abs(np.log(factor / unit_factor)), text) for unit_factor, text in units if factor > 0.0)
+        near += [text for distance, text in off if distance <= np.log1p(tolerance)]
     return f" ({', or '.join(list(dict.fromkeys(near))[:3])}?)" if near else ""
 
 
@@ -111,18 +112,7 @@ def check_impulse(
     force, x = stretch.channels["force_measured"], stretch.channels["position_desired"]
     assert force is not None and x is not None
     contacts = contacts[:: len(contacts) // MANY + 1]
-    rest = at_rest(force, contacts)
-    needed, made = [], []
-    for begin, end in contacts:
-        begin, end = begin - SMOOTH, end + SMOOTH  # below the threshold there is some force, too
-        if begin < SMOOTH or end + SMOOTH > len(x):
-            begin, end = begin + SMOOTH, end - SMOOTH
-        if begin < SMOOTH or end + SMOOTH > len(x):
-            continue
-        before = (x[begin] - x[begin - SMOOTH]) / (SMOOTH * period)
-        after = (x[end + SMOOTH - 1] - x[end - 1]) / (SMOOTH * period)
-        needed.append(mass * (before - after))
-        made.append(period * float(np.nanmean(force[begin:end]) - rest) * (end - begin))
+    needed, made = _impulses(force, x, contacts, period, mass)
     if not np.any(needed):
         return
     ratio = float(np.dot(made, needed) / np.dot(needed, needed))
@@ -137,7 +127,7 @@ def check_impulse(
     low, high = low - CERTAIN * error, high + CERTAIN * error
     if low <= ratio <= high:
         return
-    # Damping by the compensator and a dead zone change the impulse, and not the slope of the force.
+    # Damping by the compensator and a dead zone change the impulse, but not the slope of the force.
     slope = _slope_of(force, x, contacts, period, mass) or ratio
     if kind == "contact" and low <= slope <= high:
         return
@@ -149,8 +139,27 @@ def check_impulse(
     )
 
 
+def _impulses(
+    force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
+) -> tuple[list[float], list[float]]:
+    """Return the change of momentum and the impulse of the measured force in each contact [N s]."""
+    rest = at_rest(force, contacts)
+    needed, made = [], []
+    for begin, end in contacts:
+        begin, end = begin - SMOOTH, end + SMOOTH  # There is some force below the threshold, too.
+        if begin < SMOOTH or end + SMOOTH > len(x):
+            begin, end = begin + SMOOTH, end - SMOOTH
+        if begin < SMOOTH or end + SMOOTH > len(x):
+            continue
+        before = (x[begin] - x[begin - SMOOTH]) / (SMOOTH * period)
+        after = (x[end + SMOOTH - 1] - x[end - 1]) / (SMOOTH * period)
+        needed.append(mass * (before - after))
+        made.append(period * float(np.nanmean(force[begin:end]) - rest) * (end - begin))
+    return needed, made
+
+
 def at_rest(force: np.ndarray, contacts: list[tuple[int, int]]) -> float:
-    """Return the median reading next to contacts [N]; a log may begin in one."""
+    """Return the median reading near, but outside, the contacts [N]; a log may begin in contact."""
     beside = [force[max(0, begin - BESIDE) : max(0, begin - SMOOTH)] for begin, _ in contacts]
     beside += [force[end + SMOOTH : end + BESIDE] for _, end in contacts]
     values = np.concatenate(beside) if beside else force[:0]
@@ -158,7 +167,7 @@ def at_rest(force: np.ndarray, contacts: list[tuple[int, int]]) -> float:
 
 
 def _error_of(force: np.ndarray, period: float, contacts: list[tuple[int, int]]) -> float:
-    """Return the standard deviation of the impulse of all contacts by the noise of the readings [N s]."""
+    """Return the standard deviation [N s] of the impulse of all contacts due to noise."""
     steps = np.abs(np.diff(force[:SAMPLE]))
     std = 1.4826 * float(np.nanmedian(steps)) / np.sqrt(2.0)
     rows = sum(end - begin + 2 * SMOOTH for begin, end in contacts)
@@ -168,8 +177,10 @@ def _error_of(force: np.ndarray, period: float, contacts: list[tuple[int, int]])
 def _slope_of(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> float | None:
-    """Return the measured force over -M x_d'' in contact, but for what is constant or grows with the speed;
-    None where the contacts do not tell it."""
+    """Return the measured force over -M x_d'' in contact, without constant and rate-dependent parts.
+
+    Returns None if the contacts do not determine it.
+    """
     rows = [np.arange(max(begin, SMOOTH), min(end, len(x) - SMOOTH)) for begin, end in contacts]
     inside = np.concatenate(rows)[:SAMPLE] if rows else np.empty(0, int)
     if len(inside) < 2 * SMOOTH:
@@ -185,7 +196,7 @@ def _slope_of(
 
 
 def triangle(width: int) -> np.ndarray:
-    """Return the weights by which second differences over one row add up to one over `width` rows."""
+    """Return the weights with which second differences over one row add up to one over `width` rows."""
     return width - np.abs(np.arange(1.0 - width, width))
 
 
@@ -193,7 +204,7 @@ def check_velocity(label: str, stretch: Stretch, period: float) -> str | None:
     """Check that velocity_desired is the rate of position_desired.
 
     Returns:
-        None, or a note if the channel does not follow the positions and is to be ignored.
+        None, or a note if the channel does not follow the positions and is ignored.
 
     Raises:
         InputError: If it follows them with another scale or sign.
@@ -202,24 +213,24 @@ def check_velocity(label: str, stretch: Stretch, period: float) -> str | None:
     if x is None or v is None or len(x) <= 2 * SMOOTH:
         return None
     x, v = x[:SAMPLE], v[:SAMPLE]
-    moved, told = x[SMOOTH:] - x[:-SMOOTH], _window_sums(period * v)
-    good = np.isfinite(told) & np.isfinite(moved)
-    fit = scale(moved[good], told[good], SMOOTH)
+    moved, integrated = x[SMOOTH:] - x[:-SMOOTH], _window_sums(period * v)
+    good = np.isfinite(integrated) & np.isfinite(moved)
+    fit = scale(moved[good], integrated[good], SMOOTH)
     if not np.any(good) or not np.any(moved[good]):
         return None
     if fit is None or fit.left > EXPLAINED or fit.slope == 0.0:
         return f"{label}: velocity_desired: ignored, since position_desired does not move by it"
     if abs(fit.slope - 1.0) <= SPEED_ERROR + CERTAIN * fit.error:
         return None
-    found = 1.0 / fit.slope
+    ratio = 1.0 / fit.slope
     raise InputError(
-        f"{label}: velocity_desired: found {found:.4g} times the rate of position_desired, "
-        f"expected 1{likely_lengths(found, SPEED_ERROR)}"
+        f"{label}: velocity_desired: found {ratio:.4g} times the rate of position_desired, "
+        f"expected 1{likely_lengths(ratio, SPEED_ERROR)}"
     )
 
 
 def _window_sums(values: np.ndarray) -> np.ndarray:
-    """Return sums over `SMOOTH` rows up to each row, NaN where one of them is."""
+    """Return sums over `SMOOTH` rows up to each row, NaN if one of the values is NaN."""
     finite = np.isfinite(values)
     summed = np.concatenate([[0.0], np.cumsum(np.where(finite, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(finite)])
@@ -228,12 +239,16 @@ def _window_sums(values: np.ndarray) -> np.ndarray:
 
 
 def check_gain(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> None:
-    """Raise `InputError` if a slow motion is measured much larger or smaller than it was commanded."""
+    """Raise `InputError` if the measured amplitude of a slow motion differs much from the commanded one."""
     if kind not in ("contact", "tap"):
         return
     x, measured = x[:FEW] - np.mean(x[:FEW]), measured[:FEW] - np.mean(measured[:FEW])
     shifted = [scale(measured[lag:], x[: len(x) - lag]) for lag in range(0, MOST_LAG, 8) if lag < len(x) // 2]
-    fit = min((one for one in shifted if one is not None), key=lambda one: one.left, default=None)
+    fit = min(
+        (candidate for candidate in shifted if candidate is not None),
+        key=lambda candidate: candidate.left,
+        default=None,
+    )
     if fit is None or fit.left > EXPLAINED or GAIN[0] <= fit.slope <= GAIN[1]:
         return
     raise InputError(

@@ -1,22 +1,25 @@
-"""Where in a run the hardware is touched, told by the force where no channel says so."""
+"""Detection of contacts in a run, from the force, if no channel marks them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-SIGMAS = 5.0  # of the force's noise, beyond which there is contact
-TICKS = 3  # for so many in a row
-APART = 0.1  # s, between two contacts; what is nearer is one
-FIRST = 200  # rows at most, from which the force at rest is taken
+SIGMAS = 5.0  # standard deviations of the force noise that indicate contact
+TICKS = 3  # successive ticks above the threshold that begin a contact
+APART = 0.1  # s, least time between two contacts
+FIRST = 200  # largest number of rows for the force at rest
 
 
 def contacts(
     force: np.ndarray, period: float, rest: float | None = None, apart: float = APART
 ) -> list[tuple[int, int]]:
-    """First row of each contact and the row after its last one.
+    """Return the first row of each contact and the row after its last one.
 
-    `force` [N] begins without contact, unless what it is at `rest` is given; NaN where a row was lost.
-    Contacts nearer than `apart` [s] are one.
+    Args:
+        force: Force [N], without contact at first unless `rest` is specified; NaN in lost rows.
+        period: Control period [s].
+        rest: Force at rest [N].
+        apart: Time [s] below which successive contacts are merged.
     """
     touched = np.abs(force - (resting(force) if rest is None else rest)) > threshold(force)
     long = touched.copy()
@@ -26,7 +29,7 @@ def contacts(
     starts = np.flatnonzero(long)
     if not len(starts):
         return []
-    # Single rows beyond the threshold belong to a contact only beside one.
+    # Short excursions above the threshold belong to a contact only if they are close to one.
     inside = np.flatnonzero(touched)
     inside = inside[inside >= starts[0]]
     breaks = np.flatnonzero(np.diff(inside) > round(apart / period))
@@ -36,12 +39,12 @@ def contacts(
 
 
 def resting(force: np.ndarray) -> float:
-    """What the sensor reads at first, without contact [N]."""
+    """Return the reading of the sensor without contact [N], from the first rows."""
     return float(np.nanmedian(_first(force)))
 
 
 def threshold(force: np.ndarray) -> float:
-    """Beyond what the sensor's noise reaches [N]: by the scatter from row to row, and of the first rows."""
+    """Return the contact threshold [N], from the scatter between rows and that of the first rows."""
     steps = np.diff(force[np.isfinite(force)])
     sigma = max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_first(force))))
     return max(SIGMAS * sigma, 1e-6 * float(np.nanmax(np.abs(force))))

@@ -1,1 +1,1 @@
-"""Whether a rig still is the one of a mechanism file, contact by contact."""
+"""Monitoring of a rig, contact by contact: comparison with its mechanism file."""

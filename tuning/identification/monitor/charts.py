@@ -1,31 +1,33 @@
-"""Has a level changed, and since when? The generalised likelihood ratio of a change of the mean.
+"""Change detection in the mean: generalised likelihood ratio of a change, and its time.
 
-Of deviations z over their predicted standard deviation, a change with contact c is likelier than none by
+For deviations z over their predicted standard deviation, twice the log likelihood ratio of a change at
+contact c, with the new mean fitted, is
 
-    sum(z_c ... z_n)^2 / (n - c + 1)        (twice the logarithm, the new mean fitted)
+    sum(z_c ... z_n)^2 / (n - c + 1)
 
-and the c of the largest is since when (Siegmund and Venkatraman 1995). Beyond `LIMIT` it is an alarm. At the
-same rate of false alarms a CUSUM with half a standard deviation of allowance beside an average with weight
-0.2 finds a jump of one standard deviation one contact sooner in eighteen, and jumps of four later by a third;
-`tests/test_monitor_charts.py` counts both.
+and the maximizing c estimates the time of the change (Siegmund and Venkatraman 1995). A ratio above `LIMIT`
+raises an alarm. For comparison, `tests/test_monitor_charts.py` counts false alarms and delays of a CUSUM with
+an allowance of half a standard deviation, together with a moving average with weight 0.2.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-CONTACTS = 2000  # to one false alarm, all seven figures together
-LIMIT = 19.55  # such that it is so
-WINDOW = 200  # contacts before the last one with which a change may have begun
+CONTACTS = 2000  # contacts per false alarm, over all seven metrics
+LIMIT = 19.55  # of twice the log likelihood ratio; gives this rate of false alarms
+WINDOW = 200  # number of latest contacts that are searched for a change
 
 
 def changes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of deviations of (contacts, figures): how much likelier a change is than none, and the contact with
-    which it began; NaN says nothing."""
+    """Return twice the log likelihood ratio of a change, and its first contact, for each metric.
+
+    `z` holds the deviations, (contacts, metrics); NaN marks a missing value.
+    """
     first = max(0, len(z) - WINDOW)
-    known = np.isfinite(z[first:])
-    number = np.cumsum(known[::-1], axis=0)[::-1]
-    total = np.cumsum(np.where(known, z[first:], 0.0)[::-1], axis=0)[::-1]
-    likelier = np.where(known, total**2 / np.maximum(number, 1), 0.0)
+    finite = np.isfinite(z[first:])
+    number = np.cumsum(finite[::-1], axis=0)[::-1]
+    total = np.cumsum(np.where(finite, z[first:], 0.0)[::-1], axis=0)[::-1]
+    likelier = np.where(finite, total**2 / np.maximum(number, 1), 0.0)
     best = np.argmax(likelier, axis=0)
     return np.take_along_axis(likelier, best[None], axis=0)[0], first + best

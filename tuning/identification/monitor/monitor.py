@@ -1,4 +1,4 @@
-"""Contact by contact: whether the rig still is the one of the mechanism file, and since when it is not."""
+"""Monitor of a rig, contact by contact: detection of deviations from the mechanism file, and their start."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ from tuning.identification.monitor.uncertain import Uncertain, uncertain
 from tuning.identification.records import Campaign, Run, Timing
 from tuning.identification.two_clocks import refuse
 
-BLOCK = 64  # runs computed at once
+BLOCK = 64  # runs that are computed together
 SENSOR_DELAYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
 State = Literal["good", "watch", "bad"]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """One contact, by the file; figures in SI units and the order of `NAMES`."""
+    """Metrics of one contact relative to the file, in SI units and the order of `NAMES`."""
 
     source: str  # name of its log
-    value: np.ndarray  # 0 where the file is right, NaN where the log does not tell
-    predicted_std: np.ndarray
-    z: np.ndarray  # value less the predicted one, over that
+    value: np.ndarray  # 0 if the file is correct, NaN if the log does not determine it
+    predicted_std: np.ndarray  # standard deviation of the prediction
+    z: np.ndarray  # (value - prediction) over predicted_std
     state: State
 
 
 @dataclass(frozen=True)
 class Change:
-    """One figure that is not what it was, on the mean of the contacts since."""
+    """Change of one metric, averaged over the contacts since the change."""
 
     name: str
-    value: float  # by the file, SI
-    std: float  # by the noise of these contacts
+    value: float  # relative to the file, in SI units
+    std: float  # due to the noise of these contacts
 
 
 @dataclass(frozen=True)
 class Monitored:
-    """What the contacts of a log say."""
+    """Result of monitoring a log."""
 
     contacts: tuple[Contact, ...]
-    alarm: int | None  # contact at which a change was certain, from 0
-    since: int | None  # contact with which it likely began
-    changes: tuple[Change, ...]  # the figures that raised an alarm, the clearest first
+    alarm: int | None  # index of the contact that raised the alarm
+    since: int | None  # index of the contact with which the change probably began
+    changes: tuple[Change, ...]  # metrics that raised an alarm, the most significant first
 
     @property
     def state(self) -> State:
@@ -61,8 +61,8 @@ class Monitored:
         number = len(self.contacts)
         if self.alarm is None or self.since is None:
             return f"Good: the rig is that of the file in all of {number} contacts"
-        what = ", ".join(_said(one) for one in self.changes)
-        where = f"since contact {self.since + 1} of {number} ({self.contacts[self.since].source}): {what}"
+        causes = ", ".join(_said(change) for change in self.changes)
+        where = f"since contact {self.since + 1} of {number} ({self.contacts[self.since].source}): {causes}"
         if self.state == "watch":
             return f"Watch: {where}; the file's uncertainty covers it: identify again when convenient"
         return f"Bad: {where}; beyond the file's uncertainty: gains tuned on it are no longer vouched for"
@@ -75,9 +75,11 @@ def _said(change: Change) -> str:
 
 
 def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
-    """Hold the contacts of a campaign, in their order, against a mechanism.
+    """Compare the contacts of a campaign, in order, with a mechanism.
 
-    Raises `InputError` where there is no contact, or the mechanism is none that a log can be held against."""
+    Raises:
+        InputError: If there is no contact, or the mechanism cannot be compared with a log.
+    """
     refuse(campaign.timing)
     runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
     if not runs:
@@ -86,22 +88,22 @@ def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
     sensor = mechanism.rig.force_sensor
     prediction = Prediction(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
     watch = _Watch(prediction)
-    for run, told in zip(runs, _told(runs, mechanism, campaign, numbers), strict=True):
-        watch.add(run.source, *told)
-    if not any(np.isfinite(one.value[0]) for one in watch.contacts):
-        found = f"found {mechanism.rig.contact_plane:g} m, which none of the contacts in the logs goes beyond"
-        raise InputError(f"rig.contact_plane: {found}, allowed where the hardware touches")
+    for run, features in zip(runs, _told(runs, mechanism, campaign, numbers), strict=True):
+        watch.add(run.source, *features)
+    if not any(np.isfinite(contact.value[0]) for contact in watch.contacts):
+        text = f"found {mechanism.rig.contact_plane:g} m, which none of the contacts in the logs goes beyond"
+        raise InputError(f"rig.contact_plane: {text}, allowed where the hardware touches")
     return watch.outcome()
 
 
 def _told(
     runs: Sequence[Run], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[Uncertain]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each run: figures, their slopes by the numbers, their covariance."""
+    """Yield the metrics of each run, their derivatives by the parameters, and their covariance."""
     rig, timing = mechanism.rig, campaign.timing
     sensor = rig.force_sensor
     sensors = Sensors(sensor.noise_std, sensor.quantum, sensor.dead_zone, sensor.range, sensor.time_constant)
-    stds = {one.path: one.std for one in numbers}
+    stds = {number.path: number.std for number in numbers}
     delay = np.hypot(stds["rig.simulator.delay"], stds["rig.force_sensor.delay"])
     slack = float(delay), stds.get("rig.contact_plane", 0.0)
     colours = Colour(np.empty(0)), Colour(np.empty(0))
@@ -110,31 +112,33 @@ def _told(
         expected, stepped = _expected(mechanism, block, timing, numbers)
         for lane, run in enumerate(block):
             rows = len(run.tick)
-            each = weights(
+            run_weights = weights(
                 run, expected, lane, sensors, slack, campaign.equivalent_mass, timing.control_period
             )
-            slopes = [each.shift(f[:rows, lane], x[:rows, lane]) for f, x in stepped]
-            value, noise = figures(run, expected, lane, each, sensors, colours)
+            slopes = [run_weights.shift(f[:rows, lane], x[:rows, lane]) for f, x in stepped]
+            value, noise = figures(run, expected, lane, run_weights, sensors, colours)
             yield value, np.array(slopes).T, noise
 
 
 def _expected(
     mechanism: Mechanism, runs: Sequence[Run], timing: Timing, numbers: Sequence[Uncertain]
 ) -> tuple[Readings, list[tuple[np.ndarray, np.ndarray]]]:
-    """What is read, and by how much more force and position with each number one standard deviation up."""
-    slack = max(one.std for one in numbers if one.path in SENSOR_DELAYS)
-    motion, found = motion_of(mechanism, runs, timing, slack), []
+    """Return predicted readings, and their changes for one standard deviation of each parameter."""
+    slack = max(number.std for number in numbers if number.path in SENSOR_DELAYS)
+    motion, differences = motion_of(mechanism, runs, timing, slack), []
     expected = readings(mechanism, runs, motion)
-    for one in numbers:
-        other = one.stepped(mechanism)
-        own = motion_of(other, runs, timing, slack) if one.path.startswith("rig.simulator.") else motion
-        read = readings(other, runs, own)
-        found.append((read.force - expected.force, read.position - expected.position))
-    return expected, found
+    for parameter in numbers:
+        stepped = parameter.stepped(mechanism)
+        moved = (
+            motion_of(stepped, runs, timing, slack) if parameter.path.startswith("rig.simulator.") else motion
+        )
+        read = readings(stepped, runs, moved)
+        differences.append((read.force - expected.force, read.position - expected.position))
+    return expected, differences
 
 
 class _Watch:
-    """What was seen so far. After an alarm nothing more is learnt."""
+    """State of the monitor after the contacts so far; the prediction is not updated after an alarm."""
 
     def __init__(self, prediction: Prediction):
         self.prediction = prediction
@@ -142,19 +146,19 @@ class _Watch:
         self.contacts: list[Contact] = []
         self.alarm: int | None = None
         self.since = 0
-        self.beyond = np.zeros(len(NAMES), bool)  # figures that raised an alarm
+        self.beyond = np.zeros(len(NAMES), bool)  # metrics that raised an alarm
 
     def add(self, source: str, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> None:
-        off, std = self.prediction.deviation(value, slopes, noise)
+        deviation, std = self.prediction.deviation(value, slopes, noise)
         self.seen.append((value, slopes, noise))
-        self.contacts.append(Contact(source, value, std, off / std, "good"))
-        likelier, began = changes(np.array([one.z for one in self.contacts]))
+        self.contacts.append(Contact(source, value, std, deviation / std, "good"))
+        likelier, began = changes(np.array([contact.z for contact in self.contacts]))
         self.beyond |= likelier > LIMIT
         if not self.beyond.any():
             self.prediction.learn(value, slopes, noise)
             return
         if self.alarm is None:
-            # Of a drift, later contacts would tell when it was steepest.
+            # Keep the first estimate: later contacts of a drift would give the time of its steepest part.
             self.alarm, self.since = len(self.contacts) - 1, int(began[np.argmax(likelier)])
         covered = self.prediction.covers(*self._mean())
         self.contacts[-1] = replace(self.contacts[-1], state="watch" if covered else "bad")
@@ -165,11 +169,11 @@ class _Watch:
         value, _, noise = self._mean()
         std = np.sqrt(np.diag(noise))
         order = sorted(np.flatnonzero(self.beyond), key=lambda i: -abs(value[i] / std[i]))
-        found = tuple(Change(NAMES[i], float(value[i]), float(std[i])) for i in order)
-        return Monitored(tuple(self.contacts), self.alarm, self.since, found)
+        result = tuple(Change(NAMES[i], float(value[i]), float(std[i])) for i in order)
+        return Monitored(tuple(self.contacts), self.alarm, self.since, result)
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Over the contacts since the change: figures, slopes, and the figures' covariance."""
+        """Return metrics, slopes and covariance, averaged over the contacts since the change."""
         values, slopes, noises = (np.array(part) for part in zip(*self.seen[self.since :], strict=True))
         number = np.isfinite(values).sum(axis=0)
         counted = np.maximum(number, 1)

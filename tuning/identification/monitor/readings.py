@@ -1,4 +1,4 @@
-"""What the rig of a mechanism file would read under the commands of a log. Nothing is fitted here."""
+"""Predicted readings of a mechanism file's rig under the logged commands; nothing is fitted here."""
 
 from __future__ import annotations
 
@@ -21,39 +21,47 @@ from tuning.identification.sensor_filter import lag_weights
 
 @dataclass(frozen=True)
 class Readings:
-    """Without noise, (rows, lanes); a run shorter than the longest one is padded."""
+    """Predicted readings without noise, (rows, lanes); shorter runs are padded."""
 
-    force: np.ndarray  # N, bias and dead zone included
-    elastic: np.ndarray  # N, its part that does not depend on the rate
-    rate: np.ndarray  # m/s, of the depth; 0 out of contact
-    touching: np.ndarray  # 1 in contact, 0 out of it; between, where the sensor lags
-    depth: np.ndarray  # m, when the force was
+    force: np.ndarray  # N, including bias and dead zone
+    elastic: np.ndarray  # N, part that does not depend on the rate
+    rate: np.ndarray  # m/s, rate of the depth; 0 out of contact
+    touching: np.ndarray  # 1 in contact, 0 out of contact; values between with a sensor lag
+    depth: np.ndarray  # m, at the time of the force
     position: np.ndarray  # m
-    velocity: np.ndarray  # m/s, of the position that is read
+    velocity: np.ndarray  # m/s, rate of the position that is read
 
 
 def motion_of(mechanism: Mechanism, runs: Sequence[Run], timing: Timing, slack: float) -> Motion:
-    """Of the rig's motion simulator under the commands of runs; `slack` [s]: by how much the sensors' delays
-    may exceed the file's. Raises `InputError` for a G that passes some of the command at once."""
+    """Return the response of the rig's motion simulator to the commands of runs.
+
+    `slack` [s] is the amount by which the sensors' delays may exceed the file's.
+
+    Raises:
+        InputError: If G has direct feedthrough.
+    """
     rig, model = mechanism.rig, motion_model(mechanism)
     above, below = model.fraction
     if len(above) == len(below) > 1:
         allowed = "fewer coefficients than in the denominator"
         raise InputError(f"rig.simulator.numerator: found {len(above)} coefficients, allowed {allowed}")
-    # The position sensor's delay is not the force's.
+    # The force does not depend on the position sensor's delay.
     model = Model(model.structure, np.append(model.parameters[:-1], rig.simulator.delay))
     longest = max(rig.force_sensor.delay, rig.position_sensor.delay) + slack + timing.control_period
     return Motion(model, runs, timing, longest)
 
 
 def readings(mechanism: Mechanism, runs: Sequence[Run], motion: Motion) -> Readings:
-    """Of runs with at most one contact each, and their motion. Raises `InputError` for a law that no log can
-    be held against."""
+    """Return the predicted readings of runs with at most one contact each.
+
+    Raises:
+        InputError: If the contact law cannot be compared with a log.
+    """
     rig, sensor, period = mechanism.rig, mechanism.rig.force_sensor, motion.period
     law = contact_law(mechanism.contact)
     if np.isfinite(mechanism.contact.clearance):
-        found = f"found {mechanism.contact.clearance:g}"
-        raise InputError(f"contact.clearance: {found}, allowed inf: one surface")
+        finding = f"found {mechanism.contact.clearance:g}"
+        raise InputError(f"contact.clearance: {finding}, allowed inf: one surface")
     table = np.array([coefficients(mechanism.contact, entry(run)) for run in runs]).T
     # A lag integrates the force from row to row.
     parts = (0.0,) if sensor.time_constant == 0.0 else (0.0, 0.5)
@@ -67,18 +75,18 @@ def readings(mechanism: Mechanism, runs: Sequence[Run], motion: Motion) -> Readi
 
 
 def entry(run: Run) -> int:
-    """Which entry of the contact lists a run's contact meets."""
+    """Return the index in the contact lists for a run's contact."""
     if run.contact_index is None or run.force_measured is None:
         return 0
     return max(int(run.contact_index[np.argmax(np.abs(np.nan_to_num(run.force_measured)))]), 0)
 
 
 def _columns(law: Law, table: np.ndarray, depth: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Force, its part at no rate, rate and 1 where there is contact; 0 elsewhere."""
+    """Return force, force at zero rate, rate, and a contact flag; all are 0 out of contact."""
     inside = np.maximum(depth, 0.0)
 
     def force(v):
-        return sum(c * one for c, one in zip(table, law.own(inside, v), strict=True))
+        return sum(c * column for c, column in zip(table, law.own(inside, v), strict=True))
 
     total = force(rate)
     touching = (depth > 0.0) & (law.pulls | (total > 0.0))
@@ -86,7 +94,7 @@ def _columns(law: Law, table: np.ndarray, depth: np.ndarray, rate: np.ndarray) -
 
 
 def _lagged(columns: list[np.ndarray], period: float, time_constant: float) -> np.ndarray:
-    """Columns at every row, and half a period before it, as a first-order lag gives them."""
+    """Return the columns after a first-order lag, from values at every row and half a period earlier."""
     if time_constant == 0.0:
         return columns[0]
     pole, (now, half, last) = lag_weights(period / time_constant)
