@@ -92,11 +92,36 @@ def test_a_contact_that_stiffens_from_touch_to_touch_is_a_drift():
 
 
 def test_a_dead_zone_is_told_from_a_bias_and_the_pair_it_confounds_named():
-    found = known("dead_zone", speeds=FEW)
+    law = campaigns.KINDS["dead_zone"].contact["law"]
+    options = Options(law=law, fixed={"rig.contact_plane": 0.0})
+    found = known("dead_zone", options=options, speeds=FEW)
     dead = found["rig.force_sensor.dead_zone"]
     assert dead.value == pytest.approx(4.0, rel=0.03) and dead.low < 4.0 < dead.high
     assert any({"rig.force_sensor.delay", "contact.damping.0"} == {*pair[:2]} for pair in found.confounded)
     assert found.mechanism["rig"]["force_sensor"]["dead_zone"] == dead.value
+
+
+@pytest.mark.parametrize("surface", [-2e-5, 2e-5])
+def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
+    """With the surface 14 um off, damping was found 298 +- 0.4 N s/m where 348 is true, and called good."""
+    campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
+    moved = [
+        replace(
+            run,
+            position_desired=run.position_desired + surface,
+            position_measured=run.position_measured + surface,
+        )
+        for run in campaign.runs
+    ]
+    found = identify(replace(campaign, runs=tuple(moved)), options=Options(law="kelvin_voigt"))
+    truth = campaigns.KINDS["dead_zone"]
+    for key, value in (
+        ("rig.force_sensor.dead_zone", truth.rig["force_sensor"]["dead_zone"]),
+        ("contact.damping.0", truth.contact["damping"][0]),
+        ("rig.force_sensor.delay", truth.rig["force_sensor"]["delay"]),
+    ):
+        assert found[key].low < value < found[key].high, key
+    assert not found.good and any("--fix rig.contact_plane" in note for note in found.notes)
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def check(
         flags = np.ones(len(touching), bool)
         lines += validation.of_contact(contact, touching, mass, frequency, lag, flags)
     effect = uncertain_effect(mechanism)
-    if contact is not None:
+    if contact is not None and not _has_uncertain_dead_zone(mechanism):
         lines += edges(contact, touching, effect)
     lines += uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
     return Identification(
@@ -89,6 +89,12 @@ def check(
         motion=motion,
         contact=contact,
     )
+
+
+def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
+    """Return whether the dead zone is less certain than a reading: edges of contact are not predicted."""
+    stated = mechanism.uncertainty.get("rig.force_sensor.dead_zone")
+    return stated is not None and (stated.std or 0.0) > mechanism.rig.force_sensor.noise_std
 
 
 def uncertainty(effect: Effect, pressed: bool) -> list[validation.Line]:

@@ -31,6 +31,7 @@ PIECE = 1.0  # s, length of the segments of a long run
 TIME_CONSTANTS = 10.0  # time constants after which earlier commands have no effect
 FIRST_ROWS, STEADY = 5, 0.01  # rows between speeds, and their largest relative change in uniform motion
 TOLD = 1e-3  # relative standard deviation of a specified dead zone
+SURFACE_STD = 5e-5  # m; standard deviation of a surface position that nothing specifies, about 0
 BEYOND = 4.0  # standard deviations beyond the dead zone, above which a reading is used
 ROUGH = 21, 5  # delays and planes of a coarse grid, for fits that only serve comparisons
 UNKNOWN_NOISE = 0.01  # noise over the largest force, if it is unknown
@@ -95,6 +96,7 @@ class ContactFit:
     noise_error: float  # relative standard error of the noise level that weights the residuals
     dead_zone: bool  # whether the sensor has a dead zone, which then lowers "bias"
     drift: Drift | None = None  # drift of a separate force clock; the delay then includes a constant
+    has_specified_surface: bool = False  # whether the surface was an option, neither fitted nor assumed
     resampled: str = ""  # summary of the bootstrap in words, if there was one
 
     @property
@@ -146,28 +148,21 @@ def estimate(
     if law is None or isinstance(law, str):
         judged = tuple(judge(motion, readings, plane, None if law is None else (law,)))
         law, near = judged[0].law, (judged[0].delay, judged[0].plane)
-    problem, posterior, lag, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
-    if judged and law.pulls:
-        # A sensor lag that the law does not model looks like a contact that pulls.
-        pushing = kelvin_voigt()
-        alternative = _fitted(motion, readings, pushing, plane, near, hidden, seed)
-        if alternative[3] >= evidence:
-            law, (problem, posterior, lag, evidence) = pushing, alternative
-    if lag is not None:
-        problem = Problem(motion, readings, law, plane, lag.value)
-        posterior = lag.posterior
-
-    def without_damping(law: Law) -> tuple[Posterior, float]:
-        _, alone, lagging, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
-        return alone if lagging is None else lagging.posterior, evidence
-
-    posterior = undamped.averaged(problem, posterior, evidence, without_damping)
+    laws = (law, kelvin_voigt()) if judged and law.pulls else (law,)
+    problem, posterior = _solution(motion, readings, laws, plane, near, hidden, seed)
+    law = problem.law
     if hidden and not _hides(posterior):
         # Zeros at rest without a dead zone are not readings of a noisy sensor: estimate the noise.
         return estimate(runs, model, timing, None, law, plane_option, seed)
+    if hidden and readings.bias is None and plane_option is None:
+        # What the edges of contact tell of delay and damping holds for the surface that is assumed.
+        readings = _clear_of_edges(problem, posterior)
+        problem, posterior = _solution(motion, readings, (law,), plane, None, hidden, seed)
+        posterior = _with_unknown_surface(posterior, seed)
     freedom = len(problem.kept) - len(posterior.names)
     error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart)
+    is_specified = plane_option is not None
+    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart, is_specified)
 
 
 def _prepared(
@@ -187,6 +182,53 @@ def _prepared(
     # With a dead zone the bias only stands for the force that it removes.
     bias = known_bias(runs, motion, noise, plane) if not hidden else prior and (-prior[0], prior[1])
     return replace(readings, bias=bias), plane
+
+
+def _solution(
+    motion: Motion,
+    readings: Readings,
+    laws: Sequence[Law],
+    plane: float | None,
+    near: tuple[float, float] | None,
+    hidden: bool,
+    seed: int,
+) -> tuple[Problem, Posterior]:
+    """Return the fit of the likeliest of the laws, averaged over a sensor lag and contact without damping."""
+    # A sensor lag that a law does not model looks like a contact that pulls: two laws are compared.
+    fits = [(_fitted(motion, readings, law, plane, near, hidden, seed), law) for law in laws]
+    (problem, posterior, lag, evidence), law = max(reversed(fits), key=lambda fit: fit[0][3])
+    if lag is not None:
+        problem = Problem(motion, readings, law, plane, lag.value)
+        posterior = lag.posterior
+
+    def without_damping(law: Law) -> tuple[Posterior, float]:
+        _, alone, lagging, evidence = _fitted(motion, readings, law, plane, near, hidden, seed)
+        return alone if lagging is None else lagging.posterior, evidence
+
+    return problem, undamped.averaged(problem, posterior, evidence, without_damping)
+
+
+def _clear_of_edges(problem: Problem, posterior: Posterior) -> Readings:
+    """Return the readings that are in contact wherever the surface is, to two standard deviations."""
+    position, _ = problem.motion.at(posterior.best[0])
+    readings = problem.readings
+    return replace(readings, counts=readings.counts & (position - posterior.best[1] > 2.0 * SURFACE_STD))
+
+
+def _with_unknown_surface(posterior: Posterior, seed: int) -> Posterior:
+    """Return the posterior with the uncertainty of a surface that nothing specifies, and of the dead zone.
+
+    A spring that begins later lacks as much force as a dead zone removes.
+    """
+    names, draws = posterior.names, posterior.draws.copy()
+    stiffness = next(i for i, name in enumerate(names) if name.startswith("stiffness"))
+    lacking = -draws[:, names.index("bias")]
+    surface = SURFACE_STD * np.random.default_rng(seed).standard_normal(len(draws))
+    # The dead zone is not below 0.
+    surface = np.maximum(surface, -lacking / draws[:, stiffness])
+    draws[:, names.index("plane")] += surface
+    draws[:, names.index("bias")] -= draws[:, stiffness] * surface
+    return replace(posterior, draws=draws)
 
 
 def _fitted(

@@ -428,7 +428,11 @@ def _notes(
     if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
         notes.append(f"of the contact lists only entries {', '.join(map(str, entries))} were met")
     if contact is not None and contact.dead_zone and contact.problem.plane is not None:
-        notes.append("the force has a dead zone: the contact plane was taken as told")
+        assumed = (
+            f"to be at 0 +- {1e3 * contacts.SURFACE_STD:g} mm; --fix rig.contact_plane=VALUE specifies it"
+        )
+        taken = "as told" if contact.has_specified_surface else assumed
+        notes.append(f"the force has a dead zone: the contact plane was taken {taken}")
     return notes
 
 
