@@ -1,13 +1,13 @@
-"""Contact in a hardware-in-the-loop docking rig: its physics, and the controller that runs on it.
+"""Contact simulation of a hardware-in-the-loop docking rig, and the controller that runs on the rig.
 
-    load       a mechanism file, or a built-in one, of one axis or of six
-    simulate   its contacts under a compensator, once
-    jacobian   by how much a figure of each contact changes with the mechanism and the gains
-    register   a compensator or a contact law of your own
+    load       read a mechanism file, or a built-in one, with one axis or with six
+    simulate   simulate the contacts of a mechanism under a compensator, once
+    jacobian   differentiate a metric of each contact with respect to mechanism and gains
+    register   add a compensator or a contact law of your own
 
-Numbers are in SI units; arrays are NumPy's, float64 whatever jax is set to. Whatever is wrong with an
-argument raises `InputError`, one line. Nothing is imported before it is used: the rig's controller,
-`jaxhil.rig`, needs neither jax nor NumPy.
+Numbers are in SI units; arrays are NumPy arrays of float64, whatever precision JAX uses. A wrong argument
+raises `InputError` with a message of one line. Modules are imported on first use: the rig's controller,
+`jaxhil.rig`, needs neither JAX nor NumPy.
 """
 
 from importlib import import_module

@@ -1,7 +1,7 @@
-"""Errors a user can cause, reported in one line.
+"""Error class for wrong input, and functions that put values into its one-line messages.
 
-Whatever a person can get wrong (a file, a key, an option) ends as an `InputError` whose message is
-a single printable line: where it is, what was found there, and what is allowed.
+Wrong input (a file, a key, an option) raises an `InputError`. Its message is a single printable line that
+names the place, the value found there and the allowed values.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ __all__ = ["InputError", "one_line", "shown"]
 
 
 class InputError(ValueError):
-    """Unusable input. The message is one line: ``FILE: key.path: found X, allowed Y``."""
+    """Error for unusable input, with a message of one line: ``FILE: key.path: found X, allowed Y``."""
 
 
 def one_line(text: str, limit: int | None = None) -> str:
-    """`text` with every unprintable character escaped, cut to `limit` characters."""
+    """Return `text` with every unprintable character escaped, cut to `limit` characters."""
     escaped = "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode()
         for character in text
@@ -25,16 +25,16 @@ def one_line(text: str, limit: int | None = None) -> str:
 
 
 def shown(value: object, limit: int = 60) -> str:
-    """A found value in one short printable line, at most `limit` characters."""
+    """Return a printable description of a value for a message, at most `limit` characters."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
-        # A table's text is long and may be nested deeper than `repr` can follow.
+        # The text of a table is long, and `repr` fails on deeply nested tables.
         return "a table"
     if isinstance(value, str):
-        # Escaping multiplies the length: cut before it as well.
+        # Cutting before the escaping as well limits the work for a long text.
         value = value[: limit + 1]
     try:
         return one_line(repr(value), limit)

@@ -1,8 +1,8 @@
-"""Files of ours: written whole or not at all, sealed where a flipped bit would count, nobody else's touched.
+"""Atomic writes, checksummed ("sealed") files, and protection of files that this program did not write.
 
-What we write is a plain file. A link, a pipe or a device that stands in its place is neither followed, nor
-opened, nor replaced. A sealed file begins with the SHA-256 of what follows, as a line of hexadecimal digits;
-it is checked before anything looks at the content.
+The program writes regular files only. A link, a pipe or a device in the place of a file is neither followed,
+opened nor replaced. A sealed file begins with the SHA-256 of its content, as a line of hexadecimal digits,
+which is checked before the content is used.
 """
 
 import ctypes
@@ -21,19 +21,19 @@ from typing import BinaryIO
 
 from jaxhil.errors import InputError, one_line, shown
 
-TEMPORARY = ".tmp"  # end of the name under which a file is written first
-SEAL = 65  # bytes before the content of a sealed file
+TEMPORARY = ".tmp"  # suffix of the temporary name under which a file is first written
+SEAL = 65  # number of bytes before the content of a sealed file
 
-_HERE, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+_WORKING_FOLDER, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _PLAIN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_THIS_PROCESS = secrets.token_hex(4)  # numbers of processes come again
-_OURS = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY)}")
+_THIS_PROCESS = secrets.token_hex(4)  # a process number alone is not unique, since it is used again
+_TEMPORARY_NAME = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY)}")
 _numbers = count()
 
 
 @contextmanager
 def writing(path: str | os.PathLike[str]) -> Iterator[None]:
-    """What cannot be written there is an `InputError`, one line."""
+    """Raise `InputError` if the code in the context cannot write to `path`."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -44,16 +44,16 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def as_path(path: object) -> Path:
-    """What a caller gives as a path. Raises `InputError` if it is none."""
+    """Return a caller's argument as a `Path`. Raise `InputError` if it is not a path."""
     if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
         return Path(path)
     raise InputError(f"path: found {shown(path)}, allowed a path")
 
 
 def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
-    """Columns of one length as a table, a row a line, under a line of their names; numbers to the last bit.
+    """Write columns of equal length as a CSV file with a header line; numbers keep full precision.
 
-    Raises `InputError` when the file cannot be written.
+    Raise `InputError` if the file cannot be written.
     """
     target = as_path(path)
     rows = zip(*columns.values(), strict=True)
@@ -63,9 +63,9 @@ def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
 
 
 def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """The file is there as a whole, or as it was; if it is to be `lasting`, after a power cut too.
+    """Write a file atomically; a `lasting` file survives a power cut once this function has returned.
 
-    Raises OSError when it cannot be written, or when what is there is no plain file.
+    Raise OSError if the file cannot be written, or if `path` exists and is not a regular file.
     """
     with suppress(FileNotFoundError):
         _check_plain(os.lstat(path).st_mode)
@@ -81,16 +81,16 @@ def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bo
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             if isinstance(error, OSError):
-                error.filename = os.fspath(path)  # a full disk names none
+                error.filename = os.fspath(path)  # the error of a full disk has no file name
             raise
     if lasting:
         sync_folder(path.parent)
 
 
 def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
-    """The file is there as a whole, where nothing was before.
+    """Write a new file atomically.
 
-    Raises FileExistsError if something was, or another OSError when it cannot be written.
+    Raise FileExistsError if `path` exists, or another OSError if the file cannot be written.
     """
     temporary = path.with_name(temporary_name())
     write_whole(temporary, content)
@@ -99,7 +99,7 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS):
             raise
-        # A file system without links.
+        # This file system has no hard links.
         if os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), os.fspath(path)) from None
         os.replace(temporary, path)
@@ -108,33 +108,30 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
 
 
 def write_sealed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """`write_whole` of the content under its seal, which shows what a power cut took of it."""
+    """Write the content after its seal with `write_whole`; the seal reveals any later damage."""
     seal = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
     write_whole(path, seal + bytes(content), lasting)
 
 
 def read_sealed(path: Path) -> bytes | None:
-    """What `write_sealed` wrote; None if there is nothing, or anything else, down to the last bit."""
+    """Return the content that `write_sealed` wrote, or None if the file is missing or differs by any bit."""
     try:
         with open_plain(path) as file:
-            found = file.read()
+            sealed = file.read()
     except (OSError, ValueError):
         return None
-    content = found[SEAL:]
-    return content if found[:SEAL] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" else None
+    content = sealed[SEAL:]
+    return content if sealed[:SEAL] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" else None
 
 
 def open_plain(path: str | os.PathLike[str]) -> BinaryIO:
-    """A plain file, to read. Raises OSError for a link, a pipe or a device, and waits for none."""
+    """Open a regular file for reading. Raise OSError at once for a link, a pipe or a device."""
     _check_plain(os.lstat(path).st_mode)
     return _open_checked(path, _PLAIN)
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a file that a user names, to read; a link stands for its file.
-
-    Raise OSError for a pipe, a device or a folder, without waiting for one.
-    """
+    """Open a user's file for reading; links are followed. Raise OSError for a pipe, a device or a folder."""
     mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
@@ -143,6 +140,7 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
+    """Open a file for reading. Raise OSError unless the open file is a regular one."""
     descriptor = os.open(path, flags)
     try:
         _check_plain(os.fstat(descriptor).st_mode)
@@ -154,7 +152,7 @@ def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
 
 @contextmanager
 def lock(path: Path) -> Iterator[None]:
-    """Nobody else holds the lock meanwhile. Raises BlockingIOError if somebody does, or another OSError."""
+    """Hold an exclusive lock on a file. Raise BlockingIOError if it is locked, or another OSError."""
     import fcntl
 
     with suppress(FileNotFoundError):
@@ -169,9 +167,9 @@ def lock(path: Path) -> Iterator[None]:
 
 
 def follow(path: str | os.PathLike[str]) -> Path:
-    """Where a path leads that the user names for output: a link stands for its file, which may be replaced.
+    """Return the file to which a user's output path leads; links are followed.
 
-    Raises OSError for what is no plain file.
+    Raise OSError if the file exists and is not a regular one.
     """
     target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     with suppress(FileNotFoundError):
@@ -180,20 +178,22 @@ def follow(path: str | os.PathLike[str]) -> Path:
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Each has the other's name, from one moment to the next. Raises OSError: ENOSYS or EINVAL where the
-    system cannot do that."""
+    """Exchange the names of two files or folders atomically.
+
+    Raise OSError; its number is ENOSYS or EINVAL if the system does not support the exchange.
+    """
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except (AttributeError, OSError, TypeError):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
     rename.argtypes = ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint
-    if rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) != 0:
+    if rename(_WORKING_FOLDER, os.fsencode(one), _WORKING_FOLDER, os.fsencode(other), _EXCHANGE) != 0:
         reason = ctypes.get_errno()
         raise OSError(reason, os.strerror(reason), os.fspath(other))
 
 
 def make_folder(folder: Path) -> None:
-    """A folder of ours within one that the user named, made if need be. Raises OSError, for a link too."""
+    """Create a folder unless it exists. Raise OSError if this fails, or if `folder` is a link or a file."""
     with suppress(FileExistsError):
         folder.mkdir(parents=True)
     mode = os.lstat(folder).st_mode
@@ -202,10 +202,10 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove what processes that were killed while they wrote left there. Raises OSError."""
+    """Remove the temporary files and folders of processes that no longer run. Raise OSError."""
     with os.scandir(folder) as entries:
         for entry in entries:
-            name = _OURS.fullmatch(entry.name)
+            name = _TEMPORARY_NAME.fullmatch(entry.name)
             if not name or _is_writing(int(name[1]), name[2]):
                 continue
             if entry.is_file(follow_symlinks=False):
@@ -216,17 +216,17 @@ def remove_stale(folder: Path) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file of that name was left when writing was interrupted."""
-    return _OURS.fullmatch(name) is not None
+    """Return whether a name is one of `temporary_name`."""
+    return _TEMPORARY_NAME.fullmatch(name) is not None
 
 
 def temporary_name() -> str:
-    """A name for a file or folder until it is whole: of this process, used once."""
+    """Return a new name for a file or folder that this process has not finished writing."""
     return f".jaxhil-{os.getpid()}-{_THIS_PROCESS}-{next(_numbers)}{TEMPORARY}"
 
 
 def sync_folder(folder: Path) -> None:
-    """Names given in the folder so far survive a power cut. Raises OSError."""
+    """Write the entries of a folder to disk, so that they survive a power cut. Raise OSError."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -235,6 +235,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _is_writing(process: int, token: str) -> bool:
+    """Return whether the process that made a temporary name still runs."""
     if process == os.getpid():
         return token == _THIS_PROCESS
     try:
@@ -247,10 +248,12 @@ def _is_writing(process: int, token: str) -> bool:
 
 
 def _check_plain(mode: int) -> None:
+    """Raise OSError unless `mode` is that of a regular file."""
     if not stat.S_ISREG(mode):
         raise OSError(errno.EEXIST, f"found {_kind(mode)}, allowed a plain file")
 
 
 def _kind(mode: int) -> str:
+    """Return the kind of file, in words, that `mode` states."""
     kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFREG: "a file"}
     return kinds.get(stat.S_IFMT(mode), "a device")

@@ -1,1 +1,1 @@
-"""Contact: force laws, contact with one surface or two, and the same contact in space (the reference)."""
+"""Contact laws, contact with one surface or two, and the ideal (undelayed) contact as the reference."""

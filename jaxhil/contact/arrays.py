@@ -1,4 +1,4 @@
-"""`jax.numpy`, imported when a contact law first computes with arrays: files are read without JAX."""
+"""Lazy import of `jax.numpy` for the contact laws, so that mechanism files are read without JAX."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -6,7 +6,7 @@ __all__ = ["jnp"]
 
 
 class _LazyNumpy:
-    """Stand-in for `jax.numpy` that imports it at the first access."""
+    """Stand-in for `jax.numpy` that imports it when an attribute is first used."""
 
     def __getattr__(self, name: str) -> Any:
         import jax.numpy

@@ -1,13 +1,13 @@
-"""Interface of the contact laws: the force of a docking mechanism against penetration d > 0 and its rate d'.
+"""Interface of the contact laws: contact force against penetration d > 0 [m] and its rate d' [m/s].
 
-A law states all that depends on it: the keys of a mechanism file that it uses, its force in the simulation
-and in plain floats, its ideal contact, and what tuning, benchmarks and identification need of it. A new law
+A law defines everything that depends on it: its keys in a mechanism file, its force in the simulation and in
+plain floats, its ideal contact, and the functions that tuning, benchmarks and identification call. A new law
 is one file with a class and one entry in `jaxhil.contact.laws`.
 
-In the simulation a law is a pure function of the motion and of a state of its own (`init`, `step`); the state
-of a memoryless law is empty. All forces are zero for d <= 0 and, unless tension is allowed, never negative.
-Every argument broadcasts to the batch shape; slopes and depths of a segmented law carry a leading axis of
-segments. Arrays are those of `jax.numpy` where nothing else is said.
+In the simulation a law is a pure function of the motion and of the law's state (`init`, `step`); a law
+without memory has an empty state. A force is zero for d <= 0 and, unless tension is allowed, never negative.
+Every argument broadcasts to the batch shape; slopes and depths of a segmented law have a leading axis of
+segments. Arrays are those of `jax.numpy` unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -35,62 +35,73 @@ __all__ = ["ContactLaw"]
 class ContactLaw(abc.ABC):
     """Interface of all contact laws.
 
-    A subclass is a frozen dataclass and holds no arrays: all numbers come with the parameters
-    (`jaxhil.contact.laws.ContactParameters`) or with the file's table `[contact]`, here called `contact`.
+    A subclass becomes a frozen dataclass. It holds no arrays: all numbers come from the parameters
+    (`jaxhil.contact.laws.ContactParameters`) or from the file's table `[contact]`, here called `contact`.
     """
 
-    name: ClassVar[str] = ""  # in mechanism files
-    # Keys of some laws alone that this one uses; None: it does not say, and may use any of them.
+    name: ClassVar[str] = ""  # name in mechanism files
+    # Keys that only some laws have and that this law uses; None: unspecified, the law may use any of them.
     keys: ClassVar[tuple[Key, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
     damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
-    dissipates_by: ClassVar[str] = ""  # of a law that refuses the key `damping`: what dissipates instead
+    dissipates_by: ClassVar[str] = ""  # source of dissipation of a law that rejects the key `damping`
     segmented: ClassVar[bool] = False  # whether each entry of `stiffness` is a list of slopes
     is_linear: ClassVar[bool] = False  # whether the force in contact is k d + b d'
-    damped_as: ClassVar[str] = ""  # name of the law that it is with damping; empty: its own
+    damped_as: ClassVar[str] = ""  # name of the law that adds damping to this one; empty: this law itself
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the subclass a frozen dataclass: programs are compiled for a law, which has to be hashable."""
+        """Make the subclass a frozen dataclass: programs are compiled per law, which must be hashable."""
         super().__init_subclass__(**kwargs)
         dataclass(frozen=True)(cls)
 
-    # The simulation
+    # Simulation
 
     @property
     def remembers(self) -> bool:
-        """Whether the force depends on how deep the mechanism has been: state and motion are then followed
-        between samples too. Where there is no penetration the state is that before the first touch: a
-        surface that has been left is as new. Of the way between two penetrations only the deepest counts."""
+        """Return whether the force depends on the deepest penetration so far.
+
+        The simulation then follows state and motion between samples too. Without penetration the state is
+        that before the first touch: a released surface is as new. The path between two penetrations counts
+        only by its deepest point.
+        """
         return False
 
     @property
     def jumps(self) -> bool:
-        """Whether the force jumps where the motion turns: its peak is then looked for between samples."""
+        """Return whether the force jumps at a turning point; its peak is then sought between samples too."""
         return False
 
     @property
     def arcs(self) -> bool:
-        """Tell whether in contact the force over a quarter of a slow interval is close to a parabola:
-        no slope that changes at a depth, no jump at a turn, no end at a power of the depth."""
+        """Return whether the force in a slow contact is nearly parabolic over a quarter of a control period.
+
+        It is not if its slope changes at a depth, if it jumps at a turning point, or if it ends as a power of
+        the depth.
+        """
         return False
 
     @property
     def closed_form(self) -> bool:
-        """Whether the reference is quick enough to be worked out with every run; else it is integrated."""
+        """Return whether the ideal contact has a closed form, computed in every run, or is integrated."""
         return type(self).reference is not ContactLaw.reference
 
     @property
     def simulated(self) -> ContactLaw:
-        """The law that computes the same force in the simulation: laws of two names share its programs."""
+        """Return the law that computes this force in the simulation, so that two laws can share a program."""
         return self
 
     def specialised(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
-        """Return the law for numbers that all batch elements share; `drawn` tells of a key if they do not."""
+        """Return the law specialised to keys whose value all batch elements share.
+
+        Args:
+            contact: the file's table `[contact]`.
+            drawn: function that returns whether the value of a key varies over the batch.
+        """
         return self.simulated
 
     def init(self, penetration: Any) -> tuple[Any, ...]:
-        """Return the state before the first touch, for a batch shaped like `penetration`."""
+        """Return the state before the first touch, in the batch shape of `penetration`."""
         return ()
 
     @abc.abstractmethod
@@ -101,31 +112,33 @@ class ContactLaw(abc.ABC):
 
     @abc.abstractmethod
     def edge(self, parameters: Any, rate: Any) -> Any:
-        """Return the limit of the force [N] as the penetration goes to 0 from above: the jump of a damped
-        touch."""
+        """Return the limit of the force [N] as d goes to 0 from above: the jump at a damped touch."""
 
     @abc.abstractmethod
     def hold(self, parameters: Any, state: tuple[Any, ...], penetration: Any, rate: Any) -> Any:
-        """Return a smooth function that is positive as long as penetrated surfaces hold on to each other:
-        they let go where it goes through 0. It is the force before its clamp, or anything of its sign."""
+        """Return a smooth function that is positive until the penetrated surfaces separate, at its zero.
+
+        It is the force before it is clamped, or a function of the same sign.
+        """
 
     def corners(self, parameters: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the penetrations [m] at which the slope of the force changes; by default there are none."""
+        """Return the penetrations [m] at which the slope of the force changes; none by default."""
         return ()
 
     def reference(self, parameters: Any, mass: Any, velocity: Any) -> Reference:
-        """Return the ideal contact entered at `velocity` [m/s] (`jaxhil.contact.reference`). By default its
-        motion is integrated (`jaxhil.contact.reference_motion`)."""
+        """Return the ideal contact of equivalent `mass` [kg] and approach `velocity` [m/s].
+
+        By default its motion is integrated (`jaxhil.contact.reference_motion`).
+        """
         from jaxhil.contact.reference import Reference
         from jaxhil.contact.reference_motion import integrate_contact
 
         return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])
 
-    # Scales of the contact, from the numbers of scenarios as NumPy arrays
+    # Scales of the contact, from the parameters of scenarios as NumPy arrays
 
     def undamped_peak_force(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the peak force [N] of each contact if it had no damping, (slots, batch). By default the
-        motion is integrated."""
+        """Return the peak force [N] of the undamped contacts, (slots, batch); integrated by default."""
         import jax
         import jax.numpy as jnp
 
@@ -133,70 +146,79 @@ class ContactLaw(abc.ABC):
 
         shape = np.shape(parameters.stiffness)
         undamped = parameters._replace(damping=np.zeros_like(parameters.damping))
-        entered = [jnp.broadcast_to(jnp.asarray(one), shape) for one in (mass, velocity)]
-        motion = integrate_contact(self, jax.tree.map(jnp.asarray, undamped), entered[0], entered[1])
+        m, v = (jnp.broadcast_to(jnp.asarray(values), shape) for values in (mass, velocity))
+        motion = integrate_contact(self, jax.tree.map(jnp.asarray, undamped), m, v)
         return np.asarray(motion.peak_force)
 
     def tangent_stiffness(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the largest slope of the force against the depth [N/m], (slots, batch). By default it is the
-        stiffness. Of a segmented law the parameters have the largest slope alone."""
+        """Return the largest slope of the force against the depth [N/m], (slots, batch).
+
+        By default it is the stiffness. The parameters of a segmented law contain only its largest slope.
+        """
         return parameters.stiffness
 
     def onset_damping(self, parameters: Any) -> np.ndarray:
-        """Return the slope of the force against the rate at the touch [N s/m], (slots, batch)."""
+        """Return the slope of the force against the rate at the onset of contact [N s/m], (slots, batch)."""
         return parameters.damping
 
     # Scales of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Return the order of the peak force [N] over the entries of `stiffness`, as of a linear contact."""
+        """Estimate the peak force [N] over the entries of `stiffness`; by default as a linear contact's."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:
-        """Return the damping ratio [1] of an oscillator of this `frequency` [rad/s] that loses as much."""
+        """Return the damping ratio [1] of a linear oscillator at `frequency` [rad/s] with equal loss."""
         return damping / (2 * mass * frequency)
 
-    # What other parts need of a law, which a law may leave out
+    # Optional functions for other packages
 
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray
     ) -> tuple[str, np.ndarray]:
-        """Return a key and its values with the dissipation added of an oscillator of this damping ratio.
+        """Return a key and its values after adding the dissipation of an oscillator with this damping ratio.
 
         Args:
-            drawn: function of a key that returns its draws, (draws, ...); of `stiffness` and `damping`
-                (draws, entries), the first slope of a segmented law.
+            drawn: function that returns the draws of a key, (draws, ...); those of `stiffness` and `damping`
+                are (draws, entries), for a segmented law with its first slope.
             ratio: damping ratio [1], (draws, 1).
             mass: equivalent mass [kg], (draws, 1).
             velocity: approach speed [m/s], (draws, 1).
 
         Raises:
-            InputError: if the law does not state how it dissipates.
+            InputError: if the law does not define this function.
         """
         raise self._unstated("whose damping can be perturbed", "perturb_damping")
 
     def in_floats(self, contact: Any, stiffness: Any, damping: float) -> FloatLaw:
-        """Return the law in plain floats, with these entries of the lists. Raise `InputError` if there is
-        none."""
+        """Return the law in plain floats, with one entry each of the lists `stiffness` and `damping`.
+
+        Raise `InputError` if the law does not define this function.
+        """
         raise self._unstated("in plain floats", "in_floats")
 
     def regression(self, contact: Any) -> Regression:
-        """Return the law as a sum of known functions. Raise `InputError` if it is none."""
+        """Return the law as a sum of known functions. Raise `InputError` if the law does not define this."""
         raise self._unstated("that is fitted to logs", "regression")
 
     def families(self, deepest: float, entries: int) -> list[Family]:
-        """Return the regressions that identification tries on logs whose deepest touch is `deepest` [m] and
-        that meet so many entries of the lists; none by default."""
+        """Return the regression families that identification tries; none by default.
+
+        Args:
+            deepest: largest penetration in the logs [m].
+            entries: number of entries of the lists `stiffness` and `damping` that occur in the logs.
+        """
         return []
 
     def coefficients(self, contact: Any, stiffness: Any, damping: float) -> list[float]:
-        """Return the coefficients of `regression`, those of an entry and then the shared ones."""
+        """Return the coefficients of `regression`: those of one entry, then the shared ones."""
         return [stiffness, damping]
 
     def file_values(self, fitted: Mapping[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
-        """Return values by key of the mechanism file from the coefficients of an entry, `fitted` by name."""
+        """Return values by dotted key of the mechanism file from the `fitted` coefficients of an entry."""
         return {f"contact.stiffness.{entry}": fitted["stiffness"]}
 
     def _unstated(self, which: str, method: str) -> InputError:
+        """Return the error for a law that lacks an optional `method`."""
         expected = f"a law {which} (ContactLaw.{method})"
         return InputError(f"contact.law: found {shown(self.name)}, expected {expected}")

@@ -1,4 +1,4 @@
-"""Hertz's contact with a damper that works by depth: F = k d^n + b d' d/d_0, clamped at 0."""
+"""Hertz contact with damping proportional to depth: F = k d^n + b d' d/d_0, clamped at 0."""
 
 from typing import ClassVar
 
@@ -10,16 +10,18 @@ from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
 from jaxhil.contact.regression import Family, Regression
 
-DEPTH = 1e-3  # m, reference depth that identification writes
+DEPTH = 1e-3  # m, reference depth that identification writes into a file
 
 
 class DepthDamped(PowerLaw):
-    """F = max(0, k d^n + b d' d/d_0): `stiffness` k [N/m^n], n the `exponent` (1.5 for Hertz), `damping`
-    b [N s/m] at the depth d_0, `reference_depth` [m]. There is no jump at the touch; on the way out the
-    surfaces part inside, where k d^(n-1) = b |d'|/d_0.
+    """Contact law F = max(0, k d^n + b d' d/d_0), with damping proportional to depth.
 
-    The reference is integrated. Without damping it is that of Hunt and Crossley's law; with n = 1 their law
-    with chi = 2 b/(3 k d_0), whose reference has a closed form.
+    k is `stiffness` [N/m^n], n is `exponent` (1.5 for Hertz), b is `damping` [N s/m] at the depth d_0,
+    `reference_depth` [m]. The force does not jump at the onset. On the way out the surfaces separate at a
+    depth d > 0, where k d^(n-1) = b |d'|/d_0.
+
+    The ideal contact is integrated. Without damping it equals that of Hunt and Crossley's law; with n = 1 the
+    law is theirs with chi = 2 b/(3 k d_0), whose ideal contact has a closed form.
     """
 
     name: ClassVar[str] = "depth_damped"
@@ -37,25 +39,25 @@ class DepthDamped(PowerLaw):
         return jnp.zeros_like(rate)
 
     def hold(self, parameters, state, penetration, rate):
-        """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+        """Return F/d; for d <= 0 only its damping term, plus k for a linear spring."""
         touching = penetration > 0
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
         power = jnp.where(touching | (parameters.exponent == 1), power, 0)
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the b that dissipates as much at the deepest point."""
+        """Add the damping b that dissipates as much at the deepest point."""
         stiffness, order = drawn("stiffness"), drawn("exponent")[:, None] + 1
         depth = (order * mass * velocity**2 / (2 * stiffness)) ** (1 / order)
-        reach = drawn("reference_depth")[:, None]
-        added = 1.5 * np.pi * ratio / velocity * stiffness * depth ** (order - 2) * reach
+        reference_depth = drawn("reference_depth")[:, None]
+        added = 1.5 * np.pi * ratio / velocity * stiffness * depth ** (order - 2) * reference_depth
         return "damping", drawn("damping") + added
 
     def in_floats(self, contact, stiffness, damping):
         exponent, reference_depth = contact.exponent, contact.reference_depth
 
         def hold(depth: float, rate: float) -> float:
-            """F/d; outside, its damping's part alone, but for a linear spring, which has no end there."""
+            """Return F/d; for d <= 0 only its damping term, plus k for a linear spring."""
             return stiffness * max(depth, 0.0) ** (exponent - 1.0) + damping * rate / reference_depth
 
         def force(depth: float, rate: float) -> float:
@@ -72,6 +74,7 @@ class DepthDamped(PowerLaw):
 
 
 def _regression(exponent: float, reference_depth: float) -> Regression:
+    """Return F = k d^n + b d' d/d_0 with the coefficients k and b."""
     return Regression(
         "depth_damped",
         lambda d, v: [d**exponent],

@@ -1,4 +1,4 @@
-"""One step of Dormand and Prince's pair of order 5(4) for y' = f(t, y), and the motion within a step."""
+"""Runge-Kutta step of order 5(4) for y' = f(t, y) (Dormand and Prince 1980), and the motion within a step."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 __all__ = ["StepEnd", "StepResult", "along", "take_rolled_step", "take_step"]
 
-# Dormand and Prince 1980: nodes, coefficients of the stages, the last of which is the solution of order 5,
-# and the error, solution of order 5 less that of order 4.
+# Nodes and stage coefficients; the last stage is the solution of order 5. The error is the difference between
+# the solutions of order 5 and 4.
 _NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
 _STAGES = (
     (),
@@ -24,66 +24,67 @@ _STAGES = (
 )
 _ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
-# Of the time since the step's start [s] and y, a tree of arrays: y' and whatever else is asked for there.
+# Function of the time since the step's start [s] and of y, a tree of arrays. It returns y' and any other
+# result that is needed at the step's end.
 Slope = Callable[[Array, Any], tuple[Any, Any]]
 
 
 class StepResult(NamedTuple):
-    """The end of a step."""
+    """Result of a step."""
 
-    end: Any  # y
-    slopes: Any  # y' at each stage: of the first at the start, of the last at the end
-    found: Any  # what else the slope's function returned at the end
-    error: Any  # of y
+    end: Any  # y at the step's end
+    slopes: Any  # y' at each stage; the first is at the step's start, the last at its end
+    found: Any  # second result of the slope function at the step's end
+    error: Any  # error estimate of y
 
 
 def take_step(slope: Slope, start: Any, length: Array) -> StepResult:
     """Take a step of `length` [s] from y = `start`."""
 
-    def moved(row, slopes):
-        terms = [(a, one) for a, one in zip(row, slopes, strict=True) if a]
+    def increment(row, slopes):
+        terms = [(a, stage) for a, stage in zip(row, slopes, strict=True) if a]
         return jax.tree.map(
             lambda *leaves: length * sum((a * leaf for (a, _), leaf in zip(terms, leaves, strict=True)), 0.0),
-            *(one for _, one in terms),
+            *(stage for _, stage in terms),
         )
 
-    end, slopes, found = start, [], None
+    end, slopes, extra = start, [], None
     for node, row in zip(_NODES, _STAGES, strict=True):
         if row:
-            end = jax.tree.map(lambda leaf, more: leaf + more, start, moved(row, slopes))
-        one, found = slope(node * length, end)
-        slopes.append(one)
-    return StepResult(end, slopes, found, moved(_ERROR, slopes))
+            end = jax.tree.map(lambda leaf, change: leaf + change, start, increment(row, slopes))
+        stage, extra = slope(node * length, end)
+        slopes.append(stage)
+    return StepResult(end, slopes, extra, increment(_ERROR, slopes))
 
 
 def take_rolled_step(slope: Slope, start: Any, length: Float[Array, "*batch"]) -> StepResult:
-    """Take the same step with its stages in a loop, which takes a fraction of the time to compile."""
-    stages, lanes = len(_NODES), [1] * length.ndim
+    """Take the same step with a loop over its stages, which compiles in a fraction of the time."""
+    stages, batch_axes = len(_NODES), [1] * length.ndim
 
-    def moved(row: Array, slopes: Any) -> Any:
-        weights = row.reshape(-1, *lanes)
+    def increment(row: Array, slopes: Any) -> Any:
+        weights = row.reshape(-1, *batch_axes)
         return jax.tree.map(lambda leaf: length * jnp.sum(weights * leaf, axis=0), slopes)
 
-    def stage(carry, given):
+    def take_stage(carry, coefficients):
         slopes, *_ = carry
-        index, row, node = given
-        at = jax.tree.map(jnp.add, start, moved(row, slopes))
-        one, found = slope(node * length, at)
-        slopes = jax.tree.map(lambda every, leaf: every.at[index].set(leaf), slopes, one)
-        return (slopes, at, found), None
+        index, row, node = coefficients
+        end = jax.tree.map(jnp.add, start, increment(row, slopes))
+        stage, extra = slope(node * length, end)
+        slopes = jax.tree.map(lambda stack, leaf: stack.at[index].set(leaf), slopes, stage)
+        return (slopes, end, extra), None
 
-    def empty(tree: Any, *before: int) -> Any:
-        return jax.tree.map(lambda leaf: jnp.zeros((*before, *leaf.shape), leaf.dtype), tree)
+    def empty(tree: Any, *leading: int) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros((*leading, *leaf.shape), leaf.dtype), tree)
 
     rows = [(*row, *[0.0] * (stages - len(row))) for row in _STAGES]
-    given = jnp.arange(stages), jnp.asarray(rows, length.dtype), jnp.asarray(_NODES, length.dtype)
-    found = empty(jax.eval_shape(lambda: slope(length, start)[1]))
-    (slopes, end, found), _ = lax.scan(stage, (empty(start, stages), start, found), given)
-    return StepResult(end, slopes, found, moved(jnp.asarray(_ERROR, length.dtype), slopes))
+    coefficients = jnp.arange(stages), jnp.asarray(rows, length.dtype), jnp.asarray(_NODES, length.dtype)
+    extra = empty(jax.eval_shape(lambda: slope(length, start)[1]))
+    (slopes, end, extra), _ = lax.scan(take_stage, (empty(start, stages), start, extra), coefficients)
+    return StepResult(end, slopes, extra, increment(jnp.asarray(_ERROR, length.dtype), slopes))
 
 
 class StepEnd(NamedTuple):
-    """Motion of one coordinate at a step's end."""
+    """Motion of one coordinate in a step: position and velocity at its end, acceleration at both ends."""
 
     depth: Array  # penetration [m]
     velocity: Array  # its rate [m/s]
@@ -92,16 +93,17 @@ class StepEnd(NamedTuple):
 
 
 def along(
-    s: Array | float, length: Array, depth: Array, velocity: Array, tried: StepEnd
+    s: Array | float, length: Array, depth: Array, velocity: Array, end: StepEnd
 ) -> tuple[Array, Array]:
-    """Position and velocity at the fraction s of a step, by its quintic (Hermite)."""
-    speed, bend = velocity * length, tried.first * length**2 / 2
-    moved = tried.depth - depth - speed - bend
-    turned = tried.velocity * length - speed - 2 * bend
-    curled = tried.last * length**2 - 2 * bend
-    cubic = 10 * moved - 4 * turned + curled / 2
-    quartic = -15 * moved + 7 * turned - curled
-    quintic = 6 * moved - 3 * turned + curled / 2
-    position = depth + s * (speed + s * (bend + s * (cubic + s * (quartic + s * quintic))))
-    rate = speed + s * (2 * bend + s * (3 * cubic + s * (4 * quartic + s * 5 * quintic)))
+    """Return position [m] and velocity [m/s] at the fraction s of a step (quintic Hermite polynomial)."""
+    linear, square = velocity * length, end.first * length**2 / 2
+    # Remainders at the step's end of position, velocity and acceleration, per step length.
+    position_rest = end.depth - depth - linear - square
+    velocity_rest = end.velocity * length - linear - 2 * square
+    acceleration_rest = end.last * length**2 - 2 * square
+    cubic = 10 * position_rest - 4 * velocity_rest + acceleration_rest / 2
+    quartic = -15 * position_rest + 7 * velocity_rest - acceleration_rest
+    quintic = 6 * position_rest - 3 * velocity_rest + acceleration_rest / 2
+    position = depth + s * (linear + s * (square + s * (cubic + s * (quartic + s * quintic))))
+    rate = linear + s * (2 * square + s * (3 * cubic + s * (4 * quartic + s * 5 * quintic)))
     return position, jnp.where(length > 0, rate / jnp.where(length > 0, length, 1), velocity)

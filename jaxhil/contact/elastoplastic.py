@@ -1,4 +1,4 @@
-"""A mechanism that yields: it loads along one slope and unloads from its deepest point along a steeper."""
+"""Elastoplastic contact: loading along one slope, unloading from the deepest point along a steeper one."""
 
 from typing import ClassVar
 
@@ -11,22 +11,22 @@ from jaxhil.contact.keys import Key
 
 
 class Elastoplastic(ContactLaw):
-    """F = max(0, k d_max - k_u (d_max - d)), k_u = r k: `stiffness` k [N/m], `unloading_ratio` r >= 1.
+    """Contact law F = max(0, k d_max - k_u (d_max - d)), k_u = r k, of a mechanism that yields.
 
-    The state is the deepest penetration d_max [m]. At d = d_max the force is k d; it falls along k_u to 0 at
-    d = d_max (1 - 1/r), rises along the same line up to d_max and goes on along k from there. What is lost is
-    the triangle between the lines: M v^2/2 = k d_max^2/2 goes in, 1/r of it comes back, e = 1/sqrt(r).
-    There is no damping beside it.
+    k is `stiffness` [N/m], r is `unloading_ratio` >= 1. The state is the deepest penetration d_max [m]. At
+    d = d_max the force is k d. It falls along the slope k_u to 0 at d = d_max (1 - 1/r), rises along the same
+    line up to d_max and continues along k from there. The loss is the triangle between the two lines: the
+    energy M v^2/2 = k d_max^2/2 goes in, 1/r of it comes back, so that e = 1/sqrt(r). The law has no damping.
 
-    A surface that the mechanism has left (d <= 0) has forgotten its dent: every contact meets a fresh
-    element, either surface of two has its own, and only a touch before the dent is left meets the dent.
+    The dent is lost when the mechanism leaves the surface (d <= 0): every new contact begins undeformed, and
+    each of two surfaces has its own dent. Only a touch within the dent (0 < d < d_max) still sees it.
     """
 
     name: ClassVar[str] = "elastoplastic"
     keys: ClassVar = (
         Key(
             "unloading_ratio",
-            "slope of unloading over that of loading, for {laws}",
+            "ratio of the unloading slope to the loading slope, for {laws}",
             "1",
             {"ge": 1.0},
             neutral=1.0,
@@ -66,7 +66,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
     def reference(self, parameters, mass, velocity):
-        """Return a quarter of a period of sqrt(k/M) in, of sqrt(k_u/M) out."""
+        """Return a quarter period of the frequency sqrt(k/M) inward and of sqrt(k_u/M) outward."""
         from jaxhil.contact.reference import Reference
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
@@ -84,7 +84,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * parameters.unloading_ratio
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Multiply the unloading ratio by exp(2 pi zeta), as e* is its power -1/2."""
+        """Multiply the unloading ratio r by exp(2 pi zeta), since e* = 1/sqrt(r)."""
         return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
 
     def in_floats(self, contact, stiffness, damping):
@@ -92,7 +92,7 @@ class Elastoplastic(ContactLaw):
 
 
 def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
-    """Return F = k d_max - k_u (d_max - d) >= 0 after the penetration d_max; k d beyond it."""
+    """Return the law after a penetration d_max: F = k d_max - k_u (d_max - d) >= 0, k d beyond d_max."""
 
     def spring(depth: float, rate: float) -> float:
         if depth >= deepest:

@@ -1,4 +1,4 @@
-"""A spring that stiffens with depth, and a damper: F = k d (1 + (d/d_0)^2) + b d', clamped at 0."""
+"""Hardening spring with a damper: F = k d (1 + (d/d_0)^2) + b d', clamped at 0."""
 
 import math
 from typing import ClassVar
@@ -13,10 +13,12 @@ from jaxhil.contact.regression import Family, Regression
 
 
 class Hardening(ContactLaw):
-    """F = max(0, k d (1 + (d/d_0)^2) + b d'): `stiffness` k [N/m] at the surface, four times that slope at
-    the depth d_0, `reference_depth` [m]. Duffing's oscillator, one-sided.
+    """Contact law F = max(0, k d (1 + (d/d_0)^2) + b d'), a one-sided Duffing oscillator.
 
-    The reference is integrated. Without damping e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the
+    k is `stiffness` [N/m], the slope at the surface; at the depth d_0, `reference_depth` [m], the slope is
+    four times as large. b is `damping` [N s/m].
+
+    The ideal contact is integrated. Without damping e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the
     deepest point, where the force is largest.
     """
 
@@ -40,7 +42,7 @@ class Hardening(ContactLaw):
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return the force where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2), in units of d_0."""
+        """Return the force at the depth d where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2)."""
         energy, unit = mass * velocity**2 / 2, parameters.reference_depth
         square = np.sqrt(1 + 4 * energy / (parameters.stiffness * unit**2)) - 1
         return parameters.stiffness * unit * np.sqrt(square) * (1 + square)
@@ -56,7 +58,7 @@ class Hardening(ContactLaw):
         return contact.reference_depth * max(forces)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M)."""
+        """Add 2 zeta sqrt(k M) to the damping."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -79,7 +81,7 @@ class Hardening(ContactLaw):
         return [stiffness, stiffness / contact.reference_depth**2, damping]
 
     def file_values(self, fitted, entry):
-        # Where the cubic part is nothing, the depth at which it matters has no end.
+        # The bounds keep the reference depth finite where the cubic coefficient is 0 or negative.
         ratio = fitted["stiffness"] / np.maximum(fitted["cubic"], 1e-12)
         depth = np.sqrt(np.maximum(ratio, 1e-12))
         return {**super().file_values(fitted, entry), "contact.reference_depth": depth}

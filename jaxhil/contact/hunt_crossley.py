@@ -1,4 +1,4 @@
-"""A power of the penetration, damped in proportion to itself."""
+"""Hunt and Crossley's contact law: a power of the penetration, with damping proportional to that power."""
 
 from typing import ClassVar
 
@@ -11,13 +11,13 @@ from jaxhil.contact.regression import Family, Regression
 
 
 class HuntCrossley(PowerLaw):
-    """F = k d^n (1 + (3/2) chi d'), n = 1.5 for Hertz (Hunt and Crossley 1975)."""
+    """Contact law F = k d^n (1 + (3/2) chi d'), n = 1.5 for Hertz (Hunt and Crossley 1975)."""
 
     name: ClassVar[str] = "hunt_crossley"
     damping_unit: ClassVar[str] = "s/m"
-    QUICK: ClassVar = (1.0, 1.5)  # n that need no powers, which are worked out number by number
+    QUICK: ClassVar = (1.0, 1.5)  # exponents n that need no general power, which is not vectorised
 
-    # n where it is one of those in every lane and nothing is differentiated by it
+    # n, if it is in `QUICK` and equal for all batch elements; else None
     exponent: float | None = None
 
     @property
@@ -25,8 +25,8 @@ class HuntCrossley(PowerLaw):
         return True
 
     def specialised(self, contact, drawn):
-        known = not drawn("exponent") and contact.exponent in self.QUICK
-        return HuntCrossley(contact.exponent) if known else self
+        is_quick = not drawn("exponent") and contact.exponent in self.QUICK
+        return HuntCrossley(contact.exponent) if is_quick else self
 
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
@@ -48,11 +48,11 @@ class HuntCrossley(PowerLaw):
         return hunt_crossley(mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity)
 
     def damping_ratio(self, damping, mass, velocity, frequency):
-        """Return chi v/pi, from e = 1 - chi v."""
+        """Return chi v/pi, which follows from e = 1 - chi v."""
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add pi zeta/v, as e* is about 1 - chi v."""
+        """Add pi zeta/v to the damping chi, since e* is about 1 - chi v."""
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 
     def in_floats(self, contact, stiffness, damping):
@@ -77,8 +77,8 @@ class HuntCrossley(PowerLaw):
         return [stiffness, stiffness * damping]
 
     def file_values(self, fitted, entry):
-        found = super().file_values(fitted, entry)
-        return {**found, f"contact.damping.{entry}": fitted["damping"] / fitted["stiffness"]}
+        values = super().file_values(fitted, entry)
+        return {**values, f"contact.damping.{entry}": fitted["damping"] / fitted["stiffness"]}
 
     def _power(self, depth, parameters):
         if self.exponent == 1.0:

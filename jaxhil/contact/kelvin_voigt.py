@@ -1,4 +1,4 @@
-"""Spring and damper, and the linear law without the damper."""
+"""Linear contact laws: spring with damper (Kelvin-Voigt), and spring alone."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from jaxhil.contact.regression import Family, Regression
 
 
 class KelvinVoigt(ContactLaw):
-    """F = k d + b d', clamped at 0 unless tension is allowed."""
+    """Contact law F = k d + b d', clamped at 0 unless tension is allowed."""
 
     name: ClassVar[str] = "kelvin_voigt"
     keys: ClassVar = (Key("tension", "whether {laws} may pull", default=False),)
@@ -44,7 +44,7 @@ class KelvinVoigt(ContactLaw):
         return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M)."""
+        """Add 2 zeta sqrt(k M) to the damping."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -63,7 +63,7 @@ class KelvinVoigt(ContactLaw):
 
 
 class Linear(KelvinVoigt):
-    """F = k d."""
+    """Contact law F = k d."""
 
     name: ClassVar[str] = "linear"
     keys: ClassVar = ()
@@ -88,6 +88,7 @@ class Linear(KelvinVoigt):
 
 
 def _kelvin_voigt(pulls: bool) -> Regression:
+    """Return F = k d + b d' with the coefficients k and b; the force may be negative if it `pulls`."""
     return Regression(
         "kelvin_voigt",
         lambda d, v: [d],

@@ -1,7 +1,7 @@
-"""All contact laws by the names that mechanism files use, their parameters, contact at one surface or two.
+"""Registry of the contact laws, their parameters, and the contact at one surface or two.
 
-A law is one file of `jaxhil.contact` and an entry here; `jaxhil.contact.base` says what it has to offer.
-`jaxhil.register` enters those of other packages.
+A law is one file of `jaxhil.contact` and an entry here; `jaxhil.contact.base` defines its interface.
+`jaxhil.register` adds laws of other packages.
 """
 
 from collections import namedtuple
@@ -46,37 +46,38 @@ LAWS: dict[str, ContactLaw] = {
         Preloaded(),
     )
 }
-# All keys of some laws alone, in the order of the laws.
+# All keys that only some laws have, in the order of the laws.
 KEYS: dict[str, Key] = {key.name: key for law in LAWS.values() for key in law.keys or ()}
 
 
 def contact_law(name: str) -> ContactLaw:
-    """Return the law of this name. Raise `InputError` if there is none."""
+    """Return the contact law of this name. Raise `InputError` if there is none."""
     if name not in LAWS:
         raise InputError(f"contact.law: found {shown(name)}, expected one of {', '.join(LAWS)}")
     return LAWS[name]
 
 
 def laws_with(key: Key) -> tuple[str, ...]:
-    """Return the names of the laws that state the key, as files of one axis or of six call it."""
-    stated = {law.name: law.keys or () for law in LAWS.values()}
+    """Return the names of the laws that have the key, given in its one-axis or its six-axis form."""
     return tuple(
-        name for name, keys in stated.items() if any(key in (one, one.in_six_axes()) for one in keys)
+        law.name
+        for law in LAWS.values()
+        if any(key in (law_key, law_key.in_six_axes()) for law_key in law.keys or ())
     )
 
 
 if TYPE_CHECKING:
 
     class ContactParameters(NamedTuple):
-        """Numbers of one contact; a leading axis of contacts, where there is one, comes first.
+        """Parameters of one contact, or of several along a leading axis.
 
-        Besides these fields it has one for each of `KEYS`, (...); that of a key without a value in the file
-        is the key's neutral number.
+        There is a further field for each of `KEYS`, (...); without a value in the file it has the key's
+        neutral value.
         """
 
-        stiffness: Any  # [N/m], or [N/m^n] with an exponent n; (segments, ...) of a segmented law
+        stiffness: Any  # [N/m], or [N/m^n] for a law with an exponent n; (segments, ...) if segmented
         damping: Any  # [N s/m], or chi [s/m] for Hunt-Crossley
-        kind: Any = None  # number of the law for `jaxhil.contact.mixture`, else None
+        kind: Any = None  # index of the law in `jaxhil.contact.mixture.AnyOf.laws`; None without a mixture
 
         def __getattr__(self, key: str) -> Any: ...
 
@@ -87,9 +88,10 @@ else:
 
 
 def deflection(position: Any, clearance: Any | None) -> Any:
-    """Return the signed deflection [m] of the mechanism: x at x > 0, x + c at x < -c, else 0.
+    """Return the signed deflection [m] of the mechanism: x for x > 0, x + c for x < -c, else 0.
 
-    The clearance c may be infinite; it is None where there is but one surface."""
+    The clearance c [m] may be infinite; None means that there is one surface only.
+    """
     if clearance is None:
         return jnp.where(position > 0, position, 0)
     far = position + clearance
@@ -97,8 +99,11 @@ def deflection(position: Any, clearance: Any | None) -> Any:
 
 
 def two_sided(law, parameters, state, position, velocity, clearance):
-    """Return the signed force [N] at either surface: law(d, d') with d = x, or -law(d, d') with d = -c - x;
-    at one surface (`clearance` None) the former alone."""
+    """Return the signed contact force [N] and the next state of the law, for one surface or two.
+
+    The force is law(d, d') with d = x at the first surface, and -law(d, d') with d = -c - x at the second,
+    which exists only if the `clearance` c [m] is not None.
+    """
     signed = deflection(position, clearance)
     if clearance is None:
         return law.step(parameters, state, signed, jnp.where(signed > 0, velocity, 0))

@@ -1,7 +1,7 @@
-"""Any of several contact laws, lane by lane: one compiled program for mechanisms whose laws differ.
+"""Contact law selected per batch element: one compiled program for mechanisms with different laws.
 
-Every law is evaluated on every lane, and each lane takes its own: a few operations more per tick, against a
-program to compile for each law.
+Every law is evaluated for every batch element, which then takes the result of its law. This costs a few
+operations per tick, but saves compiling one program per law.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from jaxhil.contact.reference import Reference
 
 
 class AnyOf(ContactLaw):
-    """The law number `kind` of `laws`, a leaf of the parameters.
+    """Contact law that applies the law number `parameters.kind` of `laws` to each batch element.
 
     Stiffness and depths have a leading axis of segments, as for the piecewise-linear law; the other laws take
-    the first. A lane's numbers mean to its own law what they always mean; the others see them without
-    damping.
+    the first segment. A batch element's parameters keep their meaning for its law; the other laws get them
+    without damping.
 
-    `beforehand` says that references without a closed form come with the scenarios (`Scenario.reference`):
-    here they are then NaN.
+    If `beforehand` is true, ideal contacts without a closed form come with the scenarios
+    (`Scenario.reference`), and `reference` returns NaN for them.
     """
 
     laws: tuple[ContactLaw, ...]
@@ -44,44 +44,45 @@ class AnyOf(ContactLaw):
         return tuple(law.init(penetration) for law in self.laws)
 
     def step(self, parameters, state: Any, penetration, rate):
-        found = [
-            law.step(own, memory, penetration, rate)
-            for law, own, memory in zip(self.laws, self._own(parameters), state, strict=True)
+        results = [
+            law.step(numbers, memory, penetration, rate)
+            for law, numbers, memory in zip(self.laws, self._per_law(parameters), state, strict=True)
         ]
-        return self._choose(parameters, [force for force, _ in found]), tuple(memory for _, memory in found)
+        forces, states = zip(*results, strict=True)
+        return self._choose(parameters, forces), states
 
     def edge(self, parameters, rate):
-        own = zip(self.laws, self._own(parameters), strict=True)
-        return self._choose(parameters, [law.edge(one, rate) for law, one in own])
+        laws = zip(self.laws, self._per_law(parameters), strict=True)
+        return self._choose(parameters, [law.edge(numbers, rate) for law, numbers in laws])
 
     def corners(self, parameters, state: Any):
-        own = zip(self.laws, self._own(parameters), state, strict=True)
-        return tuple(corner for law, one, memory in own for corner in law.corners(one, memory))
+        laws = zip(self.laws, self._per_law(parameters), state, strict=True)
+        return tuple(corner for law, numbers, memory in laws for corner in law.corners(numbers, memory))
 
     def hold(self, parameters, state: Any, penetration, rate):
-        own = zip(self.laws, self._own(parameters), state, strict=True)
-        return self._choose(
-            parameters, [law.hold(one, memory, penetration, rate) for law, one, memory in own]
-        )
+        laws = zip(self.laws, self._per_law(parameters), state, strict=True)
+        values = [law.hold(numbers, memory, penetration, rate) for law, numbers, memory in laws]
+        return self._choose(parameters, values)
 
     def reference(self, parameters, mass, velocity):
         unknown = Reference(*[jnp.full_like(velocity, jnp.nan)] * 3)
-        found = [
-            law.reference(own, mass, velocity) if law.closed_form or not self.beforehand else unknown
-            for law, own in zip(self.laws, self._own(parameters), strict=True)
+        references = [
+            law.reference(numbers, mass, velocity) if law.closed_form or not self.beforehand else unknown
+            for law, numbers in zip(self.laws, self._per_law(parameters), strict=True)
         ]
-        return Reference(*(self._choose(parameters, list(leaves)) for leaves in zip(*found, strict=True)))
+        return Reference(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
 
-    def _own(self, parameters: ContactParameters) -> list[ContactParameters]:
-        every = []
+    def _per_law(self, parameters: ContactParameters) -> list[ContactParameters]:
+        """Return the parameters as each law takes them."""
+        per_law = []
         for kind, law in enumerate(self.laws):
             damping = jnp.where(parameters.kind == kind, parameters.damping, 0)
             stiffness = parameters.stiffness if law.segmented else parameters.stiffness[0]
-            every.append(parameters._replace(stiffness=stiffness, damping=damping, kind=None))
-        return every
+            per_law.append(parameters._replace(stiffness=stiffness, damping=damping, kind=None))
+        return per_law
 
     def _choose(self, parameters: ContactParameters, values: Sequence[Array]) -> Array:
-        """Each lane's own value."""
+        """Return for each batch element the value of its law."""
         chosen = jnp.asarray(values[0])
         for kind, value in enumerate(values[1:], start=1):
             chosen = jnp.where(parameters.kind == kind, value, chosen)

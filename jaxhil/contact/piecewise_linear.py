@@ -1,4 +1,4 @@
-"""Stiffness that varies within a contact: buffers and hard stops."""
+"""Piecewise-linear contact law: a stiffness that changes with depth, as of buffers and hard stops."""
 
 from itertools import pairwise
 from typing import ClassVar
@@ -13,9 +13,9 @@ from jaxhil.contact.regression import Family, Regression
 
 
 class PiecewiseLinear(ContactLaw):
-    """Slopes k_1, k_2, ... between depths d_1 < d_2 < ...; F = sum_i k_i overlap_i(d) + b d' >= 0.
+    """Contact law F = max(0, sum_i k_i overlap_i(d) + b d') with slopes k_i between depths d_1 < d_2 < ...
 
-    Segment i spans d_{i-1} to d_i (d_0 = 0); the last slope goes on.
+    Segment i spans d_{i-1} to d_i (d_0 = 0); the last segment is unbounded.
     """
 
     name: ClassVar[str] = "piecewise_linear"
@@ -51,7 +51,7 @@ class PiecewiseLinear(ContactLaw):
         return piecewise_linear(mass, parameters.stiffness, parameters.depths, parameters.damping, velocity)
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Go on by segments: a force F at the start is sqrt(F^2 + 2 k E) where the energy E ends in one."""
+        """Add up segments: a force F at a segment's start grows to sqrt(F^2 + 2 k E) over an energy E."""
         stiffness, depths = parameters.stiffness, parameters.depths
         slots, segments = stiffness.shape[:2]
         energy = np.broadcast_to(mass * velocity**2 / 2, (slots, stiffness.shape[-1]))
@@ -66,18 +66,18 @@ class PiecewiseLinear(ContactLaw):
         return force
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M), k the first slope."""
+        """Add 2 zeta sqrt(k M) to the damping, with the first slope k."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
-        pieces, start, level = [], 0.0, 0.0
+        segments, start, level = [], 0.0, 0.0
         for slope, end in zip(stiffness, [*contact.depths, float("inf")], strict=True):
-            pieces.append((end, start, level, slope))
+            segments.append((end, start, level, slope))
             level += slope * (end - start)
             start = end
 
         def spring(depth: float, rate: float) -> float:
-            for end, start, level, slope in pieces:
+            for end, start, level, slope in segments:
                 if depth <= end:
                     return level + slope * (depth - start) + damping * rate
             raise ValueError("the penetration is not a number")
@@ -98,11 +98,12 @@ class PiecewiseLinear(ContactLaw):
 
 
 def _regression(depths: tuple[float, ...]) -> Regression:
+    """Return F = sum_i k_i overlap_i(d) + b d' with the coefficients k_1, k_2, ... and b."""
     edges = np.array([0.0, *depths, np.inf])
 
-    def own(d, v):
+    def overlaps(d, v):
         return [np.clip(d - low, 0.0, high - low) for low, high in pairwise(edges)]
 
     slopes = tuple(f"slope{i + 1}" for i in range(len(depths) + 1))
     names, shape = (*slopes, "damping"), {"depths": list(depths)}
-    return Regression("piecewise_linear", own, names, lambda d, v: [v], shape=shape)
+    return Regression("piecewise_linear", overlaps, names, lambda d, v: [v], shape=shape)

@@ -1,4 +1,4 @@
-"""Common part of contact laws with a power of the depth, F = k d^n without damping."""
+"""Base class of the contact laws with a power of the depth, F = k d^n without damping."""
 
 from typing import ClassVar
 
@@ -9,13 +9,13 @@ COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
 
 
 class PowerLaw(ContactLaw):
-    """F = k d^n without damping: `stiffness` k [N/m^n], n the `exponent` (1.5 for Hertz)."""
+    """Base class of laws with F = k d^n without damping; k is `stiffness` [N/m^n], n is `exponent`."""
 
     keys: ClassVar[tuple[Key, ...] | None] = (EXPONENT,)
     stiffness_unit: ClassVar[str] = "N/m^n"
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return k d^n, with k d^(n + 1)/(n + 1) = M v^2/2."""
+        """Return k d^n at the depth d where k d^(n + 1)/(n + 1) = M v^2/2."""
         exponent, energy = parameters.exponent, mass * velocity**2 / 2
         depth = ((exponent + 1) * energy / parameters.stiffness) ** (1 / (exponent + 1))
         return parameters.stiffness * depth**exponent

@@ -1,4 +1,4 @@
-"""A preloaded spring with dry friction: F = F_0 + k d + F_r sign(d'), clamped at 0."""
+"""Preloaded spring with dry friction: F = F_0 + k d + F_r sign(d'), clamped at 0."""
 
 from typing import ClassVar
 
@@ -11,27 +11,28 @@ from jaxhil.contact.keys import Key
 
 
 class Preloaded(ContactLaw):
-    """F = max(0, F_0 + k d + F_r sign(d')): `preload` F_0 [N], `stiffness` k [N/m], `friction` F_r [N], which
-    works against the motion (Coulomb). The touch is a jump, and so is the turning point. There is no damping
-    beside it.
+    """Contact law F = max(0, F_0 + k d + F_r sign(d')) of a preloaded spring with dry friction.
 
-    Each way is an oscillation about a centre outside the surface, by s = (F_0 + F_r)/k on the way in, by
-    r = (F_0 - F_r)/k on the way out: with the deepest point d, (d + s)^2 = s^2 + (v/omega)^2, and at
-    separation, where d or F goes through 0, e v/omega = sqrt((d + r)^2 - max(r, 0)^2). What friction holds at
-    its deepest point, F_0 + k d <= F_r, stays there.
+    F_0 is `preload` [N], k is `stiffness` [N/m], F_r is `friction` [N], which acts against the motion
+    (Coulomb). The force jumps at the onset and at the turning point. The law has no damping.
+
+    The motion in each direction is an oscillation about a centre at d = -s, s = (F_0 + F_r)/k, inward and at
+    d = -r, r = (F_0 - F_r)/k, outward. The deepest point d satisfies (d + s)^2 = s^2 + (v/omega)^2. At
+    separation, where d or F goes through 0, e v/omega = sqrt((d + r)^2 - max(r, 0)^2). If friction holds the
+    mechanism at its deepest point, F_0 + k d <= F_r, it stays there.
     """
 
     name: ClassVar[str] = "preloaded"
     keys: ClassVar = (
-        Key("preload", "of the spring at the touch, for {laws}", "N", {"ge": 0.0}, default=0.0),
+        Key("preload", "spring force at the touch, for {laws}", "N", {"ge": 0.0}, default=0.0),
         Key(
             "friction",
-            "dry friction against the motion, for {laws}",
+            "dry friction force against the motion, for {laws}",
             "N",
             {"ge": 0.0},
             default=0.0,
             name_in_six_axes="dry_friction",
-            meaning_in_six_axes="against the depth's motion, for {laws}",
+            meaning_in_six_axes="force against the change of the depth, for {laws}",
         ),
     )
     damped: ClassVar[bool] = False
@@ -60,27 +61,29 @@ class Preloaded(ContactLaw):
         outward = (parameters.preload - parameters.friction) / parameters.stiffness
         swing = velocity / frequency
         turning = jnp.sqrt(inward**2 + swing**2)
-        # d + s less s, without the cancellation of a strong preload.
+        # This is (d + s) - s + r, without the cancellation of a strong preload.
         amplitude = swing**2 / (turning + inward) + outward
         sticks = amplitude <= 0
         amplitude = jnp.where(sticks, 1, amplitude)
-        left = jnp.where(outward > 0, outward, 0)
-        speed = jnp.sqrt((amplitude - left) * (amplitude + left))
-        lasts = (jnp.arctan2(swing, inward) + jnp.arctan2(speed, left)) / frequency
+        end = jnp.where(outward > 0, outward, 0)
+        speed = jnp.sqrt((amplitude - end) * (amplitude + end))
+        duration = (jnp.arctan2(swing, inward) + jnp.arctan2(speed, end)) / frequency
         return Reference(
             restitution=jnp.where(sticks, 0, speed / swing),
             peak_force=parameters.stiffness * turning,
-            duration=jnp.where(sticks, jnp.inf, lasts),
+            duration=jnp.where(sticks, jnp.inf, duration),
         )
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the friction that takes 1 - e*^2 of the energy on the way to the deepest point without it, and
-        back."""
+        """Add friction that dissipates 1 - e*^2 of the energy on the way to the deepest point and back.
+
+        The deepest point is taken without friction.
+        """
         preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]
         energy = (mass * velocity**2)[:, 0] / 2
         deepest = 2 * energy / (preload + np.sqrt(preload**2 + 2 * stiffness * energy))
-        lost = energy * -np.expm1(-2 * np.pi * ratio[:, 0])
-        return "friction", friction + lost / (2 * deepest)
+        loss = energy * -np.expm1(-2 * np.pi * ratio[:, 0])
+        return "friction", friction + loss / (2 * deepest)
 
     def in_floats(self, contact, stiffness, damping):
         def constant(rate: float) -> float:
@@ -92,4 +95,5 @@ class Preloaded(ContactLaw):
         return clamped(spring, constant)
 
     def _constant(self, parameters, rate):
+        """Return the part of the force that does not depend on depth [N]."""
         return parameters.preload + parameters.friction * jnp.sign(rate)

@@ -1,12 +1,12 @@
-"""The reference: the same contact in space, continuous and without any delay.
+"""Ideal contact: the same contact of two free bodies, in continuous time and without any delay.
 
-Every result of the rig is judged against the motion M d'' = -F(d, d'), d(0) = 0, d'(0) = v > 0, of
-two free bodies of equivalent mass M until they separate. Nothing here is time-stepped: each contact
-law has a closed form, or a first integral that leaves one well-conditioned scalar equation.
+It is the reference of every result of the rig: the motion M d'' = -F(d, d'), d(0) = 0, d'(0) = v > 0, of two
+free bodies of equivalent mass M until they separate. No time stepping is needed: each contact law here has a
+closed form, or a first integral that leaves one well-conditioned scalar equation.
 
-All parameters are floating arrays of one batch shape and one dtype, `damping` not negative and all
-others positive (not checked here). Everything can be jitted, vmapped and differentiated once:
-equations are solved without derivative, and their roots given the exact first derivative.
+All parameters are floating-point arrays of one batch shape and one dtype, `damping` not negative and all
+others positive (not checked here). All functions can be jitted, vmapped and differentiated once: equations
+are solved without differentiation, and their roots then get the exact first derivative.
 """
 
 import math
@@ -22,7 +22,7 @@ from jaxhil.contact.reference_closed_form import arccosine_over_sine, chained_os
 
 
 class Reference(NamedTuple):
-    """What a contact in space does: arrays of the batch shape."""
+    """Result of the ideal contact: arrays of the batch shape."""
 
     restitution: Float[Array, "*batch"]  # rebound speed over approach speed [1]
     peak_force: Float[Array, "*batch"]  # largest contact force [N]
@@ -37,15 +37,20 @@ def kelvin_voigt(
     velocity: Float[Array, "*batch"],
     tension: Bool[Array, "*batch"],
 ) -> Reference:
-    """Contact with F = k d + b d', at any damping ratio xi = b / (2 sqrt(k M)).
+    """Return the ideal contact with F = k d + b d', at any damping ratio xi = b / (2 sqrt(k M)).
 
-    Without `tension` F = max(0, k d + b d') and the bodies part at F = 0, after 2 g(xi) / omega,
-    with e = exp(-2 xi g(xi)), g(xi) = acos(xi) / sqrt(1 - xi^2) continued through xi = 1. With
-    `tension` they part at d = 0: e = exp(-pi xi / sqrt(1 - xi^2)), or stick (e = 0, infinite
-    duration) if xi >= 1. F is largest inside the contact for xi < 1/2, else b v at the onset.
-
-    Args: mass [kg], stiffness k [N/m], damping b [N s/m], velocity v [m/s], tension (true: pulls).
+    Without `tension`, F = max(0, k d + b d') and the bodies separate at F = 0, after 2 g(xi) / omega,
+    with e = exp(-2 xi g(xi)), g(xi) = acos(xi) / sqrt(1 - xi^2) continued analytically through xi = 1.
+    With `tension` they separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick (e = 0,
+    infinite duration) if xi >= 1. F is largest within the contact for xi < 1/2, else b v at the onset.
     Source: impulse response of the damped oscillator.
+
+    Args:
+        mass: equivalent mass M [kg].
+        stiffness: k [N/m].
+        damping: b [N s/m].
+        velocity: approach speed v [m/s].
+        tension: whether the contact force may pull.
     """
     frequency = jnp.sqrt(stiffness / mass)
     damping_ratio = damping / (2 * jnp.sqrt(stiffness * mass))
@@ -84,21 +89,26 @@ def hunt_crossley(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> Reference:
-    """Contact with F = k d^n (1 + a d'), a = 3 chi / 2.
+    """Return the ideal contact with F = k d^n (1 + a d'), a = 3 chi / 2.
 
     With y = a d', q = a v the first integral is k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),
-    G(y) = y - log(1 + y). The two speeds at one depth, y and -p with G(y) = G(-p), have the common
+    G(y) = y - log(1 + y). The two rates at one depth, y and -p with G(y) = G(-p), have the common
     parameter s = (y + p) / 2: y = s + L, p = s - L, L(s) = s coth(s) - 1, and there
-    G = L(s) + log(sinh(s) / s). Hence, with S the root of S + L(S) = q,
+    G = L(s) + log(sinh(s) / s). Hence, with the root S of S + L(S) = q,
 
         e = (S - L(S)) / (S + L(S)),
         duration = 2 M / (a k) int_0^S d(s)^-n ds,
 
-    and F is largest where G(q) - G(y) = n y / (n + 1). All are evaluated in forms regular at
-    chi = 0; the integral by the double-exponential rule, its singularity at s = S substituted away.
+    and F is largest where G(q) - G(y) = n y / (n + 1). All three are evaluated in forms that are regular at
+    chi = 0. The integral uses the double-exponential rule after a substitution that removes its singularity
+    at s = S. Source of the law: Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445; of the solution: here.
 
-    Args: mass [kg], stiffness k [N/m^n], exponent n, damping chi [s/m], velocity v [m/s].
-    Source: Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445, for the law; derived here.
+    Args:
+        mass: equivalent mass M [kg].
+        stiffness: k [N/m^n].
+        exponent: n [1].
+        damping: chi [s/m].
+        velocity: approach speed v [m/s].
     """
     restitution, peak, duration = _hunt_crossley_shape(1.5 * damping * velocity, exponent)
     depth = ((exponent + 1) * mass * velocity**2 / stiffness) ** (1 / (exponent + 1))
@@ -116,13 +126,17 @@ def piecewise_linear(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> Reference:
-    """Contact with F = max(0, f(d) + b d'), f(0) = 0, f' = k_i between depths d_(i-1) and d_i.
+    """Return the ideal contact with F = max(0, f(d) + b d'), f(0) = 0, f' = k_i between d_(i-1) and d_i.
 
-    The damped oscillator's closed form, chained from one depth to the next on the way in and out.
-    The last slope goes on beyond the last depth. With one segment: `kelvin_voigt` without tension.
+    The closed form of the damped oscillator is chained from one depth to the next, inward and outward. The
+    last slope continues beyond the last depth. One segment gives `kelvin_voigt` without tension.
 
-    Args: mass [kg], slopes k_1, k_2, ... > 0 [N/m], depths 0 < d_1 < d_2 < ... [m],
-    damping b [N s/m], velocity v [m/s].
+    Args:
+        mass: equivalent mass M [kg].
+        slopes: k_1, k_2, ... > 0 [N/m].
+        depths: 0 < d_1 < d_2 < ... [m].
+        damping: b [N s/m].
+        velocity: approach speed v [m/s].
     """
     return Reference(*chained_oscillators(mass, slopes, depths, damping, velocity))
 
@@ -130,7 +144,7 @@ def piecewise_linear(
 # s coth(s) - 1 = sum_k COTANGENT[k-1] s^(2k), radius of convergence pi.
 _ORDER = np.arange(1, 9)
 _SERIES_LIMIT = 0.3
-# Riemann's zeta(2), zeta(4), ...: SciPy, which has them, takes long to import.
+# Riemann's zeta(2), zeta(4), ... are listed because SciPy, which has them, takes long to import.
 _ZETA = np.array(
     [
         1.6449340668482264,
@@ -144,12 +158,12 @@ _ZETA = np.array(
     ]
 )
 _COTANGENT = 2 * (-1.0) ** (_ORDER + 1) * _ZETA / np.pi ** (2 * _ORDER)
-# s coth(s) - 1 + log(sinh(s) / s), the first integral in terms of s.
+# Series of the first integral in terms of s, s coth(s) - 1 + log(sinh(s) / s).
 _POTENTIAL = _COTANGENT * (1 + 1 / (2 * _ORDER))
 
 
 def _langevin(s):
-    """1 - L(s) / s, with Langevin's function L(s) / s = coth(s) - 1 / s, and L'(s), for s >= 0."""
+    """Return 1 - L(s) / s, with Langevin's function L(s) / s = coth(s) - 1 / s, and L'(s), for s >= 0."""
     small = s < _SERIES_LIMIT
     square = jnp.where(small, s, 0.0) ** 2
     value, slope = jnp.zeros_like(s), jnp.zeros_like(s)
@@ -168,14 +182,14 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Restitution, peak force, duration in units of M, v and D, D^(n+1) = (n + 1) M v^2 / k."""
+    """Return restitution, peak force and duration in units of M, v and D, D^(n+1) = (n + 1) M v^2 / k."""
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
 
 
 @_hunt_crossley_shape.defjvp
 def _hunt_crossley_shape_jvp(primals, tangents):
-    # Two partial derivatives, however many tangents there are.
+    # Two partial derivatives are enough for any number of tangents.
     onset, exponent = primals
     root, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     root_slope = 1 + _langevin(root)[1]
@@ -184,8 +198,8 @@ def _hunt_crossley_shape_jvp(primals, tangents):
         half_span = root + (onset - primals[0]) / root_slope
         return _shape_at_roots(half_span, at_peak, onset, exponent)
 
-    one, zero = jnp.ones_like(onset), jnp.zeros_like(onset)
-    basis = jnp.stack([one, zero]), jnp.stack([zero, one])
+    ones, zeros = jnp.ones_like(onset), jnp.zeros_like(onset)
+    basis = jnp.stack([ones, zeros]), jnp.stack([zeros, ones])
     value, partial = jax.vmap(lambda *direction: jax.jvp(shape, primals, direction), out_axes=(None, 0))(
         *basis
     )
@@ -193,6 +207,7 @@ def _hunt_crossley_shape_jvp(primals, tangents):
 
 
 def _shape_at_roots(half_span, at_peak, onset, exponent):
+    """Return restitution, scaled peak force and scaled duration at the roots of their equations."""
     symmetry, _ = _langevin(half_span)
     share = exponent / (exponent + 1)
     # The force is stationary in y / q^2 = `at_peak`, which needs no derivative.
@@ -206,18 +221,18 @@ def _shape_at_roots(half_span, at_peak, onset, exponent):
 
 
 def _solve_half_span(onset):
-    """The root S >= 0 of S + L(S) = q."""
+    """Return the root S >= 0 of S + L(S) = q."""
 
     def newton(_, s):
         symmetry, slope = _langevin(s)
         return s - (s * (2 - symmetry) - onset) / (1 + slope)
 
-    # L is convex and max(0, S - 1) <= L: the start is not below the root, so Newton descends to it.
+    # L is convex and L >= max(0, S - 1): the start is not below the root, and Newton's method descends to it.
     return lax.fori_loop(0, 8, newton, jnp.minimum(onset, (onset + 1) / 2))
 
 
 def _solve_peak(onset, exponent):
-    """The root u = y / q^2 of G(q^2 u) / q^2 + n / (n + 1) u = G(q) / q^2."""
+    """Return the root u = y / q^2 of G(q^2 u) / q^2 + n / (n + 1) u = G(q) / q^2."""
     share = exponent / (exponent + 1)
     potential = _scaled_potential(onset)
 
@@ -226,15 +241,15 @@ def _solve_peak(onset, exponent):
         residual = y * u * _scaled_potential(y) + share * u - potential
         return u - residual / (y / (1 + y) + share)
 
-    # G is convex and G >= 0: as above, Newton descends from the start.
+    # G is convex and G >= 0, so Newton's method descends from the start to the root.
     return lax.fori_loop(0, 8, newton, potential / share)
 
 
 def _scaled_potential(y):
-    """(y - log(1 + y)) / y^2 for y >= 0."""
+    """Return (y - log(1 + y)) / y^2 for y >= 0."""
     small = y < 0.1
     low = jnp.where(small, y, 0.0)
-    # log(1 + y) = 2 artanh(z), z = y / (2 + y): the leading terms cancel in closed form.
+    # With log(1 + y) = 2 artanh(z), z = y / (2 + y), the leading terms cancel in closed form.
     square = (low / (2 + low)) ** 2
     series = jnp.zeros_like(y)
     for k in reversed(range(6)):
@@ -255,12 +270,12 @@ _WEIGHT = 0.135 * np.pi * np.cosh(_STEP) * _NODE / (1 + np.exp(np.pi * np.sinh(_
 
 
 def _duration_integral(half_span, exponent):
-    """int_0^1 R^(-n/(n+1)) dtau, R = (G(S) - G(s)) / (S^2 (1 - s/S)), 1 - s/S = tau^(n+1)."""
+    """Integrate R^(-n/(n+1)) over tau in (0, 1), R = (G(S) - G(s)) / (S^2 (1 - s/S)), 1 - s/S = tau^(n+1)."""
     column = (-1,) + (1,) * half_span.ndim
     log_node = jnp.asarray(_LOG_NODE, half_span.dtype).reshape(column)
     weight = jnp.asarray(_WEIGHT, half_span.dtype).reshape(column)
     power = (exponent + 1)[None] * log_node
-    # Bounded away from 0, where R only tends to its limit.
+    # This is bounded away from 0, where R is undefined and only has a limit.
     below_end = jnp.exp(jnp.maximum(power, math.log(jnp.finfo(half_span.dtype).tiny) / 2))
     fraction = -jnp.expm1(power)
 
@@ -274,7 +289,7 @@ def _duration_integral(half_span, exponent):
 
 
 def _gap_by_series(span, fraction):
-    """R = (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)), r = s / S."""
+    """Return R = (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)), r = s / S."""
 
     def term(k, carry):
         total, power, partial_sum = carry
@@ -288,10 +303,10 @@ def _gap_by_series(span, fraction):
 
 
 def _gap_in_closed_form(span, fraction, below_end):
-    """R from differences of coth and log sinh, written without cancellation at s = S."""
+    """Return R from differences of coth and log sinh, written without cancellation at s = S."""
     s, distance = span * fraction, span * below_end
     loss = -jnp.expm1(-2 * span)
-    # sinh(S) = exp(S - s) sinh(s) (1 + surplus)
+    # The surplus is defined by sinh(S) = exp(S - s) sinh(s) (1 + surplus)
     surplus = jnp.exp(-2 * s) * jnp.expm1(-2 * distance) / jnp.expm1(-2 * s)
     at_end = below_end < 0.5
     log_fraction = jnp.where(

@@ -1,11 +1,11 @@
-"""The reference of linear contact, piece by piece: closed-form damped oscillators.
+"""Ideal contact of the piecewise-linear law: a chain of damped oscillators in closed form.
 
-Between two depths the bodies obey M d'' = -(f + k (d - d_0) + b d'), a damped oscillator about the
-depth at which the piece's line would reach zero force. A piece ends at the next depth, or where a
-homogeneous solution of the same oscillator has its first zero: d' (turning point) on the way in,
-F = -M d'' (separation) on the way out. Those zeros are closed forms at every damping ratio.
-Only the time at which a depth is crossed is iterated for, by Newton's method, which converges
-monotonically because d is concave in time throughout a contact.
+Between two depths the bodies obey M d'' = -(f + k (d - d_0) + b d'), a damped oscillator about the depth at
+which the segment's line would reach zero force. The motion through a segment ends at the next depth, or
+where a homogeneous solution of the same oscillator has its first zero: d' (turning point) inward,
+F = -M d'' (separation) outward. These zeros have closed forms at every damping ratio. Only the time at which
+a depth is crossed needs iterations, by Newton's method, which converges monotonically because d is concave
+in time throughout a contact.
 """
 
 import math
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_NEWTON_STEPS = 80  # halving steps suffice even where a depth is only grazed
+_NEWTON_STEPS = 80  # enough even at a grazed depth, where each step only halves the distance
 
 
 def chained_oscillators(
@@ -26,7 +26,7 @@ def chained_oscillators(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Restitution, peak force [N], duration [s]: see `jaxhil.contact.reference.piecewise_linear`."""
+    """Return restitution, peak force [N] and duration [s] for `jaxhil.contact.reference.piecewise_linear`."""
     segments = slopes.shape[0]
     zero = jnp.zeros_like(velocity)
     thicknesses = jnp.diff(depths, axis=0, prepend=zero[None])
@@ -57,7 +57,10 @@ def chained_oscillators(
 
 
 def arccosine_over_sine(cosine):
-    """acos(c) / sqrt(1 - c^2) for c >= 0, analytic at c = 1: acosh(c) / sqrt(c^2 - 1) above it."""
+    """Return acos(c) / sqrt(1 - c^2) for 0 <= c < 1 and its analytic continuation for c >= 1.
+
+    Above 1 it is acosh(c) / sqrt(c^2 - 1).
+    """
     near = jnp.abs(cosine - 1) < 0.02
     below = (cosine < 1) & ~near
     above = (cosine > 1) & ~near
@@ -77,68 +80,68 @@ def arccosine_over_sine(cosine):
 
 
 class _Layer(NamedTuple):
-    """One segment, per unit mass."""
+    """Segment of the law, per unit mass."""
 
-    number: Int[Array, ""]  # from 0
-    stiffness: Float[Array, "*batch"]  # its slope [1/s^2]
-    acceleration: Float[Array, "*batch"]  # spring force at its lower depth [m/s^2]
-    thickness: Float[Array, "*batch"]  # [m]; the last one's is infinite
+    number: Int[Array, ""]  # index, from 0
+    stiffness: Float[Array, "*batch"]  # slope [1/s^2]
+    acceleration: Float[Array, "*batch"]  # spring force over mass at the lower depth [m/s^2]
+    thickness: Float[Array, "*batch"]  # distance from the lower to the upper depth [m]; infinite for the last
 
 
 class _State(NamedTuple):
-    """Between two segments."""
+    """State of the motion between two segments."""
 
-    depth: Float[Array, "*batch"]  # of the turning point above the lower depth of its segment [m]
+    depth: Float[Array, "*batch"]  # turning point above the lower depth of its segment [m]
     velocity: Float[Array, "*batch"]  # [m/s]
-    time: Float[Array, "*batch"]  # since the first touch [s]
+    time: Float[Array, "*batch"]  # time since the first touch [s]
     peak: Float[Array, "*batch"]  # largest force so far over mass [m/s^2]
-    segment: Int[Array, "*batch"]  # the deepest reached
-    # on the way in whether it has turned, on the way out whether the bodies have separated
+    segment: Int[Array, "*batch"]  # index of the deepest segment reached
+    # inward: whether the turning point is reached; outward: whether the bodies have separated
     ended: Bool[Array, "*batch"]
 
 
-class _Piece(NamedTuple):
-    """How one segment is passed: what comes after the start, and how it ends."""
+class _Passage(NamedTuple):
+    """Motion through one segment, from its start to its end."""
 
-    spring: Array  # force of the spring over mass at the start [m/s^2]
-    velocity: Array  # at the start [m/s]
-    crosses: Array  # whether it ends at the segment's far end, else by itself: turning point or separation
-    target: Array  # distance to that end [m]; 0 where it ends by itself
-    time: Array  # until the end, without derivative [s]
-    grows: Array  # whether, on the way in, the force grows at first
+    spring: Array  # spring force over mass at the start [m/s^2]
+    velocity: Array  # velocity at the start [m/s]
+    crosses: Array  # whether it ends at the segment's far depth, not at a turning point or a separation
+    target: Array  # distance to the far depth [m]; 0 if it is not reached
+    time: Array  # duration, without derivative [s]
+    grows: Array  # whether it is inward and the force grows at first
     culmination: Array  # time until the force is largest [s]
 
 
 def _traverse(decay, layer: _Layer, inward, state: _State) -> _State:
-    """Through one segment, inward or outward, to its far end, the turning point or separation."""
+    """Move through one segment, inward or outward, to its far depth, the turning point or separation."""
     active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= layer.number))
-    piece = _piece(decay, layer, inward, state, active)
+    passage = _passage(decay, layer, inward, state, active)
     stiffness = layer.stiffness
     distances, speeds = _travel(
         decay[None],
         stiffness[None],
-        piece.spring[None],
-        piece.velocity[None],
-        jnp.stack([piece.time, piece.culmination]),
+        passage.spring[None],
+        passage.velocity[None],
+        jnp.stack([passage.time, passage.culmination]),
     )
-    forces = piece.spring[None] + stiffness[None] * distances + 2 * decay[None] * speeds
+    forces = passage.spring[None] + stiffness[None] * distances + 2 * decay[None] * speeds
     distance, speed, end_force = distances[0], speeds[0], forces[0]
 
-    # The event is the zero of `residual`: one Newton step carries its derivative, and nothing else.
-    # At the culmination none is needed: F is stationary there.
-    crosses = piece.crosses
+    # The event is the zero of `residual`. One Newton step of value 0 gives the event's time its derivative.
+    # The culmination needs no such step, since F is stationary there.
+    crosses = passage.crosses
     force_rate = stiffness * speed - 2 * decay * end_force
-    residual = jnp.where(crosses, distance - piece.target, jnp.where(inward, speed, end_force))
+    residual = jnp.where(crosses, distance - passage.target, jnp.where(inward, speed, end_force))
     rate = jnp.where(crosses, speed, jnp.where(inward, -end_force, force_rate))
     step = jnp.where(rate == 0, 0.0, -residual) / jnp.where(rate == 0, 1.0, rate)
     step = step - lax.stop_gradient(step)
-    time = piece.time + step
-    distance = jnp.where(crosses, piece.target, distance + speed * step)
+    time = passage.time + step
+    distance = jnp.where(crosses, passage.target, distance + speed * step)
     speed = speed - end_force * step
     end_force = end_force + force_rate * step
     speed = jnp.where(inward, jnp.where(crosses, jnp.maximum(speed, 0.0), 0.0), speed)
 
-    inside = piece.grows & (piece.culmination < time)
+    inside = passage.grows & (passage.culmination < time)
     peak = jnp.where(inside, forces[1], jnp.where(inward, end_force, 0.0))
     new = _State(
         depth=jnp.where(inward & ~crosses, distance, state.depth),
@@ -149,27 +152,27 @@ def _traverse(decay, layer: _Layer, inward, state: _State) -> _State:
         ended=~crosses,
     )
     chosen = _State(*(jnp.where(active, a, b) for a, b in zip(new, state, strict=True)))
-    # At the innermost point, being turned ends the way in and begins the way out.
+    # After the last segment the outward motion begins, so that `ended` is reset.
     innermost = inward & jnp.isinf(layer.thickness)
     return chosen._replace(ended=jnp.where(innermost, False, chosen.ended))
 
 
-def _piece(decay, layer: _Layer, inward, state: _State, active) -> _Piece:
-    """How a segment is passed where `active`; times are found without derivative."""
+def _passage(decay, layer: _Layer, inward, state: _State, active) -> _Passage:
+    """Return the motion through a segment for `active` batch elements; times have no derivative."""
     stiffness, turns_here = layer.stiffness, state.segment == layer.number
-    # Outward, a segment is entered at its upper depth, the turning segment where it was left.
+    # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, layer.thickness))
     depth = jnp.where(active, depth, 0.0)
     velocity = jnp.where(active, state.velocity, 0.0)
     spring = layer.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
-    # The piece ends by itself at d' = 0 or at F = 0. On the way in F is largest at an end of the piece or, if
-    # it grows at first, where F' = 0.
+    # Unless a depth is crossed, the motion ends at d' = 0 or at F = 0. Inward, F is largest at the start or
+    # the end or, if it grows at first, where F' = 0.
     fixed = lax.stop_gradient((decay, stiffness, spring, velocity))
     growth = stiffness * velocity - 2 * decay * force
     grows = inward & (growth > 0)
-    by_itself, culmination = lax.stop_gradient(
+    event, culmination = lax.stop_gradient(
         _first_zero(
             decay[None],
             stiffness[None],
@@ -177,24 +180,22 @@ def _piece(decay, layer: _Layer, inward, state: _State, active) -> _Piece:
             jnp.stack([jnp.where(inward, spring, -stiffness * velocity), stiffness * force]),
         )
     )
-    farthest, _ = _travel(*fixed, by_itself)
+    farthest, _ = _travel(*fixed, event)
     boundary = jnp.where(inward, layer.thickness, -depth)
-    # Without damping force and depth vanish together in the first segment: always a separation.
+    # The first segment always ends by separation: without damping, force and depth vanish together.
     crosses = jnp.where(inward, farthest > boundary, (farthest < boundary) & (layer.number > 0))
     target = jnp.where(crosses, boundary, 0.0)
-    start = jnp.where(crosses & ~inward, by_itself, 0.0)
+    start = jnp.where(crosses & ~inward, event, 0.0)
     crossing = _crossing_time(*fixed, *lax.stop_gradient((target, start)))
-    return _Piece(
-        spring, velocity, crosses, target, jnp.where(crosses, crossing, by_itself), grows, culmination
-    )
+    time = jnp.where(crosses, crossing, event)
+    return _Passage(spring, velocity, crosses, target, time, grows, culmination)
 
 
 def _crossing_time(decay, stiffness, spring, velocity, target, start):
-    """The time, without derivative, at which the distance travelled is `target`; 0 if that is 0.
+    """Return the time [s], without derivative, to travel the distance `target`; 0 if `target` is 0.
 
-    d is concave, so Newton moves from `start` (0 on the way in, the separation on the way out)
-    towards the crossing without overshooting it. Rounding shows as a step back: a lane that no
-    longer advances is done.
+    Since d is concave in time, Newton's method moves from `start` (0 inward, the separation outward) towards
+    the crossing without overshooting it. A batch element is done when rounding stops its progress.
     """
 
     def advance(carry):
@@ -215,25 +216,25 @@ def _crossing_time(decay, stiffness, spring, velocity, target, start):
 
 
 def _first_zero(decay, stiffness, value, slope_share):
-    """First zero of y'' + 2 a y' + k y = 0 from y(0) = y >= 0 and y'(0) = -(2 a y + c), c >= 0.
+    """Return the first zero of the solution of y'' + 2 a y' + k y = 0, y(0) >= 0, y'(0) = -(2 a y(0) + c).
 
-    Args: a, k, y, c. With w^2 = k - a^2 the solution is y cos(w t) - (a y + c) sin(w t) / w under
-    e^(-a t); whatever the sign of w^2 the zero is artanh(h y / (a y + c)) / h, h^2 = -w^2. At
-    k > a^2 it lies in the first quarter of a turn.
+    The arguments are a, k, y(0) and c >= 0. With w^2 = k - a^2 the solution is
+    e^(-a t) (y(0) cos(w t) - (a y(0) + c) sin(w t) / w). Its zero is artanh(h y(0) / (a y(0) + c)) / h,
+    h^2 = -w^2, for either sign of w^2. For k > a^2 it lies in the first quarter period.
     """
     over, rate = _rate(decay, stiffness)
     circular = jnp.arctan2(rate * value, decay * value + slope_share) / rate
-    # a - h = k / (a + h): exact also when the damping ratio is large.
+    # The form a - h = k / (a + h) is accurate also for a large damping ratio.
     gap = stiffness / (decay + rate) * value + slope_share
-    used = over & (value > 0)
-    hyperbolic = jnp.log1p(jnp.where(used, 2 * rate * value, 0.0) / jnp.where(used, gap, 1.0))
+    is_used = over & (value > 0)
+    hyperbolic = jnp.log1p(jnp.where(is_used, 2 * rate * value, 0.0) / jnp.where(is_used, gap, 1.0))
     return jnp.where(over, hyperbolic / (2 * rate), circular)
 
 
 def _travel(decay, stiffness, spring, velocity, time):
-    """Distance and velocity after `time`, from `velocity` and the spring force over mass `spring`.
+    """Return distance [m] and velocity [m/s] after `time`; `spring` is the initial spring force over mass.
 
-    With the impulse response S: distance = v S - f int S, velocity = v S' - f S.
+    With the impulse response S they are v S - f int S and v S' - f S.
     """
     impulse, slope, integral = _impulse_response(decay, stiffness, time)
     return velocity * impulse - spring * integral, velocity * slope - spring * impulse
@@ -241,7 +242,7 @@ def _travel(decay, stiffness, spring, velocity, time):
 
 @jax.custom_jvp
 def _impulse_response(decay, stiffness, time):
-    """S = e^(-a t) sin(w t) / w, S' and int S, at any damping ratio; w^2 = k - a^2."""
+    """Return S = e^(-a t) sin(w t) / w, S' and int S, at any damping ratio; w^2 = k - a^2."""
     over, rate = _rate(decay, stiffness)
     half = jnp.where(over, 0.0, rate * time) / 2
     sine = jnp.sin(half)
@@ -263,8 +264,8 @@ def _impulse_response(decay, stiffness, time):
 
 @_impulse_response.defjvp
 def _impulse_response_jvp(primals, tangents):
-    # By hand because the square root in w has no derivative at critical damping, where S
-    # is analytic.
+    # Automatic differentiation fails at critical damping: the square root in w has no derivative there,
+    # although S is analytic.
     decay, stiffness, time = primals
     impulse, slope, integral = _impulse_response(decay, stiffness, time)
     discriminant = decay**2 - stiffness
@@ -273,7 +274,7 @@ def _impulse_response_jvp(primals, tangents):
     series = jnp.zeros_like(angle)
     for k in (4, 3, 2, 1):
         series = series * angle + k / math.factorial(2 * k + 1)
-    # dS/d(a^2 - k) at fixed a under the exponential
+    # This is dS/d(a^2 - k), with the a in the exponential held fixed.
     bend = jnp.where(
         near,
         jnp.exp(-decay * time) * time**3 * series,
@@ -303,7 +304,7 @@ def _impulse_response_jvp(primals, tangents):
 
 
 def _rate(decay, stiffness):
-    """Whether overdamped, and sqrt(|a^2 - k|), kept from 0: all that uses it has a limit there."""
+    """Return whether a^2 > k (overdamped), and sqrt(|a^2 - k|) bounded away from 0."""
     discriminant = decay**2 - stiffness
     floor = float(jnp.finfo(discriminant.dtype).tiny)
     return discriminant > 0, jnp.sqrt(jnp.maximum(jnp.abs(discriminant), floor))

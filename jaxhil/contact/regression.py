@@ -1,4 +1,4 @@
-"""Contact laws as sums of known functions of depth and rate, which makes their fits to logs linear."""
+"""Contact laws as sums of known functions of depth and rate, so that fits to logs are linear regressions."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ __all__ = ["Family", "Regression"]
 Functions = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 
 
-def _nothing(depth: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
+def _no_functions(depth: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
     return []
 
 
 @dataclass(frozen=True)
 class Regression:
-    """One law with its shape (an exponent, depths) fixed: F = sum_i c_i phi_i(d, d')."""
+    """Contact law F = sum_i c_i phi_i(d, d') with a fixed shape (an exponent, depths)."""
 
-    name: str  # in mechanism files
-    own: Functions = field(repr=False)  # of depth [m] and rate [m/s], a coefficient per entry
-    names: tuple[str, ...]  # of the coefficients of `own`, then of `shared`
-    shared: Functions = field(repr=False, default=_nothing)  # the same for all entries
+    name: str  # name of the law in mechanism files
+    own: Functions = field(repr=False)  # phi(d [m], d' [m/s]) whose coefficients differ between entries
+    names: tuple[str, ...]  # names of the coefficients of `own`, then of `shared`
+    shared: Functions = field(
+        repr=False, default=_no_functions
+    )  # phi with coefficients common to all entries
     pulls: bool = False  # whether the force may be negative
-    shape: dict[str, Any] = field(default_factory=dict)  # keys of the mechanism file that make the shape
+    shape: dict[str, Any] = field(default_factory=dict)  # keys of the mechanism file that fix the shape
 
     @property
     def complexity(self) -> int:
-        """Numbers to find with one entry of the list: coefficients, and those of the shape."""
+        """Return the number of unknowns for one list entry: coefficients, depths and exponent."""
         return len(self.names) + len(self.shape.get("depths", ())) + ("exponent" in self.shape)
 
 
 class Family(NamedTuple):
-    """Regressions of one law among which a fit chooses by one number, its shape."""
+    """Regressions of one contact law that differ in one number, the shape, which a fit chooses."""
 
-    make: Callable[[float], Regression]  # of the shape
-    low: float = 0.0  # least and greatest shape that the fit tries; equal if there is nothing to choose
-    high: float = 0.0
-    usual: tuple[float, ...] = ()  # shapes that are preferred if they explain as much
+    make: Callable[[float], Regression]  # returns the regression of a shape
+    low: float = 0.0  # smallest shape that the fit tries
+    high: float = 0.0  # largest shape that the fit tries; equal to `low` if the shape is fixed
+    usual: tuple[float, ...] = ()  # shapes that are preferred if they fit equally well
