@@ -1,1 +1,1 @@
-"""What a mechanism file says: structs, reading and checking, random draws of what is uncertain."""
+"""Mechanism files: their structs, reading and validation, and random draws of the uncertain numbers."""

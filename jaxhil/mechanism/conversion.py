@@ -1,7 +1,7 @@
-"""From a raw table to a `Mechanism`, key by key.
+"""Conversion of a raw table into a `Mechanism`, key by key.
 
-Walks the table along the struct types of `jaxhil.mechanism.structs`, so that each wrong key is reported with
-its path, what was found and what is allowed. Rules that join several keys are in
+The table is compared with the struct types of `jaxhil.mechanism.structs`, so that a wrong key is reported
+with its path, the value found and the allowed values. Rules for several keys together are in
 `jaxhil.mechanism.rules`.
 """
 
@@ -44,11 +44,11 @@ __all__ = [
 
 AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 Path = tuple[str | int, ...]
-Extra = Mapping[str, Any]  # what `jaxhil.mechanism.structs.says` puts beside a type
+Extra = Mapping[str, Any]  # metadata that `jaxhil.mechanism.structs.says` adds to a type
 
 # Lists for which a bare number stands for a list of one entry.
 NUMBER_FOR_LIST = ("contact", "stiffness"), ("contact", "damping")
-# Polynomials, whose leading zeros say nothing.
+# Polynomials, whose leading zeros have no effect and are dropped.
 _POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
 
 
@@ -56,7 +56,7 @@ _type_info = functools.cache(inspect.type_info)
 
 
 class KeyProblem(Exception):
-    """A key with an unusable value: its path, what was found, what is allowed."""
+    """Error for a key with an unusable value: its path, the value found and the allowed values, in words."""
 
     def __init__(self, path: Path, found: str, allowed: str):
         super().__init__(path, found, allowed)
@@ -70,7 +70,7 @@ class KeyProblem(Exception):
 
 
 def dotted(path: Path) -> str:
-    """A path as TOML writes it, printable: ``uncertainty."contact.stiffness".factor[0]``."""
+    """Return a path as printable TOML text: ``uncertainty."contact.stiffness".factor[0]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -83,38 +83,37 @@ def dotted(path: Path) -> str:
 
 
 def close_match(word: str, known: Iterable[str]) -> str:
-    """` (did you mean X?)` for the known words closest to `word`, or nothing."""
+    """Return ` (did you mean X?)` with the known words closest to `word`, or an empty text."""
     matches = difflib.get_close_matches(word[:200], list(known), n=3, cutoff=0.6)
     return f" (did you mean {' or '.join(matches)}?)" if matches else ""
 
 
 def entry_count(entries: Sequence[object]) -> str:
-    """`a list of N entries`."""
+    """Return the text `a list of N entries`."""
     return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
 
 
 def computable(allowed: object) -> str:
-    """The numbers that are `allowed`, with the magnitudes that arithmetic bears."""
+    """Return the text `allowed`, extended by the range of magnitudes that computations support."""
     return f"{allowed}, of a magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}"
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
-    """The raw table as a `Mechanism`: every key known, of its type and in its range.
+    """Convert a raw table to a `Mechanism`. Raise `KeyProblem` for the first unknown or unusable key.
 
-    Integers are accepted where a number is wanted, a bare number for `contact.stiffness` and
-    `contact.damping`; leading zeros of a transfer function's polynomials are dropped. Raises
-    `KeyProblem` for the first key that is not usable.
+    Integers are accepted as numbers, and a single number for the lists `contact.stiffness` and
+    `contact.damping`; leading zeros of a transfer function's polynomials are dropped.
     """
     return msgspec.convert(_clean(schema_type(), raw, (), PLAIN), Mechanism)
 
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
-    """The raw table as a struct whose fields say what is allowed, as `Mechanism`. Raises `KeyProblem`."""
+    """Convert a raw table to a struct of a type with metadata like `Mechanism`'s. Raise `KeyProblem`."""
     return msgspec.convert(_clean(_type_info(kind), raw, (), PLAIN), kind)
 
 
 def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
-    """The type of what `part` names inside a value of type `kind`, or raises `KeyProblem`."""
+    """Return the type of the key or list entry `part` in a value of type `kind`. Raise `KeyProblem`."""
     match kind:
         case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
             return step_into(inner, 0, path)
@@ -140,7 +139,7 @@ def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
 
 
 def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
-    """The values of a type, in words."""
+    """Return the allowed values of a type, in words."""
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             return f"one of {', '.join(names)}"
@@ -173,14 +172,15 @@ def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
 
 
 def allowed_at(kind: type[msgspec.Struct], key: str) -> str:
-    """The values of a struct's key, in words."""
+    """Return the allowed values of a struct's key, in words."""
     info = _type_info(kind)
     assert isinstance(info, inspect.StructType)
-    [found] = (entry.type for entry in info.fields if entry.encode_name == key)
-    return allowed_of(found)
+    [key_type] = (entry.type for entry in info.fields if entry.encode_name == key)
+    return allowed_of(key_type)
 
 
 def _bare(kind: inspect.Type) -> inspect.Type:
+    """Return a type without its metadata."""
     return _bare(kind.type) if isinstance(kind, inspect.Metadata) else kind
 
 
@@ -191,7 +191,7 @@ def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
 
 
 def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
-    """`value` as plain data of type `kind`, numbers as floats; raises `KeyProblem`."""
+    """Return `value` as plain data of type `kind`, with numbers as floats. Raise `KeyProblem`."""
     if path in NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
@@ -247,9 +247,10 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
 
 
 def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
+    """Return a table as plain data of the struct type `kind`. Raise `KeyProblem`."""
     names = {entry.encode_name for entry in kind.fields}
     for key in value:
-        # Unknown keys come first: a misspelt key is also a missing one.
+        # Unknown keys are reported first, because a misspelt key also looks like a missing one.
         if key not in names:
             raise _unknown_key(kind, str(key), path)
     cleaned = {}
@@ -263,7 +264,10 @@ def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path
 
 
 def _six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path: Path) -> Any:
-    """Six entries of one number, or of one each for the two `names`; anything else as it is."""
+    """Return the six entries that one number, or a table of two numbers with the keys `names`, stands for.
+
+    A list is returned unchanged. Raise `KeyProblem` for any other value.
+    """
     if isinstance(value, (list, tuple)):
         return value
     if isinstance(value, Mapping) and set(value) == set(names):
@@ -274,12 +278,11 @@ def _six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path:
 
 
 def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
-    """Which of the types of a union a value is meant to be: nothing, a list, or the scalar."""
+    """Return the member of a union type that fits the form of a value: None, a list, or a scalar."""
     kinds = list(members)
-    nothing = [kind for kind in kinds if isinstance(kind, inspect.NoneType)]
-    if value is None and nothing:
-        return nothing[0]
+    none = [kind for kind in kinds if isinstance(kind, inspect.NoneType)]
+    if value is None and none:
+        return none[0]
     lists = [kind for kind in kinds if isinstance(kind, inspect.ListType)]
-    others = [kind for kind in kinds if kind not in nothing and kind not in lists]
-    wanted = lists or others if isinstance(value, (list, tuple)) else others or lists
-    return wanted[0]
+    scalars = [kind for kind in kinds if kind not in none and kind not in lists]
+    return (lists or scalars if isinstance(value, (list, tuple)) else scalars or lists)[0]

@@ -1,8 +1,8 @@
-"""Reading a mechanism file: bytes, TOML, overrides, validation.
+"""Reading of mechanism files: bytes, TOML, overrides and validation.
 
-`load` turns a file (or the name of a built-in one or suite), the ``PATH=VALUE`` overrides of ``--set`` and
-the keys that ``--unset`` takes out into a validated `Mechanism`; `load_any` takes files of six axes as well.
-Whatever is wrong with them raises `InputError` with one line.
+`load` makes a validated `Mechanism` from a file (or from the name of a built-in mechanism or suite), the
+``PATH=VALUE`` overrides of ``--set`` and the keys that ``--unset`` removes; `load_any` also reads six-axis
+files. Any error in them raises `InputError` with a message of one line.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ Overrides = Sequence[str] | Mapping[str, Any]
 AnyMechanism = Mechanism | SixAxisMechanism
 Kind = TypeVar("Kind", Mechanism, AnyMechanism)
 
-SUITE = "suite-"  # begins the names of the standard suites
+SUITE = "suite-"  # prefix of the names of the standard suites
 
-_UNLIMITED = [math.inf] * 6  # six numbers that are the default of their key
-_sources: dict[str, str] = {}  # digests of the files read, by those of what was read
+_UNLIMITED = [math.inf] * 6  # default of keys with six limits
+_sources: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
 
 _FOLDER = Path(__file__).parent / "builtin"
 _SIX_AXES = _FOLDER / "six_axes"
 
 
 class LoadedMechanism(NamedTuple):
-    """A validated mechanism, the SHA-256 of its file's bytes in hex, and what to call the file."""
+    """Validated mechanism with the identity of its file."""
 
     mechanism: Mechanism
-    sha256: str
-    label: str
+    sha256: str  # SHA-256 of the file's bytes, in hexadecimal digits
+    label: str  # printable name of the file, for messages
 
 
 class LoadedAny(NamedTuple):
-    """A validated mechanism of one axis or of six; else as `LoadedMechanism`."""
+    """Validated mechanism with one axis or with six; fields as in `LoadedMechanism`."""
 
     mechanism: AnyMechanism
     sha256: str
@@ -77,31 +77,33 @@ class LoadedAny(NamedTuple):
 def load(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedMechanism:
-    """The mechanism of a TOML file or of a built-in's name (`None`: the default built-in), of one axis.
+    """Load the one-axis mechanism of a TOML file, or a built-in one.
 
-    `overrides` are ``PATH=VALUE`` texts as given to ``--set``, applied in order before validation:
-    PATH a dotted TOML key, possibly with an index (``contact.stiffness[1]``), VALUE a TOML value; a
-    bare word is a string. A table given as VALUE replaces the one there. A mapping of PATH to the value
-    itself does the same, and takes out the key whose value is None. `unset` are PATHs as given to
-    ``--unset``, keys that are then taken out.
+    Args:
+        path_or_name: path of a file, name of a built-in mechanism, or None for the default one.
+        overrides: ``PATH=VALUE`` texts as for ``--set``, applied in order before validation. PATH is a dotted
+            TOML key, possibly with an index (``contact.stiffness[1]``); VALUE is a TOML value, or a bare word
+            for a string. A table as VALUE replaces the whole table. Alternatively a mapping from PATH to the
+            value, in which None removes the key.
+        unset: PATHs of keys to remove afterwards, as for ``--unset``.
 
-    Raises `InputError`, one line, for whatever is wrong, and for a mechanism of six axes.
+    Raises:
+        InputError: if the file or a change is wrong, or the mechanism has six axes.
     """
     raw, sha256, label = _read(path_or_name)
-    return LoadedMechanism(_noted(from_builtins(raw, label, overrides, unset), sha256), sha256, label)
+    return LoadedMechanism(_registered(from_builtins(raw, label, overrides, unset), sha256), sha256, label)
 
 
 def load_any(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedAny:
-    """Like `load`, of one axis or of six."""
+    """Load a mechanism with one axis or with six, as `load` does."""
     raw, sha256, label = _read(path_or_name)
-    return LoadedAny(_noted(any_from_builtins(raw, label, overrides, unset), sha256), sha256, label)
+    return LoadedAny(_registered(any_from_builtins(raw, label, overrides, unset), sha256), sha256, label)
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """SHA-256 in hex of the file that an equal mechanism was read from, or of its content if it was not read
-    from any."""
+    """Return the SHA-256 (hex) of the file from which an equal mechanism was read, else of its content."""
     content = _content_sha256(mechanism)
     return _sources.get(content, content)
 
@@ -109,9 +111,10 @@ def source_sha256(mechanism: AnyMechanism) -> str:
 def from_builtins(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> Mechanism:
-    """The validated mechanism of plain data, such as a parsed TOML or JSON table, changed as by `load`.
+    """Return the validated one-axis mechanism of plain data, such as a parsed TOML or JSON table.
 
-    `label` is what an error calls its source. Raises `InputError`, for a mechanism of six axes too.
+    `label` names the source in messages; `overrides` and `unset` are as for `load`. Raise `InputError`, also
+    for a six-axis mechanism.
     """
     if is_six_axes(raw):
         allowed = f"{SCHEMA}: six axes are known to init, mechanisms, simulate, tune, sweep and report"
@@ -124,10 +127,10 @@ def from_builtins(
 def any_from_builtins(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> AnyMechanism:
-    """Like `from_builtins`, of one axis or of six, as the schema says."""
+    """Return the validated mechanism of plain data with one axis or with six, as `from_builtins` does."""
     changed, label = raw, one_line(label)
-    given = _given(overrides, unset)
-    for option, changes in given.items():
+    all_changes = _changes(overrides, unset)
+    for option, changes in all_changes.items():
         for change in changes:
             try:
                 changed = apply_override(changed, *parse_override(change))
@@ -136,36 +139,38 @@ def any_from_builtins(
     try:
         return _validated(changed)
     except KeyProblem as problem:
-        blamed = "" if str(problem) == _problem_of(raw) else _listed(given)
-        raise InputError(f"{label}{blamed}: {problem}") from None
+        options = "" if str(problem) == _problem_of(raw) else _listed(all_changes)
+        raise InputError(f"{label}{options}: {problem}") from None
 
 
 def to_builtins(mechanism: AnyMechanism) -> dict[str, Any]:
-    """The mechanism as plain data fit for JSON; `from_builtins` makes an equal mechanism of it.
+    """Return the mechanism as plain data for JSON, from which `from_builtins` makes an equal mechanism.
 
-    Keys without a value and infinite numbers are left out: both are the defaults of their keys.
+    Keys without a value and infinite numbers, both defaults of their keys, are omitted.
     """
     return _without_empty(msgspec.to_builtins(mechanism))
 
 
 def builtin_names() -> list[str]:
-    """The names of the built-in mechanism files of one axis, the standard suites apart."""
+    """Return the names of the built-in one-axis mechanisms, without the standard suites."""
     return [name for name in _names() if not name.startswith(SUITE)]
 
 
 def suite_names() -> list[str]:
-    """The names of the standard suites: built-in mechanism files on which compensators are compared, each
-    with one difficulty, drawn from the same rig."""
+    """Return the names of the standard suites.
+
+    They are built-in mechanism files of one rig, each with one difficulty, for comparing compensators.
+    """
     return [name for name in _names() if name.startswith(SUITE)]
 
 
 def six_axis_names() -> list[str]:
-    """The names of the built-in mechanism files of six axes."""
+    """Return the names of the built-in six-axis mechanisms."""
     return sorted(path.stem for path in _SIX_AXES.glob("*.toml"))
 
 
 def builtin_path(name: str) -> Path:
-    """The file of a built-in mechanism or suite. Raises `InputError` for an unknown name."""
+    """Return the path of a built-in mechanism or suite. Raise `InputError` for an unknown name."""
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if name not in names:
         raise InputError(
@@ -176,7 +181,7 @@ def builtin_path(name: str) -> Path:
 
 
 def _read(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
-    """The table of a file, the digest of its bytes, and what to call it."""
+    """Return the table of a file, the SHA-256 of its bytes, and its printable name."""
     name = DEFAULT if path_or_name is None else path_or_name
     if isinstance(name, str) and name in (*builtin_names(), *suite_names(), *six_axis_names()):
         path, label = builtin_path(name), name
@@ -189,8 +194,8 @@ def _read(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], 
     return parse_toml(data, label, "a mechanism"), hashlib.sha256(data).hexdigest(), label
 
 
-def _noted(mechanism: Kind, sha256: str) -> Kind:
-    """The mechanism, its content's digest kept with that of its file."""
+def _registered(mechanism: Kind, sha256: str) -> Kind:
+    """Store the SHA-256 of the mechanism's file for `source_sha256`, and return the mechanism."""
     _sources[_content_sha256(mechanism)] = sha256
     return mechanism
 
@@ -205,18 +210,20 @@ def _names() -> list[str]:
 
 
 def _missing(label: str) -> InputError:
+    """Return the error for a file that does not exist."""
     names = [*builtin_names(), *six_axis_names()]
     hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
     return InputError(f"{label}: found no such file, allowed a mechanism file{hint}")
 
 
 def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
+    """Return the validated mechanism of a raw table. Raise `KeyProblem`."""
     if is_six_axes(raw):
         check_named(raw)
-        in_space = to_struct(SixAxisMechanism, raw)
+        six_axis_mechanism = to_struct(SixAxisMechanism, raw)
         check_legs(raw)
-        check_six_axes(in_space)
-        return in_space
+        check_six_axes(six_axis_mechanism)
+        return six_axis_mechanism
     if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:
         raise KeyProblem(("schema",), shown(raw["schema"]), f"{SCHEMA}, or {SCHEMA_SIX} of six axes")
     if isinstance(raw, Mapping) and {"target", "chaser"} <= set(raw):
@@ -228,6 +235,7 @@ def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
 
 
 def _problem_of(raw: Mapping[str, Any]) -> str:
+    """Return the message about a raw table's first problem, or an empty text."""
     try:
         _validated(raw)
     except KeyProblem as problem:
@@ -235,32 +243,33 @@ def _problem_of(raw: Mapping[str, Any]) -> str:
     return ""
 
 
-def _given(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """The changes that are asked for, by what they are called where they are given: on the command line, or
-    as an argument."""
-    named = isinstance(overrides, Mapping)
+def _changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the requested changes by the name of the command's option or of the function's argument."""
+    is_mapping = isinstance(overrides, Mapping)
     return {
-        "overrides" if named else "--set": list(overrides.items() if named else overrides),
+        "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),
         "--unset": [(path, None) for path in unset],
     }
 
 
-def _listed(given: Mapping[str, Sequence[Any]]) -> str:
+def _listed(all_changes: Mapping[str, Sequence[Any]]) -> str:
+    """Return the first three changes of each option as a text for a message."""
     options = [
         " ".join([option, *map(_short, changes[:3]), *["..."][: len(changes) > 3]])
-        for option, changes in given.items()
+        for option, changes in all_changes.items()
         if changes
     ]
     return f": {' '.join(options)}" if options else ""
 
 
-def _short(given: object) -> str:
-    """A change by its text, or by its key."""
-    given = given[0] if isinstance(given, tuple) else given
-    return one_line(given, 60) if isinstance(given, str) else shown(given)
+def _short(change: object) -> str:
+    """Return a change's text, or its key if it is a pair of key and value."""
+    text = change[0] if isinstance(change, tuple) else change
+    return one_line(text, 60) if isinstance(text, str) else shown(text)
 
 
 def _without_empty(value: Any) -> Any:
+    """Return plain data without keys that have no value or infinite numbers."""
     if isinstance(value, dict):
         entries = {key: _without_empty(entry) for key, entry in value.items()}
         return {key: entry for key, entry in entries.items() if entry not in (None, math.inf, _UNLIMITED)}

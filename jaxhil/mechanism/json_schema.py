@@ -1,6 +1,6 @@
-"""The JSON Schema of mechanism files: editors that have it complete keys, show meanings and mark errors.
+"""JSON Schema of mechanism files, with which editors complete keys, show descriptions and mark errors.
 
-It states what each key allows by itself; the rules that join several keys are checked when a file is read.
+It contains the allowed values of each key; rules for several keys together are checked when a file is read.
 """
 
 from __future__ import annotations
@@ -17,20 +17,23 @@ from jaxhil.mechanism.structs import Mechanism, numeric_keys
 
 __all__ = ["json_schema"]
 
-SIX = "SixAxes."  # begins the names of tables of six axes
+SIX = "SixAxes."  # prefix of the names of six-axis tables
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema as plain data (draft 2020-12), with the contact laws that are registered: that of one axis
-    or of six, as a file's own `schema` says."""
-    of_six_axes = {"properties": {"schema": {"const": SCHEMA_SIX}}, "required": ["schema"]}
+    """Return the JSON Schema (draft 2020-12) as plain data, with the registered contact laws.
+
+    A file's key `schema` selects the one-axis or the six-axis tables.
+    """
+    has_six_axes = {"properties": {"schema": {"const": SCHEMA_SIX}}, "required": ["schema"]}
     kinds = {"then": {"$ref": f"#/$defs/{SIX}SixAxisMechanism"}, "else": {"$ref": "#/$defs/Mechanism"}}
     tables = {**_one_axis(), **_six_axes()}
     draft = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": draft, "if": of_six_axes, **kinds, "$defs": tables}
+    return {"$schema": draft, "if": has_six_axes, **kinds, "$defs": tables}
 
 
 def _one_axis() -> dict[str, Any]:
+    """Return the one-axis tables; some lists may also be a single number."""
     tables = _tables(Mechanism)
     for table, name in NUMBER_FOR_LIST:
         properties = tables[table.capitalize()]["properties"]
@@ -43,38 +46,41 @@ def _one_axis() -> dict[str, Any]:
 
 
 def _six_axes() -> dict[str, Any]:
-    """Under names of their own: tables of one axis have the same."""
+    """Return the six-axis tables, with a prefix because one-axis tables have the same names."""
     return {f"{SIX}{name}": _renamed(table) for name, table in _tables(SixAxisMechanism).items()}
 
 
 def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the schema of each table of a struct type, by name."""
     tables = {name: _tidy(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
     tables["Contact"]["properties"]["law"]["enum"] = list(LAWS)
     return tables
 
 
 def _renamed(node: Any) -> Any:
+    """Return a schema whose references to tables have the six-axis prefix."""
     if isinstance(node, list):
         return [_renamed(entry) for entry in node]
     if not isinstance(node, dict):
         return node
-    place = "#/$defs/"
+    root = "#/$defs/"
     return {
-        key: value.replace(place, place + SIX)
-        if key == "$ref" and isinstance(value, str)
-        else _renamed(value)
+        key: value.replace(root, root + SIX) if key == "$ref" and isinstance(value, str) else _renamed(value)
         for key, value in node.items()
     }
 
 
 def _tidy(node: Any) -> Any:
-    """Units in the descriptions; without null, which TOML has not, and without defaults that JSON has not."""
+    """Return a schema with units in the descriptions, without null values and infinite defaults.
+
+    TOML has no null, and JSON has no infinite numbers.
+    """
     if isinstance(node, list):
         return [_tidy(entry) for entry in node]
     if not isinstance(node, dict):
         return node
     if "six" in node or "square" in node:
-        return _shorter(node)
+        return _with_short_forms(node)
     tidied = {key: _tidy(value) for key, value in node.items() if key not in ("unit", "default")}
     if (unit := node.get("unit")) not in (None, "", "1"):
         tidied["description"] += f" [{unit}]"
@@ -88,13 +94,13 @@ def _tidy(node: Any) -> Any:
     return tidied
 
 
-def _shorter(node: dict[str, Any]) -> dict[str, Any]:
-    """Six numbers that may be said as one or two, or a matrix that may be said as one."""
-    whole = _tidy({key: value for key, value in node.items() if key not in ("six", "square", "description")})
-    number = whole["items"]["items"] if "square" in node else whole["items"]
-    several = [number]
+def _with_short_forms(node: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema of six numbers or of a matrix, extended by the forms with one or two numbers."""
+    full = _tidy({key: value for key, value in node.items() if key not in ("six", "square", "description")})
+    number = full["items"]["items"] if "square" in node else full["items"]
+    forms = [number]
     if names := node.get("six"):
-        each = dict.fromkeys(names, number)
-        table = {"type": "object", "properties": each, "required": names, "additionalProperties": False}
-        several.append(table)
-    return {"description": node["description"], "anyOf": [*several, whole]}
+        numbers = dict.fromkeys(names, number)
+        table = {"type": "object", "properties": numbers, "required": names, "additionalProperties": False}
+        forms.append(table)
+    return {"description": node["description"], "anyOf": [*forms, full]}

@@ -1,7 +1,7 @@
-"""Every key of a mechanism file, as its type describes it: reference pages and a new file's comments are made
-of this.
+"""Descriptions of all keys of a mechanism file, for the reference pages and the comments in a new file.
 
-A key whose meaning, or a number whose unit nobody stated has no place there: both raise ValueError.
+They come from the types of the keys. A key without a description, or a number without a unit, raises
+ValueError.
 """
 
 from __future__ import annotations
@@ -21,62 +21,63 @@ __all__ = ["Key", "Table", "tables"]
 
 
 class Key(NamedTuple):
-    """One key of a table."""
+    """Key of a table."""
 
     name: str
-    meaning: str
-    unit: str | None  # None of what is no number, "1" of a number without unit, "" for that of another key
+    meaning: str  # description
+    unit: str | None  # None: not a number; "1": dimensionless; "": the unit of another key
     allowed: str  # the allowed values, in words
     required: bool
-    default: Any  # None of a key that has no value unless it is given one
-    users: tuple[str, ...]  # contact laws, or models of the motion simulator; () if it is for all
+    default: Any  # None: no value by default
+    users: tuple[str, ...]  # contact laws or motion simulator models that use the key; () if all do
 
 
 class Table(NamedTuple):
-    """One table of the file: its dotted path, '' that of the file's head; what it says; its keys."""
+    """Table of a mechanism file."""
 
-    path: str
-    meaning: str
+    path: str  # dotted path; '' for the head of the file
+    meaning: str  # description
     keys: tuple[Key, ...]
 
 
 def tables(kind: type[msgspec.Struct] = Mechanism) -> tuple[Table, ...]:
-    """The tables of a struct, each before those within it; `"KEY"` stands for the keys of a dictionary.
+    """Return the tables of a struct, each before its subtables; `"KEY"` stands for any key of a dictionary.
 
-    Raises ValueError for a key whose type does not say what it means, or of a number the unit.
+    Raise ValueError for a key without a description, or a number without a unit.
     """
     return tuple(_tables(inspect.type_info(kind), ""))
 
 
 def _tables(kind: inspect.Type, path: str) -> Iterator[Table]:
+    """Yield the table of a struct type at a path, then its subtables."""
     assert isinstance(kind, inspect.StructType)
-    keys, within = [], []
+    keys, subtables = [], []
     for field in kind.fields:
-        where = f"{path}.{field.encode_name}".lstrip(".")
+        key_path = f"{path}.{field.encode_name}".lstrip(".")
         inner = _table_of(field.type)
         if inner is None:
-            keys.append(_key(field, where))
+            keys.append(_key(field, key_path))
         elif isinstance(inner, inspect.DictType):
-            within.append((inner.value_type, f'{where}."KEY"'))
+            subtables.append((inner.value_type, f'{key_path}."KEY"'))
         else:
-            within.append((inner, where))
+            subtables.append((inner, key_path))
     yield Table(path, _first_paragraph(kind), tuple(keys))
-    for inner, where in within:
-        yield from _tables(inner, where)
+    for inner, key_path in subtables:
+        yield from _tables(inner, key_path)
 
 
 def _first_paragraph(kind: inspect.StructType) -> str:
-    """The first paragraph of a struct's docstring, on one line."""
+    """Return the first paragraph of a struct's docstring, on one line."""
     return " ".join((kind.cls.__doc__ or "").split("\n\n")[0].split())
 
 
 def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | None:
-    """The table that a key's type is, possibly an optional one."""
+    """Return the table type of a key, without metadata and None, or None if the key is not a table."""
     match kind:
         case inspect.Metadata(type=inner):
             return _table_of(inner)
         case inspect.UnionType(types=members):
-            return next((found for member in members if (found := _table_of(member))), None)
+            return next((table for member in members if (table := _table_of(member))), None)
         case inspect.StructType() | inspect.DictType():
             return kind
         case _:
@@ -84,6 +85,7 @@ def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | Non
 
 
 def _key(field: inspect.Field, path: str) -> Key:
+    """Return the description of the key at a path. Raise ValueError if it is incomplete."""
     meaning = next(_meanings(field.type), "")
     if not meaning:
         raise ValueError(f"{path}: its type does not say what it means")
@@ -97,10 +99,11 @@ def _key(field: inspect.Field, path: str) -> Key:
 
 
 def _meanings(kind: inspect.Type) -> Iterator[str]:
+    """Yield the descriptions of a type, the outermost first."""
     match kind:
-        case inspect.Metadata(type=inner, extra_json_schema=said):
-            if said and said.get("description"):
-                yield said["description"]
+        case inspect.Metadata(type=inner, extra_json_schema=schema):
+            if schema and schema.get("description"):
+                yield schema["description"]
             yield from _meanings(inner)
         case inspect.UnionType(types=members):
             for member in members:
@@ -110,10 +113,10 @@ def _meanings(kind: inspect.Type) -> Iterator[str]:
 
 
 def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None) -> str | None:
-    """The unit of a number, or of a list's entries."""
+    """Return the unit of a number or of a list's entries, or None for other types."""
     match kind:
-        case inspect.Metadata(type=inner, extra=said):
-            return _unit(inner, path, said)
+        case inspect.Metadata(type=inner, extra=metadata):
+            return _unit(inner, path, metadata)
         case inspect.UnionType(types=members):
             return next((unit for member in members if (unit := _unit(member, path)) is not None), None)
         case inspect.ListType(item_type=item):
@@ -127,6 +130,7 @@ def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None)
 
 
 def _users(path: str) -> tuple[str, ...]:
+    """Return the contact laws or motion simulator models that use the key at a path; () for all."""
     table, _, name = path.rpartition(".")
     if table == "contact":
         if name == "damping":

@@ -1,4 +1,4 @@
-"""A mechanism from whatever names it: a built-in's name, a file's path, or the `Mechanism` itself."""
+"""Loading of a mechanism from a built-in name, a file's path, or a `Mechanism` object."""
 
 from __future__ import annotations
 
@@ -17,14 +17,19 @@ __all__ = ["as_any_mechanism", "as_mechanism", "load"]
 def load(
     name_or_path: str | os.PathLike[str] = file.DEFAULT, overrides: Mapping[str, Any] | None = None
 ) -> Any:
-    """The mechanism of a built-in's name, or of a TOML file: a `Mechanism`, or a `SixAxisMechanism`, as its
-    schema says.
+    """Load a mechanism from a TOML file, or a built-in one.
 
-    `overrides` maps keys to values, in SI units, which replace those of the file: a key is a dotted path,
-    such as ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``). The value None
-    takes the key out, as ``--unset`` does, and with it what ``[uncertainty]`` says of it.
+    Args:
+        name_or_path: name of a built-in mechanism, or path of a file.
+        overrides: values in SI units that replace those of the file, by key. A key is a dotted path such as
+            ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``). The value None
+            removes the key, as ``--unset`` does, and its entry of ``[uncertainty]``.
 
-    Raises `InputError`, one line, for whatever is wrong: file, key, what was found and what is allowed.
+    Returns:
+        A `Mechanism`, or a `SixAxisMechanism` if the file's schema has six axes.
+
+    Raises:
+        InputError: if the file, a key or a value is wrong. The message is one line.
     """
     if not (overrides is None or isinstance(overrides, Mapping)):
         raise InputError(f"overrides: found {shown(overrides)}, allowed a dict from dotted paths to values")
@@ -32,22 +37,23 @@ def load(
 
 
 def as_mechanism(given: object) -> Mechanism:
-    """The mechanism given, checked; or that of the name or path given; of one axis. Raises `InputError`."""
+    """Validate a one-axis mechanism, or load that of a name or path. Raise `InputError`."""
     if not isinstance(given, (Mechanism, SixAxisMechanism)):
         return file.load(_source(given)).mechanism
-    # Structs hold what they are given: one that was not read from a file was not checked yet.
+    # Structs do not validate their fields: a mechanism that was not read from a file is unchecked.
     return file.from_builtins(file.to_builtins(given), f"mechanism {shown(given.name)}")
 
 
 def as_any_mechanism(given: object) -> file.AnyMechanism:
-    """Likewise, of one axis or of six."""
+    """Validate a mechanism with one axis or with six, or load that of a name or path. Raise `InputError`."""
     if not isinstance(given, (Mechanism, SixAxisMechanism)):
         return file.load_any(_source(given)).mechanism
     return file.any_from_builtins(file.to_builtins(given), f"mechanism {shown(given.name)}")
 
 
-def _source(given: object) -> str | os.PathLike[str]:
-    if isinstance(given, (str, os.PathLike)) and isinstance(os.fspath(given), str):
-        return given
+def _source(argument: object) -> str | os.PathLike[str]:
+    """Return a name or path. Raise `InputError` for any other argument."""
+    if isinstance(argument, (str, os.PathLike)) and isinstance(os.fspath(argument), str):
+        return argument
     allowed = "a Mechanism, the name of a built-in one or a path"
-    raise InputError(f"mechanism: found {shown(given)}, allowed {allowed}")
+    raise InputError(f"mechanism: found {shown(argument)}, allowed {allowed}")

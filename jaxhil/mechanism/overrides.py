@@ -1,8 +1,8 @@
-"""Overrides of a mechanism file: ``PATH=VALUE``, as given to ``--set``, and ``PATH`` as given to ``--unset``.
+"""Overrides of a mechanism file: ``PATH=VALUE`` of the option ``--set``, and ``PATH`` of ``--unset``.
 
-PATH is a dotted key as TOML writes it, possibly with indices into lists; VALUE is a TOML value, and
-a bare word is a string, so that ``contact.law=linear`` needs no quotes within a shell's quotes. TOML has no
-word for nothing: the value None takes a key out.
+PATH is a dotted TOML key, possibly with indices into lists. VALUE is a TOML value; a bare word is a string,
+so that ``contact.law=linear`` needs no quotes within a shell's quotes. The value None, which TOML does not
+have, removes a key.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MAX_LENGTH = 100_000
 
 
 def parse_override(override: str | tuple[object, Any]) -> tuple[Path, Any]:
-    """Path and value of a ``PATH=VALUE`` text, or of a pair of PATH and the value. Raises `KeyProblem`."""
+    """Return path and value of a ``PATH=VALUE`` text, or of a pair (PATH, value). Raise `KeyProblem`."""
     if not isinstance(override, str):
         key, value = override
         return parse_key(key), _plain(value)
@@ -37,7 +37,7 @@ def parse_override(override: str | tuple[object, Any]) -> tuple[Path, Any]:
 
 
 def parse_key(key: object) -> Path:
-    """The path that a dotted key names. Raises `KeyProblem`."""
+    """Return the path that a dotted key names. Raise `KeyProblem`."""
     if isinstance(key, str):
         path, end = _parse_path(f"{key}=", key)
         if end == len(key) + 1:
@@ -46,10 +46,10 @@ def parse_key(key: object) -> Path:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and arrays of NumPy and jax as those of Python."""
+    """Return a value with the numbers and arrays of NumPy and JAX converted to those of Python."""
     if isinstance(value, (list, tuple)):
         if len(value) > MAX_CONTACTS:
-            return value  # refused for its length, whatever is in it
+            return value  # validation rejects it for its length, so that its entries do not matter
         return [_plain(entry) for entry in value]
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
@@ -57,6 +57,7 @@ def _plain(value: Any) -> Any:
 
 
 def _parse_text(text: str) -> tuple[Path, Any]:
+    """Return path and value of a ``PATH=VALUE`` text. Raise `KeyProblem`."""
     path, position = _parse_path(text)
     written = text[position:].strip()
     if len(written) > _MAX_LENGTH:
@@ -78,19 +79,19 @@ def _parse_text(text: str) -> tuple[Path, Any]:
 
 
 def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, Any]:
-    """A copy of a raw table with the value at `path` replaced; tables on the way are made. None takes the key
-    out, and with it what ``[uncertainty]`` and ``[correlation]`` say of it and of the keys below it.
+    """Return a copy of a raw table with a new value at `path`; missing tables on the path are created.
 
-    Raises `KeyProblem` when the schema has no such path, a list no such entry, or where there is no such key
-    to take out.
+    The value None removes the key, and the entries of ``[uncertainty]`` and ``[correlation]`` for it and for
+    the keys below it. Raise `KeyProblem` if the schema has no such path, a list has no such entry, or the key
+    to remove does not exist.
     """
-    in_space = is_six_axes(raw)
-    kind = six_axis_type() if in_space else schema_type()
+    has_six_axes = is_six_axes(raw)
+    kind = six_axis_type() if has_six_axes else schema_type()
     for depth, part in enumerate(path):
         try:
             kind = step_into(kind, part, path[:depth])
         except KeyProblem as problem:
-            hint = close_match(dotted(path), _numeric_keys(raw) if in_space else numeric_keys())
+            hint = close_match(dotted(path), _numeric_keys(raw) if has_six_axes else numeric_keys())
             if hint and "did you mean" not in problem.allowed:
                 problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
             raise problem from None
@@ -98,25 +99,25 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
 
 
 def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
-    """Of a raw table of six axes."""
+    """Return the numeric keys of a raw six-axis table, with their ranges."""
     tables = (raw.get(key) for key in ("contact", "latch"))
-    return numeric_keys_beside(*(tuple(map(str, one)) if isinstance(one, Mapping) else () for one in tables))
+    return numeric_keys_beside(*(tuple(map(str, t)) if isinstance(t, Mapping) else () for t in tables))
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:
-    """The path in front of ``=`` and the position behind it; problems speak of the `key`, if one is given."""
-    given, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
+    """Return the path before ``=`` and the position after it; messages show `key` if it is not None."""
+    source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
     while True:
         part = _PART.match(text, position)
         if part is None or len(path) > 16:
-            raise KeyProblem((), shown(given), example)
+            raise KeyProblem((), shown(source), example)
         word = part.group(1)
         try:
             path.append(next(iter(tomllib.loads(f"{word} = 0"))))
         except ValueError:
-            raise KeyProblem((), shown(given), example) from None
+            raise KeyProblem((), shown(source), example) from None
         position = part.end()
         while index := _INDEX.match(text, position):
             path.append(int(index.group(1)))
@@ -124,11 +125,12 @@ def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:
         if text[position : position + 1] == "=":
             return tuple(path), position + 1
         if text[position : position + 1] != ".":
-            raise KeyProblem((), shown(given), example)
+            raise KeyProblem((), shown(source), example)
         position += 1
 
 
 def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
+    """Return a copy of a node at `path[:depth]` with a new value at `path`. Raise `KeyProblem`."""
     if depth == len(path):
         return value
     part = path[depth]
@@ -147,28 +149,34 @@ def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
 
 
 def _removed(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    left, key = _without(raw, path, 0), dotted(path)
-    if isinstance(uncertain := left.get("uncertainty"), Mapping):
-        kept = {name: one for name, one in uncertain.items() if not f"{name}.".startswith(f"{key}.")}
-        left["uncertainty"] = kept
-    gone = [name for name in raw.get("uncertainty") or () if name not in (left.get("uncertainty") or ())]
-    return _uncorrelated(left, gone)
+    """Return a raw table without the key at `path` and its uncertainty and correlation."""
+    changed, key = _without(raw, path, 0), dotted(path)
+    if isinstance(table := changed.get("uncertainty"), Mapping):
+        entries = {name: entry for name, entry in table.items() if not f"{name}.".startswith(f"{key}.")}
+        changed["uncertainty"] = entries
+    certain = [
+        name for name in raw.get("uncertainty") or () if name not in (changed.get("uncertainty") or ())
+    ]
+    return _uncorrelated(changed, certain)
 
 
-def _uncorrelated(raw: dict[str, Any], gone: list[str]) -> dict[str, Any]:
-    """Without what ``[correlation]`` says of the keys that are gone."""
+def _uncorrelated(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
+    """Return a raw table without the correlations of the keys that are now `certain`."""
     table = raw.get("correlation")
-    if not gone or table is None:
+    if not certain or table is None:
         return raw
     try:
-        left = remaining(table["keys"], table["matrix"], gone)
+        correlation = remaining(table["keys"], table["matrix"], certain)
     except (TypeError, LookupError):
-        return raw  # no such table, which is refused when all is read
-    rest = {name: value for name, value in raw.items() if name != "correlation"}
-    return rest | ({"correlation": {**table, "keys": left[0], "matrix": left[1]}} if left else {})
+        return raw  # The table is malformed; validation reports it later.
+    others = {name: value for name, value in raw.items() if name != "correlation"}
+    if correlation is None:
+        return others
+    return others | {"correlation": {**table, "keys": correlation[0], "matrix": correlation[1]}}
 
 
 def _without(node: Any, path: Path, depth: int) -> dict[str, Any]:
+    """Return a copy of a table at `path[:depth]` without the key at `path`. Raise `KeyProblem`."""
     part = path[depth]
     if isinstance(path[-1], int):
         raise KeyProblem(path, "an entry of a list", "a key: a list is replaced as a whole")

@@ -1,8 +1,8 @@
-"""Rules of a mechanism file that join several keys.
+"""Validation rules for several keys of a mechanism file together.
 
-Each rule raises a `KeyProblem` that names the key to change. Types and single ranges are checked
-before, in `jaxhil.mechanism.conversion`. A key that the chosen law or model does not use is refused where
-it says anything: who wrote it means something by it. What a law from elsewhere uses, only that law knows.
+Each rule raises a `KeyProblem` that names the key to change. Types and single ranges are checked before, in
+`jaxhil.mechanism.conversion`. A key that the chosen law or model does not use is rejected if it has a value,
+because its author expects an effect. A user-registered law that does not state its keys may use any of them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
     "velocity_limit_allowed",
 ]
 
-# Keys of each model of the motion simulator.
+# Keys that each model of the motion simulator uses and needs.
 KEYS_OF_MODELS = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -55,7 +55,7 @@ FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
 def check(mechanism: Mechanism) -> None:
-    """Every rule in turn; raises `KeyProblem` for the first one broken."""
+    """Check every rule. Raise `KeyProblem` for the first violation."""
     check_texts(mechanism)
     _check_bodies(mechanism)
     check_law(("contact",), mechanism.contact, mechanism.uncertainty, KEYS.values())
@@ -68,10 +68,10 @@ def check(mechanism: Mechanism) -> None:
 
 
 def is_hurwitz(polynomial: Sequence[float]) -> bool:
-    """Whether all roots of a real polynomial (descending powers) have negative real parts.
+    """Return whether all roots of a real polynomial (descending powers) have negative real parts.
 
-    Routh's array in exact rational arithmetic: true when its first column has one sign throughout
-    (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV). A zero there is not stable.
+    This holds if the first column of the Routh array, in exact rational arithmetic, has one sign and no zero
+    (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV).
     """
     coefficients = [Fraction(value) for value in polynomial]
     if coefficients[0] < 0:
@@ -87,7 +87,7 @@ def is_hurwitz(polynomial: Sequence[float]) -> bool:
 
 
 def check_texts(mechanism: Any) -> None:
-    """Name and source can be shown. Raises `KeyProblem`."""
+    """Check that name and source are printable. Raise `KeyProblem`."""
     if not mechanism.name.isprintable():
         raise KeyProblem(("name",), shown(mechanism.name), "printable characters")
     if not mechanism.source.replace("\n", "").replace("\t", "").isprintable():
@@ -95,15 +95,16 @@ def check_texts(mechanism: Any) -> None:
 
 
 def _check_bodies(mechanism: Mechanism) -> None:
+    """Check that the bodies have one equivalent mass, or two masses. Raise `KeyProblem`."""
     bodies = mechanism.bodies
     either = "either equivalent_mass, or both chaser_mass and target_mass"
-    both = bodies.chaser_mass is not None and bodies.target_mass is not None
-    one = bodies.chaser_mass is not None or bodies.target_mass is not None
-    if bodies.equivalent_mass is not None and one:
+    has_both = bodies.chaser_mass is not None and bodies.target_mass is not None
+    has_any = bodies.chaser_mass is not None or bodies.target_mass is not None
+    if bodies.equivalent_mass is not None and has_any:
         raise KeyProblem(("bodies", "equivalent_mass"), "a body's mass beside it", either)
-    if bodies.equivalent_mass is None and not both:
+    if bodies.equivalent_mass is None and not has_both:
         missing = "target_mass" if bodies.chaser_mass is not None else "chaser_mass"
-        key = missing if one else "equivalent_mass"
+        key = missing if has_any else "equivalent_mass"
         raise KeyProblem(("bodies", key), "nothing", either)
     if not 0.0 < bodies.mass < math.inf:
         allowed = "masses whose equivalent mass is a finite number > 0"
@@ -113,13 +114,19 @@ def _check_bodies(mechanism: Mechanism) -> None:
 def check_law(
     path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[Key]
 ) -> None:
-    """Check that a contact's keys are those of its law; `keys` are those of some laws alone, as this schema
-    calls them. Raise `KeyProblem`."""
+    """Check that a contact has the keys of its contact law. Raise `KeyProblem`.
+
+    Args:
+        path: path of the contact's table.
+        contact: the contact's struct.
+        uncertainties: the file's table `[uncertainty]`.
+        keys: keys that only some laws have, by their names in this schema.
+    """
     law = contact_law(contact.law)
     _check_depths(path, law, contact.depths)
-    listed = isinstance(contact, Contact)  # on one axis there is an entry for each successive contact
-    for i, entry in enumerate(contact.stiffness if listed else [contact.stiffness]):
-        where = (*path, "stiffness", *[i] * listed)
+    is_list = isinstance(contact, Contact)  # A one-axis file has one entry for each successive contact.
+    for i, entry in enumerate(contact.stiffness if is_list else [contact.stiffness]):
+        where = (*path, "stiffness", *[i] * is_list)
         if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
             allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
             raise KeyProblem(where, shown(entry), allowed)
@@ -132,7 +139,7 @@ def check_law(
 
 
 def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
-    """Check that the depths at which the slope changes are there if the law needs them, and in order."""
+    """Check that a segmented law has depths, and that they increase. Raise `KeyProblem`."""
     if law.segmented and not depths:
         allowed = f"a list of at least one depth (law {law.name} needs it)"
         raise KeyProblem((*path, "depths"), "no entries", allowed)
@@ -146,7 +153,7 @@ def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
 def _check_keys(
     path: Path, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[Key]
 ) -> None:
-    """Check that of the keys of some laws alone the contact has those of its law."""
+    """Check that, among the `keys` that only some laws have, the contact has those of its law."""
     for key in keys:
         value = getattr(contact, key.name)
         laws = laws_with(key)
@@ -165,13 +172,13 @@ def _check_keys(
 def is_damped(
     path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
 ) -> bool:
-    """Return whether the contact has damping, or what else is named, or may have some where it is drawn."""
+    """Return whether the key `by` of the contact is nonzero, or may be so in a random draw."""
     uncertain = uncertainties.get(".".join((*map(str, path), by)))
     return bool(np.any(getattr(contact, by))) or (uncertain is not None and uncertain.factor is None)
 
 
 def check_model(simulator: Any) -> None:
-    """The motion simulator's keys are those of its model, and it is stable. Raises `KeyProblem`."""
+    """Check that the motion simulator has the keys of its model and is stable. Raise `KeyProblem`."""
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
@@ -193,6 +200,7 @@ def check_model(simulator: Any) -> None:
 
 
 def _check_transfer_function(numerator: list[float], denominator: list[float]) -> None:
+    """Check that G(s) is strictly proper and stable, with G(0) = 1. Raise `KeyProblem`."""
     path = ("rig", "simulator")
     if len(numerator) >= len(denominator):
         found = f"degree {len(numerator) - 1} over degree {len(denominator) - 1}"
@@ -209,31 +217,33 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 
 
 def _check_hold(mechanism: Mechanism) -> None:
-    # The ideal simulator jumps between ticks and rests otherwise: damping would see no velocity.
+    """Check that a damped contact has a velocity to act on. Raise `KeyProblem`."""
+    # An ideal simulator with zero-order hold jumps at the ticks and has no velocity between them.
     rig, contact = mechanism.rig, mechanism.contact
-    law, given = contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
-    damped = (law.damped and is_damped(*given)) or is_damped(*given, "friction")
-    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped:
+    law, arguments = contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
+    dissipates = (law.damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
+    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
         allowed = '"linear" for an ideal simulator with contact damping (or another model)'
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
 
 
 def _extremes(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
-    """Return a function of a path and an end, 0 or 1: the least and the greatest value at the path.
+    """Return a function of a path and of 0 or 1 that gives the least or the greatest value at the path.
 
-    An unbounded distribution reaches every value, so that only the nominal one can be judged.
+    A normal distribution has no useful bounds; the function gives the nominal value instead.
     """
 
     def extreme(path: str, end: int) -> Any:
         uncertainty = mechanism.uncertainty.get(path)
-        drawn = uncertainty is not None and uncertainty.distribution != "normal"
-        return spans[path][end] if drawn else value_at(mechanism, path)
+        is_bounded = uncertainty is not None and uncertainty.distribution != "normal"
+        return spans[path][end] if is_bounded else value_at(mechanism, path)
 
     return extreme
 
 
 def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    # Drives that are slower than the approach have no steady state in which a run could begin.
+    """Check that the drives can follow the approach. Raise `KeyProblem`."""
+    # Drives that are slower than the approach have no steady state from which a run could start.
     extreme, path = _extremes(mechanism, spans), "rig.simulator.velocity_limit"
     fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
     if limit < fastest:
@@ -241,31 +251,32 @@ def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> No
 
 
 def velocity_limit_allowed(approach: float) -> str:
-    """Return what is allowed as velocity limit, in words, at an approach speed [m/s]."""
+    """Return the allowed velocity limits for an approach speed [m/s], in words."""
     return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
 
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T) with x_a behind by the motion
-    # simulator's delay and lag and the command's latency, and has to lie inside the gap.
+    """Check that the start of the approach lies between the two surfaces. Raise `KeyProblem`."""
+    # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T); x_a lags behind by the motion
+    # simulator's delay and lag and by the command latency.
     extreme = _extremes(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
     period = extreme("rig.control_period", 1)
-    behind = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period
-    behind += max(_greatest_lag(mechanism.rig.simulator, extreme), 0.0)
-    start = float(extreme("approach.velocity", 1) * (0.02 + period + behind))
+    delay = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period
+    delay += max(_greatest_lag(mechanism.rig.simulator, extreme), 0.0)
+    start = float(extreme("approach.velocity", 1) * (0.02 + period + delay))
     if clearance <= start:
         allowed = f"a clearance > {start:g}, v (0.02 s + T + the motion simulator's delay and lag): "
         raise KeyProblem(("contact", "clearance"), shown(clearance), allowed + "the start lies within it")
-    most = clearance - start
+    limit = clearance - start
     for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
-        if not abs(plane) < most:
-            allowed = f"a number > {-most:g} and < {most:g}, the clearance less what the start needs"
+        if not abs(plane) < limit:
+            allowed = f"a number > {-limit:g} and < {limit:g}, the clearance less what the start needs"
             raise KeyProblem(("rig", "contact_plane"), shown(plane), allowed)
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
-    """By how much [s] a motion simulator follows a uniform motion late, its delay apart: -G'(0)."""
+    """Return the greatest lag -G'(0) [s] of a motion simulator behind a uniform motion, without its delay."""
     path = "rig.simulator."
     if simulator.model == "first_order":
         return extreme(path + "time_constant", 1)
@@ -281,6 +292,7 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
 
 
 def _check_uncertainty(mechanism: Mechanism, path: str) -> Span:
+    """Return the least and greatest values of an uncertain key. Raise `KeyProblem` for invalid draws."""
     low, high = check_uncertainty(mechanism, path, numeric_keys(), FIXED)
     where, independent = ("uncertainty", path), mechanism.uncertainty[path].independent
     if path == "contact.depths" and independent and np.any(high[:-1] >= low[1:]):

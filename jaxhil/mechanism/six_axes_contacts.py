@@ -1,4 +1,4 @@
-"""Rules of the contacts of a mechanism file of six axes: which shapes can touch, and which keys they have."""
+"""Validation rules for contacts and latches of a six-axis mechanism file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from jaxhil.mechanism.six_axes import (
 
 __all__ = ["check_contact", "check_latch"]
 
-# Keys that each shape needs, and those that it may have.
+# Required keys and optional keys of each shape.
 KEYS_OF_SHAPES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "sphere": (("centre", "radius"), ("inside",)),
     "plane": (("point", "normal"), ()),
@@ -38,7 +38,10 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
-    """The contact's shapes can touch, and its keys are those of its shapes and laws. Raises `KeyProblem`."""
+    """Check the pair of shapes of a contact, and that it has the keys of its shapes and laws.
+
+    Raise `KeyProblem`.
+    """
     path: Path = ("contact", name)
     for body in ("chaser", "target"):
         _check_shape((*path, body), getattr(contact, body))
@@ -57,7 +60,7 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
-    """The latch has one spring, and what it is caught by. Raises `KeyProblem`."""
+    """Check that the latch has one spring and the conditions for catching. Raise `KeyProblem`."""
     path: Path = ("latch", name)
     if latch.latched and mechanism.approach is not None:
         allowed = "false: an approach is free until the first touch ([start] says where a latch holds)"
@@ -80,12 +83,13 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
 
 
 def _check_shape(path: Path, shape: Shape) -> None:
-    needed, more = KEYS_OF_SHAPES[shape.shape]
-    for key, value in _given(shape).items():
-        if key in needed and value is None:
+    """Check the keys of a shape. Raise `KeyProblem`."""
+    required, optional = KEYS_OF_SHAPES[shape.shape]
+    for key, value in _file_values(shape).items():
+        if key in required and value is None:
             allowed = f"{allowed_at(Shape, key)} ({shape.shape} needs it)"
             raise KeyProblem((*path, key), "nothing", allowed)
-        if key not in (*needed, *more) and value not in (None, False):
+        if key not in (*required, *optional) and value not in (None, False):
             raise KeyProblem((*path, key), shown(value), f"nothing ({shape.shape} does not use it: unset it)")
     if shape.shape == "plane" and not np.any(shape.normal):
         raise KeyProblem((*path, "normal"), shown(shape.normal), "a direction, outwards from the body")
@@ -107,26 +111,30 @@ def _check_shape(path: Path, shape: Shape) -> None:
 
 
 def _check_pair(path: Path, contact: Contact) -> None:
+    """Check that contact between the two shapes is supported and that they fit. Raise `KeyProblem`."""
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
         raise KeyProblem(
             (*path, "chaser", "shape"), "drogue", "a drogue on the target, where it opens along +z"
         )
-    balls = [one.shape == "sphere" and not one.inside for one in (chaser, target)]
-    if not any(balls) and not chaser.shape == target.shape == "capsule":
+    is_ball = [shape.shape == "sphere" and not shape.inside for shape in (chaser, target)]
+    if not any(is_ball) and not chaser.shape == target.shape == "capsule":
         found = f"{target.shape} against the chaser's {chaser.shape}"
         raise KeyProblem((*path, "target", "shape"), found, "a sphere on either body, or two capsules")
     if target.mouth_radius is not None and not chaser.radius:
         allowed = "a number > 0 m: a drogue with a mouth is a thin shell"
         raise KeyProblem((*path, "chaser", "radius"), shown(chaser.radius), allowed)
-    for body, ball, other in (("chaser", chaser, target), ("target", target, chaser)):
-        narrow = other.bottom_radius if other.shape == "drogue" else other.radius if other.inside else None
+    for body, ball, socket in (("chaser", chaser, target), ("target", target, chaser)):
+        narrow = (
+            socket.bottom_radius if socket.shape == "drogue" else socket.radius if socket.inside else None
+        )
         if narrow is not None and not (ball.radius or 0.0) < narrow:
             allowed = f"a number < {narrow:g} m, the radius that it is to fit into"
             raise KeyProblem((*path, body, "radius"), shown(ball.radius), allowed)
 
 
 def _check_friction(path: Path, friction: Friction) -> None:
+    """Check that the friction has the keys of its law. Raise `KeyProblem`."""
     for law, keys in KEYS_OF_FRICTION.items():
         for key in keys:
             value = getattr(friction, key)
@@ -136,7 +144,7 @@ def _check_friction(path: Path, friction: Friction) -> None:
                 raise KeyProblem((*path, key), shown(value), f"nothing ({friction.law} does not use it)")
 
 
-def _given(shape: Shape) -> dict[str, Any]:
-    """Every key but the shape's name, as the file calls it, with its value."""
+def _file_values(shape: Shape) -> dict[str, Any]:
+    """Return the values of all keys except `shape`, by their names in the file."""
     names = zip(shape.__struct_encode_fields__, shape.__struct_fields__, strict=True)
     return {key: getattr(shape, name) for key, name in names if name != "shape"}

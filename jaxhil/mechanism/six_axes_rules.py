@@ -1,7 +1,7 @@
-"""Rules of a mechanism file of six axes that join several keys: bodies, start, rig, what is uncertain.
+"""Validation rules for several keys of a six-axis mechanism file: bodies, start, rig and uncertainty.
 
-As in `jaxhil.mechanism.rules`, each raises a `KeyProblem` that names the key to change. Those of shapes and
-contact laws are in `jaxhil.mechanism.six_axes_contacts`.
+As in `jaxhil.mechanism.rules`, each rule raises a `KeyProblem` that names the key to change. Rules for shapes
+and contact laws are in `jaxhil.mechanism.six_axes_contacts`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 
 __all__ = ["check_legs", "check_named", "check_six_axes", "inertia_matrix"]
 
-LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
-MOMENTS = 1e-9  # by how much of itself a moment of inertia may exceed the sum of the others
-SLIMMEST = 1e-6  # of the largest moment of inertia, the smallest
-UNIT = 1e-6  # by how much a quaternion's norm may differ from 1
-# Keys of each kind of axes of the motion simulator: those it needs, and those it may have.
+LARGEST_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
+MOMENTS = 1e-9  # relative tolerance of the rule that no moment of inertia exceeds the sum of the others
+SLIMMEST = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia
+UNIT = 1e-6  # tolerance of a quaternion's norm, which is 1
+# Required and optional keys of each kind of axes of the motion simulator.
 KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "task": ((), ()),
     "stewart": (("base", "platform", "height"), ("stroke",)),
@@ -37,7 +37,7 @@ NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 
 def check_six_axes(mechanism: SixAxisMechanism) -> None:
-    """Every rule in turn; raises `KeyProblem` for the first one broken."""
+    """Check every rule. Raise `KeyProblem` for the first violation."""
     check_texts(mechanism)
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         _check_body(name, body)
@@ -60,20 +60,22 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
 
 
 def check_named(raw: Mapping[str, Any]) -> None:
-    """A raw table's contacts and latches have names. Raises `KeyProblem`."""
+    """Check that the contacts and latches of a raw table have names. Raise `KeyProblem`."""
     for key, kind in (("contact", Contact), ("latch", Latch)):
         table = raw.get(key)
-        given = table.items() if isinstance(table, Mapping) else ()
-        own = [name for name, value in given
-               if name in kind.__struct_fields__ and not isinstance(value, Mapping)]  # fmt: skip
-        if own:
-            found = f"a table without a name: {', '.join(own)}"
+        entries = table.items() if isinstance(table, Mapping) else ()
+        fields = [name for name, value in entries
+                  if name in kind.__struct_fields__ and not isinstance(value, Mapping)]  # fmt: skip
+        if fields:
+            found = f"a table without a name: {', '.join(fields)}"
             raise KeyProblem((key,), found, f"[{key}.NAME], each with a name of its own")
 
 
 def check_legs(raw: Mapping[str, Any]) -> None:
-    """Of a hexapod's legs a raw table speaks as legs: they are neither translations nor rotations. Raises
-    `KeyProblem`."""
+    """Check that a hexapod's values are given per leg, not for translation and rotation.
+
+    Raise `KeyProblem`.
+    """
     simulator = raw["rig"]["simulator"]
     for key in AXES:
         if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
@@ -82,12 +84,13 @@ def check_legs(raw: Mapping[str, Any]) -> None:
 
 
 def inertia_matrix(inertia: Inertia) -> np.ndarray:
-    """Three moments, or three rows, as a matrix (3, 3); drawn ones (..., 3) or (..., 3, 3) likewise."""
-    given = np.asarray(inertia, float)
-    return given if given.shape[-2:] == (3, 3) else given[..., None] * np.eye(3)
+    """Return inertia matrices (..., 3, 3) [kg m^2] from moments (..., 3) or from matrices."""
+    values = np.asarray(inertia, float)
+    return values if values.shape[-2:] == (3, 3) else values[..., None] * np.eye(3)
 
 
 def _check_body(name: str, body: RigidBody) -> None:
+    """Check the inertia and the interface rotation of a body. Raise `KeyProblem`."""
     _check_inertia((name, "inertia"), body.inertia)
     angle = float(np.linalg.norm(body.interface_rotation))
     if not angle < np.pi:
@@ -96,8 +99,11 @@ def _check_body(name: str, body: RigidBody) -> None:
 
 
 def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> None:
-    """Symmetric and positive definite, no principal moment more than the sum of the others; all 0 where it
-    may be `massless`."""
+    """Check that a rigid body can have the inertia, or that all entries are 0 if it may be `massless`.
+
+    Raise `KeyProblem` unless the matrix is symmetric and positive definite, and no principal moment exceeds
+    the sum of the others.
+    """
     if len({isinstance(entry, list) for entry in inertia}) > 1:
         raise KeyProblem(path, shown(inertia), "three moments, or three rows of three entries")
     matrix = inertia_matrix(inertia)
@@ -112,7 +118,7 @@ def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> N
             f"{matrix[row, column]:g} at row {row + 1}, column {column + 1}, {matrix[column, row]:g} there"
         )
         raise KeyProblem(path, found + " transposed", "a symmetric matrix")
-    first, second, third = (float(one) for one in np.linalg.eigvalsh(matrix / size) * size)
+    first, second, third = map(float, np.linalg.eigvalsh(matrix / size) * size)
     if not first > 0:
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
     if first < SLIMMEST * third:
@@ -125,6 +131,7 @@ def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> N
 
 
 def _check_start(mechanism: SixAxisMechanism) -> None:
+    """Check that there is a valid approach or a valid start, not both. Raise `KeyProblem`."""
     approach, start = mechanism.approach, mechanism.start
     if (approach is None) == (start is None):
         if start is None:
@@ -149,6 +156,7 @@ def _check_start(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_states(start: Start) -> None:
+    """Check that the attitudes at the start are unit quaternions. Raise `KeyProblem`."""
     for name, state in (("target", start.target), ("chaser", start.chaser)):
         norm = float(np.linalg.norm(state.attitude))
         if not abs(norm - 1) <= UNIT:
@@ -157,7 +165,7 @@ def _check_states(start: Start) -> None:
 
 
 def _check_sides(mechanism: SixAxisMechanism) -> None:
-    """Each body is on its side of the interface: else an axis was taken the wrong way round."""
+    """Check that each body is on its side of the interface, since a z axis is easily reversed by mistake."""
     for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
         axis = _turned(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
         along = float(axis @ np.asarray(body.interface))
@@ -168,7 +176,7 @@ def _check_sides(mechanism: SixAxisMechanism) -> None:
 
 
 def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
-    """exp(rotation) vector (Rodrigues)."""
+    """Rotate a vector by a rotation vector [rad] (Rodrigues' formula)."""
     turn = np.asarray(rotation, float)
     angle = float(np.linalg.norm(turn))
     if angle == 0:
@@ -179,14 +187,14 @@ def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
 
 
 def _check_space(simulator: Simulator) -> None:
-    """The keys are those of the kind of axes, and of the model."""
+    """Check that the motion simulator has the keys of its kind of axes and model. Raise `KeyProblem`."""
     path: Path = ("rig", "simulator")
-    needed, more = KEYS_OF_SPACES[simulator.space]
+    required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
         value = getattr(simulator, key)
-        if key in needed and value is None:
+        if key in required and value is None:
             raise KeyProblem((*path, key), "nothing", f'what space = "{simulator.space}" needs')
-        if key not in (*needed, *more) and value is not None:
+        if key not in (*required, *optional) and value is not None:
             found = "a table" if key == "target_robot" else shown(value)
             raise KeyProblem((*path, key), found, f'nothing (space = "{simulator.space}" does not use it)')
     if simulator.stroke is not None and not simulator.stroke[0] < simulator.stroke[1]:
@@ -201,24 +209,26 @@ def _check_space(simulator: Simulator) -> None:
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
-    # As on one axis: an ideal simulator that jumps has no velocity for a damper, or for friction.
+    """Check that a contact with damping or friction has a velocity to act on. Raise `KeyProblem`."""
+    # An ideal simulator with zero-order hold jumps at the ticks and has no velocity between them.
     rig = mechanism.rig
-    damped = any(contact.damping or contact.friction or contact.dry_friction
-                 for contact in mechanism.contact.values())  # fmt: skip
-    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and damped:
+    dissipates = any(contact.damping or contact.friction or contact.dry_friction
+                     for contact in mechanism.contact.values())  # fmt: skip
+    if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
         allowed = '"linear" for an ideal simulator with contact damping or friction (or another model)'
         raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
 
 
 def _check_sensor(rig: Rig) -> None:
+    """Check crosstalk, tool and position sensor against the force sensor's side. Raise `KeyProblem`."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     mixed = np.eye(6) + np.asarray(sensor.crosstalk)
     if not np.linalg.cond(mixed) < 100:
         found = "channels that are nearly the same"
         raise KeyProblem((*path, "crosstalk"), found, "entries of which 1 + E has a condition below 100")
     if sensor.side == "fixed":
-        for key, given in (("tool", sensor.tool), ("gravity", any(sensor.gravity) or None)):
-            if given is not None:
+        for key, entry in (("tool", sensor.tool), ("gravity", any(sensor.gravity) or None)):
+            if entry is not None:
                 value = "a table" if key == "tool" else shown(sensor.gravity)
                 allowed = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
                 raise KeyProblem((*path, key), value, allowed)
@@ -229,12 +239,13 @@ def _check_sensor(rig: Rig) -> None:
     if sensor.tool is None:
         raise KeyProblem((*path, "tool"), "nothing", 'a table with mass and com (side = "moving" needs it)')
     for key in ("inertia", "inertia_assumed"):
-        given = getattr(sensor.tool, key)
-        if given is not None:
-            _check_inertia((*path, "tool", key), given, massless=True)
+        entry = getattr(sensor.tool, key)
+        if entry is not None:
+            _check_inertia((*path, "tool", key), entry, massless=True)
 
 
 def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
+    """Check that all draws of an uncertain key are valid. Raise `KeyProblem`."""
     low, high = check_uncertainty(mechanism, path, numeric_keys_of(mechanism), FIXED)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:

@@ -1,11 +1,11 @@
-"""What a mechanism file says, as plain frozen structs.
+"""Content of a mechanism file as plain frozen structs.
 
-A `Mechanism` is one docking mechanism on one rig: the two bodies, how they approach, the contact,
-the rig (motion simulator, sensors, period), and how uncertain each number is. Every number is in SI
-units, natural frequencies in Hz. The type of a field carries its meaning, unit and range: the reader of
-files, the error messages and the truncation of random draws all take them from here.
+A `Mechanism` is one docking mechanism on one rig: the two bodies, their approach, the contact, the rig
+(motion simulator, sensors, control period), and the uncertainty of the numbers. All numbers are in SI units,
+natural frequencies in Hz. The type of a field contains its description, unit and range, which the reader of
+files, the messages and the truncation of random draws use.
 
-The structs themselves hold what they are given; `jaxhil.mechanism.file` reads and validates.
+The structs do not validate their fields; `jaxhil.mechanism.file` reads and validates.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-MAGNITUDES = 1e-100, 1e100  # of numbers other than 0: a product of three neither overflows nor vanishes
-PLAIN: Mapping[str, Any] = {}  # what a type without metadata says
+MAGNITUDES = 1e-100, 1e100  # limits of nonzero numbers; a product of three neither overflows nor underflows
+PLAIN: Mapping[str, Any] = {}  # metadata of a type without any
 
-# `jaxhil.register` enters further laws.
-Law = Annotated[str, Meta(description="which force the mechanism gives", extra={"one_of": LAWS})]
+# The type refers to the registry itself, because `jaxhil.register` adds laws later.
+Law = Annotated[str, Meta(description="contact law", extra={"one_of": LAWS})]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
 Distribution = Literal["uniform", "loguniform", "normal"]
 
-# Entries of lists. A number is finite unless its type says otherwise.
+# Types of the entries of lists. A number must be finite unless its metadata contains `infinite`.
 Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
-# What the descriptions of stiffness and damping say of laws with other units.
+# Parts of the descriptions of stiffness and damping, for laws with other units.
 STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
     law.name for law in LAWS.values() if law.stiffness_unit == "N/m^n"
 )
@@ -68,32 +68,34 @@ DAMPING_UNITS = "in s/m for {}, none for {}".format(
     " and ".join(law.name for law in LAWS.values() if law.damping_unit == "s/m"),
     " and ".join(law.name for law in LAWS.values() if law.dissipates_by),
 )
-Factor = Annotated[float, says("share of the nominal value", "1", gt=0.0)]
-Coefficient = Annotated[float, says("of the n-th power of s", "s^n", gt=0.0)]
+Factor = Annotated[float, says("factor on the nominal value", "1", gt=0.0)]
+Coefficient = Annotated[float, says("coefficient of the n-th power of s", "s^n", gt=0.0)]
 Polynomial = Annotated[
-    list[Annotated[float, says("of the n-th power of s", "s^n")]], Meta(min_length=1, max_length=21)
+    list[Annotated[float, says("coefficient of the n-th power of s", "s^n")]],
+    Meta(min_length=1, max_length=21),
 ]
 UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
 CorrelationRow = Annotated[
-    list[Annotated[float, says("of two keys' underlying normal numbers", "1", ge=-1.0, le=1.0)]],
+    list[Annotated[float, says("correlation of two keys' normal numbers", "1", ge=-1.0, le=1.0)]],
     Meta(min_length=1, max_length=100),
 ]
 
 
 def _only(value: float) -> Callable[[], list[float]]:
+    """Return a function that returns a list of one value."""
     return lambda: [value]
 
 
 class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The two free bodies: their equivalent mass, or both masses."""
+    """Masses of the two free bodies: their equivalent mass, or both masses."""
 
     equivalent_mass: Annotated[float, says("mass of the relative motion", "kg", gt=0.0)] | None = None
-    chaser_mass: Annotated[float, says("mass of the one body", "kg", gt=0.0)] | None = None
-    target_mass: Annotated[float, says("mass of the other body", "kg", gt=0.0)] | None = None
+    chaser_mass: Annotated[float, says("mass of the chaser", "kg", gt=0.0)] | None = None
+    target_mass: Annotated[float, says("mass of the target", "kg", gt=0.0)] | None = None
 
     @property
     def mass(self) -> float:
-        """Equivalent mass M = m1 m2 / (m1 + m2) [kg] of the relative motion."""
+        """Return the equivalent mass M = m1 m2 / (m1 + m2) [kg] of the relative motion."""
         if self.equivalent_mass is not None:
             return self.equivalent_mass
         if self.chaser_mass is None or self.target_mass is None:
@@ -102,13 +104,13 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the bodies meet."""
+    """Approach of the two bodies."""
 
     velocity: Annotated[float, says("speed of the first approach", "m/s", gt=0.0)]
-    contacts: Annotated[int, says("how many successive contacts a run makes", "1", ge=1, le=MAX_CONTACTS)] = 1
-    phase: Annotated[float, says("of the first contact within a control period", "1", ge=0.0, le=1.0)] = (
-        1.0 / 3.0
-    )
+    contacts: Annotated[int, says("number of successive contacts in a run", "1", ge=1, le=MAX_CONTACTS)] = 1
+    phase: Annotated[
+        float, says("phase of the first contact within a control period", "1", ge=0.0, le=1.0)
+    ] = 1.0 / 3.0
 
 
 class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -120,7 +122,7 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Meta(
             min_length=1,
             max_length=MAX_CONTACTS,
-            description=f"of each contact; {STIFFNESS_UNITS}",
+            description=f"stiffness of each contact; {STIFFNESS_UNITS}",
         ),
     ]
     damping: Annotated[
@@ -128,23 +130,23 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Meta(
             min_length=1,
             max_length=MAX_CONTACTS,
-            description=f"of each contact; {DAMPING_UNITS}",
+            description=f"damping of each contact; {DAMPING_UNITS}",
         ),
     ] = field(default_factory=_only(0.0))
     clearance: Annotated[
-        float, says("between two surfaces; infinite where there is one", "m", gt=0.0, infinite=True)
+        float, says("gap between two surfaces; infinite for one surface", "m", gt=0.0, infinite=True)
     ] = math.inf
 
 
-CONTACT = """The contact law and its parameters, one entry per successive contact; the last repeats.
+CONTACT = """Contact law and its parameters, with one entry per successive contact; the last entry repeats.
 
-For piecewise_linear `stiffness` has one list of slopes per contact, one slope more than there are depths.
+For piecewise_linear, `stiffness` has one list of slopes per contact, with one slope more than depths.
 """
 
 if TYPE_CHECKING:
 
     class Contact(ContactOfAnyLaw, frozen=True):
-        """The contact, with a field for each of `jaxhil.contact.laws.KEYS`."""
+        """Contact with a field for each of `jaxhil.contact.laws.KEYS`."""
 
         def __getattr__(self, key: str) -> Any: ...
 
@@ -162,12 +164,12 @@ else:
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The motion simulator, from commanded to actual position: G(s) exp(-s delay), and its limits."""
+    """Motion simulator G(s) exp(-s delay) from commanded to actual position, and its limits."""
 
-    model: Annotated[SimulatorModel, says("what G(s) is")]
-    natural_frequency: Annotated[float, says("of second_order", "Hz", gt=0.0)] | None = None
-    damping_ratio: Annotated[float, says("of second_order", "1", gt=0.0)] | None = None
-    time_constant: Annotated[float, says("of first_order", "s", ge=0.0)] | None = None
+    model: Annotated[SimulatorModel, says("form of G(s)")]
+    natural_frequency: Annotated[float, says("natural frequency of second_order", "Hz", gt=0.0)] | None = None
+    damping_ratio: Annotated[float, says("damping ratio of second_order", "1", gt=0.0)] | None = None
+    time_constant: Annotated[float, says("time constant of first_order", "s", ge=0.0)] | None = None
     coefficients: (
         Annotated[
             list[Coefficient],
@@ -175,44 +177,52 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         ]
         | None
     ) = None
-    numerator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
-    denominator: Annotated[Polynomial, Meta(description="of G(s), in descending powers of s")] | None = None
+    numerator: (
+        Annotated[Polynomial, Meta(description="numerator of G(s), in descending powers of s")] | None
+    ) = None
+    denominator: (
+        Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")] | None
+    ) = None
     delay: Annotated[float, says("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
-    velocity_limit: Annotated[float, says("of the position command", "m/s", gt=0.0, infinite=True)] = math.inf
-    acceleration_limit: Annotated[float, says("of the position command", "m/s^2", gt=0.0, infinite=True)] = (
+    velocity_limit: Annotated[
+        float, says("velocity limit of the position command", "m/s", gt=0.0, infinite=True)
+    ] = math.inf
+    acceleration_limit: Annotated[
+        float, says("acceleration limit of the position command", "m/s^2", gt=0.0, infinite=True)
+    ] = math.inf
+
+
+class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Force sensor: delay and lag, then noise and bias, quantum, dead zone and range."""
+
+    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    time_constant: Annotated[float, says("time constant of the reading's first-order lag", "s", ge=0.0)] = 0.0
+    noise_std: Annotated[float, says("standard deviation of white noise", "N", ge=0.0)] = 0.0
+    quantum: Annotated[float, says("step to whose multiples a reading is rounded", "N", ge=0.0)] = 0.0
+    dead_zone: Annotated[float, says("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
+    bias: Annotated[float, says("bias added to every reading", "N")] = 0.0
+    range: Annotated[float, says("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)] = (
         math.inf
     )
 
 
-class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The force sensor: delay and lag, then noise and bias, quantum, dead zone and range."""
-
-    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-    time_constant: Annotated[float, says("of the reading's first-order lag", "s", ge=0.0)] = 0.0
-    noise_std: Annotated[float, says("standard deviation of white noise", "N", ge=0.0)] = 0.0
-    quantum: Annotated[float, says("to multiples of which a reading is rounded", "N", ge=0.0)] = 0.0
-    dead_zone: Annotated[float, says("below which nothing is read", "N", ge=0.0)] = 0.0
-    bias: Annotated[float, says("added to every reading", "N")] = 0.0
-    range: Annotated[float, says("beyond which a reading saturates", "N", gt=0.0, infinite=True)] = math.inf
-
-
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The position sensor of the motion simulator."""
+    """Position sensor of the motion simulator."""
 
     delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     noise_std: Annotated[float, says("standard deviation of white noise", "m", ge=0.0)] = 0.0
-    quantum: Annotated[float, says("to multiples of which a reading is rounded", "m", ge=0.0)] = 0.0
+    quantum: Annotated[float, says("step to whose multiples a reading is rounded", "m", ge=0.0)] = 0.0
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The controller, the motion simulator, the sensors."""
+    """Rig: controller, motion simulator and sensors."""
 
     control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)]
-    integrator: Annotated[Integrator, says("of the numerical model")] = "semi_implicit_euler"
+    integrator: Annotated[Integrator, says("integrator of the numerical model")] = "semi_implicit_euler"
     command_latency: Annotated[int, says("periods until a command reaches the drives", "1", ge=0, le=1)] = 0
-    command_hold: Annotated[CommandHold, says("of the command within a period")] = "linear"
+    command_hold: Annotated[CommandHold, says("hold of the command within a period")] = "linear"
     contact_plane: Annotated[
-        float, says("where the hardware touches; the controller takes it to be at 0", "m")
+        float, says("position of the hardware's surface; the controller assumes 0", "m")
     ] = 0.0
     simulator: Annotated[Simulator, says("the motion simulator")]
     force_sensor: Annotated[ForceSensor, says("the force sensor")] = ForceSensor()
@@ -220,58 +230,61 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How one number varies: see `jaxhil.mechanism.uncertainty`."""
+    """Distribution of an uncertain number (`jaxhil.mechanism.uncertainty`)."""
 
-    distribution: Annotated[Distribution, says("how it is drawn")]
+    distribution: Annotated[Distribution, says("kind of distribution")]
     low: Annotated[float, says("least value, in the key's unit", "")] | None = None
     high: Annotated[float, says("greatest value, in the key's unit", "")] | None = None
     factor: (
-        Annotated[list[Factor], Meta(min_length=2, max_length=2, description="least and greatest")] | None
+        Annotated[
+            list[Factor],
+            Meta(min_length=2, max_length=2, description="least and greatest factor on the nominal value"),
+        ]
+        | None
     ) = None
     std: Annotated[float, says("standard deviation, in the key's unit", "", gt=0.0)] | None = None
-    independent: Annotated[bool, says("whether each entry of a list is drawn apart")] = False
+    independent: Annotated[bool, says("whether each entry of a list has a draw of its own")] = False
 
 
 class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which uncertain numbers vary together: each keeps its distribution, and the standard normal numbers
-    behind them are correlated (a Gaussian copula)."""
+    """Correlation of uncertain numbers by a Gaussian copula; each number keeps its distribution."""
 
     keys: Annotated[
-        list[UncertainKey], Meta(min_length=1, max_length=100, description="what varies together")
+        list[UncertainKey], Meta(min_length=1, max_length=100, description="keys that are correlated")
     ]
     matrix: Annotated[
         list[CorrelationRow],
-        Meta(min_length=1, max_length=100, description="lower triangle, a row for a key"),
+        Meta(min_length=1, max_length=100, description="lower triangle of the matrix, one row for each key"),
     ]
 
 
 class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One docking mechanism on one rig."""
+    """Docking mechanism on a rig."""
 
-    schema: Annotated[Literal["jaxhil/mechanism/1"], says("what kind of file it is")]
-    name: Annotated[str, says("what to call it", min_length=1, max_length=100)]
-    source: Annotated[str, says("where its numbers come from", max_length=10_000)] = "assumed"
+    schema: Annotated[Literal["jaxhil/mechanism/1"], says("kind of file")]
+    name: Annotated[str, says("name of the mechanism", min_length=1, max_length=100)]
+    source: Annotated[str, says("source of the numbers", max_length=10_000)] = "assumed"
     bodies: Annotated[Bodies, says("the two bodies")]
-    approach: Annotated[Approach, says("how they meet")]
+    approach: Annotated[Approach, says("approach of the bodies")]
     contact: Annotated[Contact, says("the contact")]
     rig: Annotated[Rig, says("the rig")]
-    uncertainty: Annotated[
-        dict[str, Uncertainty], says("how uncertain the number of each dotted path is")
-    ] = field(default_factory=dict)
-    correlation: Annotated[Correlation, says("which of these vary together")] | None = None
+    uncertainty: Annotated[dict[str, Uncertainty], says("uncertainty of the numbers, by dotted path")] = (
+        field(default_factory=dict)
+    )
+    correlation: Annotated[Correlation, says("correlation of the uncertain numbers")] | None = None
 
 
 class Range(NamedTuple):
-    """The allowed values of a number: the interval from low to high, each end in it or not; its unit."""
+    """Allowed values of a number."""
 
     low: float
     high: float
-    low_open: bool
-    high_open: bool
+    low_open: bool  # whether `low` itself is excluded
+    high_open: bool  # whether `high` itself is excluded
     unit: str = "1"
 
     def allows(self, value: float) -> bool:
-        """Whether `value` is in the interval; never for NaN."""
+        """Return whether `value` is in the interval; False for NaN."""
         above = value > self.low if self.low_open else value >= self.low
         below = value < self.high if self.high_open else value <= self.high
         return above and below
@@ -289,13 +302,12 @@ class Range(NamedTuple):
 
 
 def is_computable(value: float) -> bool:
-    """Whether arithmetic bears a number of an allowed range: its magnitude is in `MAGNITUDES`, or it is 0 or
-    infinite."""
+    """Return whether a number is 0, infinite, or of a magnitude within `MAGNITUDES`."""
     return value == 0.0 or math.isinf(value) or MAGNITUDES[0] <= abs(value) <= MAGNITUDES[1]
 
 
 def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: Mapping[str, Any]) -> Range:
-    """The allowed values that the type of a numeric field states, with what `says` put beside it."""
+    """Return the allowed values of a numeric field from its type and from the metadata `extra` of `says`."""
     low = kind.gt if kind.gt is not None else kind.ge
     high = kind.lt if kind.lt is not None else kind.le
     return Range(
@@ -309,7 +321,7 @@ def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: M
 
 @functools.cache
 def schema_type() -> msgspec.inspect.StructType:
-    """The description of `Mechanism` and all below it that readers of files walk along."""
+    """Return msgspec's description of the type `Mechanism`."""
     info = msgspec.inspect.type_info(Mechanism)
     assert isinstance(info, msgspec.inspect.StructType)
     return info
@@ -317,20 +329,22 @@ def schema_type() -> msgspec.inspect.StructType:
 
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
-    """Every key of real numbers by dotted path, and its allowed values (or its entries')."""
+    """Return the allowed values of every real-valued key (or of its list's entries), by dotted path."""
     return ranges_of(schema_type(), PLAIN)
 
 
 def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:
-    """Every key of real numbers below a struct, by dotted path; `names` are those of the tables that a
-    dictionary holds, by its path."""
+    """Return the allowed values of every real-valued key of a struct type, by dotted path.
+
+    `names` are the names of the tables in a dictionary, by the dictionary's path.
+    """
     keys: dict[str, Range] = {}
 
     def visit(kind: msgspec.inspect.Type, path: str, extra: Mapping[str, Any] = PLAIN) -> None:
         match kind:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
-                    if entry.name != "correlation":  # its numbers speak of other keys
+                    if entry.name != "correlation":  # its numbers describe other keys
                         visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or PLAIN)
@@ -352,12 +366,12 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
 
 
 def value_at(mechanism: Struct, path: str) -> Any:
-    """The value at a dotted path of keys, such as ``rig.simulator.delay``; None below a table that is not
-    there."""
-    return functools.reduce(_within, path.split("."), mechanism)
+    """Return the value at a dotted path such as ``rig.simulator.delay``, or None below a missing table."""
+    return functools.reduce(_entry, path.split("."), mechanism)
 
 
-def _within(table: Any, key: str) -> Any:
+def _entry(table: Any, key: str) -> Any:
+    """Return the value of a table's key, or None if the table or the dictionary's entry is missing."""
     if table is None:
         return None
     if isinstance(table, dict):

@@ -1,7 +1,7 @@
-"""A mechanism file to start from: the values of a mechanism, with every key that it could have besides, each
-with its meaning, unit, range and default, as the key's type states them.
+"""Text of a new mechanism file: the values of a mechanism, and every further key with its default.
 
-A key that is at its default stands in a comment (`#key = value`): the rest is what this mechanism needs.
+Each key has a comment with its description, unit and range. A key at its default is commented out
+(`#key = value`).
 """
 
 from __future__ import annotations
@@ -19,35 +19,36 @@ from jaxhil.mechanism.structs import Mechanism
 
 __all__ = ["commented"]
 
-WIDTH, COLUMN = 110, 36  # of lines, and where comments begin
+WIDTH, COLUMN = 110, 36  # length of lines, and column where comments begin
 HEAD = """\
-A mechanism file of jaxhil: one docking mechanism on one rig. Numbers are in SI units, natural frequencies
-in Hz. A line such as "#key = value" is a key at its default: take the "#" away to change it."""
+Mechanism file of jaxhil: one docking mechanism on one rig. Numbers are in SI units, natural frequencies
+in Hz. A line such as "#key = value" is a key at its default: remove the "#" to change it."""
 UNCERTAIN = """\
-What tuning and sweeps draw from: a line for any numeric key above, by its dotted path. On a list one draw
-scales the whole list, unless independent = true. uniform and loguniform take either factor, or low and
-high; normal takes std, and has the value above as its mean."""
+Distributions for tuning and sweeps: one line for any numeric key above, by its dotted path. One draw scales
+a whole list, unless independent = true. uniform and loguniform need either factor, or low and high; normal
+needs std, and its mean is the value above."""
 
 
 def commented(mechanism: Mechanism) -> str:
-    """The TOML text of a file that `jaxhil.mechanism.file.load` reads as an equal mechanism."""
+    """Return the TOML text of a file that `jaxhil.mechanism.file.load` reads as an equal mechanism."""
     values = msgspec.to_builtins(mechanism)
     lines = _comment(HEAD)
     for table in tables():
         if table.path.startswith("uncertainty."):
             lines += ["", "[uncertainty]", *_uncertainty(table, values["uncertainty"])]
             continue
-        found: Any = values
+        entries: Any = values
         for part in filter(None, table.path.split(".")):
-            found = (found or {}).get(part)
+            entries = (entries or {}).get(part)
         if table.path:
-            lines += ["", *_comment(table.meaning), f"{'' if found else '#'}[{table.path}]"]
+            lines += ["", *_comment(table.meaning), f"{'' if entries else '#'}[{table.path}]"]
         for key in table.keys:
-            lines += _lines(key, found or {})
+            lines += _lines(key, entries or {})
     return "\n".join(lines) + "\n"
 
 
 def _uncertainty(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the comment on the table ``[uncertainty]``, then one line for each entry."""
     yield from _comment(UNCERTAIN)
     for key in table.keys:
         yield from _wrapped(f"#   {key.name}", _described(key))
@@ -58,11 +59,12 @@ def _uncertainty(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> Iter
 
 
 def _lines(key: Key, values: Mapping[str, Any]) -> Iterator[str]:
+    """Return the lines of a key with its comment; a key at its default is commented out."""
     value = values.get(key.name)
-    stated = key.required or value != key.default
-    shown = value if stated else key.default
+    is_active = key.required or value != key.default
+    shown = value if is_active else key.default
     text = f"{key.name} = {'' if shown is None else _value(shown)}".rstrip()
-    return _wrapped(text if stated and shown is not None else f"#{text}", _described(key))
+    return _wrapped(text if is_active and shown is not None else f"#{text}", _described(key))
 
 
 def _described(key: Key) -> str:
@@ -70,7 +72,7 @@ def _described(key: Key) -> str:
 
 
 def _wrapped(text: str, comment: str) -> Iterator[str]:
-    """A key and its comment, on further lines what does not fit."""
+    """Yield a key with its comment, which continues on further lines if it is long."""
     column = max(COLUMN, len(text) + 2)
     column = column if column <= WIDTH // 2 else COLUMN
     parts = textwrap.wrap(comment, WIDTH - column - 2)
@@ -83,13 +85,14 @@ def _wrapped(text: str, comment: str) -> Iterator[str]:
 
 
 def _comment(text: str) -> list[str]:
+    """Return a text as comment lines."""
     return [f"# {part}" for line in text.splitlines() for part in textwrap.wrap(line, WIDTH - 2)]
 
 
 def _value(value: Any) -> str:
-    """A value as TOML writes it."""
+    """Return a value as TOML text."""
     if isinstance(value, str):
-        # JSON's escapes are TOML's, but for a surrogate and for DEL, which a mechanism's texts do not have.
+        # JSON and TOML differ only in surrogates and DEL, which the texts of a mechanism do not contain.
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -1,4 +1,4 @@
-"""TOML files of ours: bytes within bounds, then a table; whatever is wrong is one line."""
+"""Reading of TOML files with limits on size and nesting; errors are messages of one line."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ __all__ = ["parse_toml", "read_bytes"]
 MAX_BYTES = 1 << 20
 MAX_KEY_PARTS = 64
 
-# The pieces of a TOML text that matter for where a dotted key begins and ends. An unclosed string
-# is taken to where it would have to end, so that the scan stays linear.
+# Tokens of a TOML text that delimit dotted keys. An unclosed string extends to where it would have to end, so
+# that the scan takes linear time.
 _TOKENS = re.compile(
     r'(?P<long>"""(?:[^"\\]|\\.|"(?!""))*(?:""")?' + r"|'''(?:[^']|'(?!''))*(?:''')?)"
     r"|(?P<part>\"(?:[^\"\\\n]|\\[^\n])*\"?|'[^'\n]*'?|[A-Za-z0-9_-]+)"
@@ -26,7 +26,10 @@ _TOKENS = re.compile(
 
 
 def read_bytes(path: Path, label: str, what: str) -> bytes:
-    """The bytes of a file that says `what`, "a mechanism" say. Raises FileNotFoundError, or `InputError`."""
+    """Read a file; `what` names its content in messages, for example "a mechanism".
+
+    Raise FileNotFoundError, or `InputError` for any other problem.
+    """
     try:
         with open_input(path) as file:
             data = file.read(MAX_BYTES + 1)
@@ -43,11 +46,11 @@ def read_bytes(path: Path, label: str, what: str) -> bytes:
 
 
 def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
-    """The table of a file's bytes, which say `what`. Raises `InputError`."""
+    """Return the table of a file's bytes; `what` names its content in messages. Raise `InputError`."""
     if not data.strip():
         raise InputError(f"{label}: found an empty file, allowed {what} in TOML")
     try:
-        # Some editors put a byte-order mark in front.
+        # Some editors write a byte-order mark at the start.
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
@@ -61,13 +64,13 @@ def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{label}: found values nested too deeply, allowed plain TOML") from None
     except ValueError as error:
-        # Also an integer of thousands of digits, which is no TOMLDecodeError.
+        # An integer of thousands of digits raises a ValueError that is no TOMLDecodeError.
         reason = one_line(str(error).split(";")[0], 120)
         raise InputError(f"{label}: not valid TOML: {reason}") from None
 
 
 def _longest_key(text: str) -> int:
-    """The number of parts of the longest run ``a.b.c`` outside comments and long strings."""
+    """Return the number of parts of the longest dotted key, outside comments and multi-line strings."""
     longest = parts = 0
     joined = False
     for token in _TOKENS.finditer(text):

@@ -1,21 +1,22 @@
-"""Random values of a mechanism's uncertain numbers, from its ``[uncertainty]`` table.
+"""Random draws of a mechanism's uncertain numbers, from its ``[uncertainty]`` table.
 
-Each number has a distribution around or beside its nominal value m:
+Each number has a distribution; m is its nominal value:
 
 - ``uniform``, ``loguniform``: between ``low`` and ``high``, or ``factor[0] m`` and ``factor[1] m``;
 - ``normal``: mean m and standard deviation ``std`` of the underlying normal distribution, truncated
   to the values allowed for that key.
 
-On a list one draw scales all of it: by the factor drawn, or, for values in the number's own unit,
-by the draw for the first entry over that entry (when all entries are equal the draw is their
-common value). With ``independent = true`` every entry has a draw of its own. The phase of each
-contact within a control period is drawn as well, each contact its own, uniform on 0..1 unless the
-table says otherwise: the phase alone moves the restitution, and nobody controls it. In six axes it is that
-of the first touch, and there is none where the start is stated.
+One draw scales a whole list: by the drawn factor, or, for a distribution in the number's unit, by the ratio
+of the draw to the first entry (if all entries are equal, the draw is their common value). With
+``independent = true`` every entry has a draw of its own. The phase of each contact within a control period is
+drawn as well, separately for each contact, uniform on 0..1 unless the table has an entry for it: the phase
+changes the restitution, and nobody controls it. With six axes it is the phase of the first touch, and is not
+drawn if the file has a ``[start]``.
 
-Draw number i depends on the seed, on i, on its own entry of the table, and on the keys that ``[correlation]``
-names before it (`jaxhil.mechanism.correlation`): neither on how many draws are made at once, nor on the other
-uncertain numbers, nor (for phases) on the number of contacts. Needs NumPy and SciPy, not jax.
+Draw number i depends on the seed, on i, on its entry of the table, and on the keys that precede it in
+``[correlation]`` (`jaxhil.mechanism.correlation`). It depends neither on the number of draws made at once,
+nor on the other uncertain numbers, nor (for phases) on the number of contacts. The module needs NumPy and
+SciPy, not JAX.
 """
 
 from __future__ import annotations
@@ -36,20 +37,20 @@ __all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quantiles", 
 AnyMechanism = Mechanism | SixAxisMechanism
 
 PHASE = "approach.phase"
-BLOCK = 1024
+BLOCK = 1024  # number of draws from one generator
 
-_TINY = 2.0**-54
-_LARGEST = 1.0 - 2.0**-53  # of a generator's uniform numbers
+_TINY = 2.0**-54  # replaces a uniform number of 0
+_LARGEST = 1.0 - 2.0**-53  # largest uniform number of a generator
 _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
 def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
-    """Draws `first` to `first + number - 1` of every uncertain number of a valid mechanism.
+    """Return the draws `first` to `first + number - 1` of every uncertain number of a valid mechanism.
 
-    Returns by dotted path an array of shape ``(number,)`` for a number, ``(number, *entries)`` for
-    a list, and on one axis ``(number, contacts)`` for ``approach.phase``, which is always there; units of
-    the key. Uniform numbers come from a Philox generator per key and block of 1024 draws, and go
-    through the inverse of the distribution function. Raises ValueError for a negative argument.
+    The result has by dotted path an array (number,) for a number, (number, *entries) for a list, and with one
+    axis always (number, contacts) for ``approach.phase``, in the units of the keys. Uniform numbers come from
+    a Philox generator per key and block of 1024 draws; the quantile function of the distribution converts
+    them. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, allowed >= 0")
@@ -59,13 +60,13 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
 
 
 def quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
-    """Like `draw`, with the uniform numbers of a scrambled Sobol sequence, one point per draw.
+    """Return draws as `draw` does, from a scrambled Sobol sequence with one point per draw.
 
-    The points fill the box of all uncertain numbers more evenly than random ones; best for a power
-    of two. Sobol 1967, scrambled as in `scipy.stats.qmc.Sobol`. Raises ValueError for a negative
-    argument, or when all uncertain entries together are more than 21201.
+    The points fill the unit box of all uncertain numbers more evenly than random ones, best if `number` is a
+    power of two (Sobol 1967; scrambled as in `scipy.stats.qmc.Sobol`). Raise ValueError for a negative
+    argument, or for more than 21201 uncertain entries.
     """
-    # Takes most of a second to import, and only this function needs it.
+    # The import takes most of a second, and only this function needs it.
     from scipy.stats import qmc
 
     if number < 0 or seed < 0:
@@ -77,27 +78,27 @@ def quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, n
 
 
 def at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """The draws that belong to points of the unit box, (number, sum of `dimensions`), as `draw` returns them.
+    """Return the draws for points of the unit box, (number, sum of `dimensions`), as `draw` does.
 
-    Coordinates that vary together are made to, and each goes through the inverse of its distribution
-    function; 0 stands for the least draw.
+    The coordinates are correlated as the mechanism states, then converted by the quantile function of each
+    key; 0 gives the least draw.
     """
     return _values(mechanism, correlated(mechanism, _by_key(mechanism, points)))
 
 
 def quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Like `at_points`, each key by itself: its quantile at its coordinates, whatever it varies with."""
+    """Return each key's quantiles at points of the unit box, as `at_points` but without correlation."""
     return _values(mechanism, _by_key(mechanism, points))
 
 
 def extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
-    """Every uncertain number at one end of what can be drawn, then at the other, whatever it varies with."""
+    """Return every uncertain number at both ends of its distribution, without correlation: (2, ...)."""
     ends = np.array([[0.0], [_LARGEST]])
     return quantiles(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
 
 
 def dimensions(mechanism: AnyMechanism) -> dict[str, int]:
-    """How many uniform numbers each key takes: sorted by path, the phases last."""
+    """Return the number of uniform numbers for each key, sorted by path with the phases last."""
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE}):
         independent = mechanism.uncertainty[path].independent
@@ -110,38 +111,40 @@ def dimensions(mechanism: AnyMechanism) -> dict[str, int]:
 
 
 def _by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Split points of the unit box into the columns of each key."""
     columns = dimensions(mechanism)
     edges = np.cumsum(list(columns.values()))[:-1]
     return dict(zip(columns, np.split(points, edges, axis=1), strict=True))
 
 
 def _uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:
-    """Uniform numbers, shape (number, count), rows `first` on of an endless table of this path."""
+    """Return uniform numbers (number, count): the rows from `first` on of an infinite table for this path."""
     start = first // BLOCK
     blocks = [np.empty((0, count))]
     philox = np.random.Philox(key=0)
     fresh: Any = philox.state
     for block in range(start, math.ceil((first + number) / BLOCK)):
         digest = hashlib.sha256(f"{seed} {block} {path}".encode()).digest()
-        # As a new generator with this key, which would ask the system for a seed first.
+        # Setting the key of one generator is faster than a new one, which asks the system for a seed.
         fresh["state"]["key"] = np.frombuffer(digest[:16], "<u8")
         philox.state = fresh
-        # Column by column, so that further columns leave the first ones as they are.
+        # Numbers fill column by column, so that the first columns do not depend on `count`.
         blocks.append(np.random.Generator(philox).random((count, BLOCK)).T)
     skipped = first - start * BLOCK
     return np.concatenate(blocks)[skipped : skipped + number]
 
 
 def _values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    one_axis = isinstance(mechanism, Mechanism)
-    ranges = numeric_keys() if one_axis else numeric_keys_of(mechanism)
+    """Return the values of every key from its uniform numbers."""
+    has_one_axis = isinstance(mechanism, Mechanism)
+    ranges = numeric_keys() if has_one_axis else numeric_keys_of(mechanism)
     return {
         path: _key_values(
             np.asarray(value_at(mechanism, path), dtype=float),
             mechanism.uncertainty.get(path, _UNIFORM_PHASE),
             ranges[path],
             numbers,
-            one_axis and path == PHASE,
+            has_one_axis and path == PHASE,
         )
         for path, numbers in uniform.items()
     }
@@ -154,9 +157,9 @@ def _key_values(
     uniform: np.ndarray,
     per_contact: bool,
 ) -> np.ndarray:
-    """The values of one key from its uniform numbers, shape (number, columns)."""
+    """Return the values of one key from its uniform numbers (number, columns)."""
     number = uniform.shape[0]
-    # Zero would be outside an open range.
+    # The quantile at 0 would be outside an open range.
     uniform = np.maximum(uniform, _TINY)
     if per_contact:
         return _quantile(uncertainty, nominal, allowed)(uniform)
@@ -178,7 +181,7 @@ def _key_values(
 def _quantile(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The inverse distribution function, of uniform numbers that broadcast against `nominal`."""
+    """Return the quantile function, for uniform numbers that broadcast against `nominal`."""
     if uncertainty.distribution == "normal":
         assert uncertainty.std is not None
         return _truncated_normal(nominal, uncertainty.std, allowed)
@@ -195,9 +198,9 @@ def _quantile(
 
 
 def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[[np.ndarray], np.ndarray]:
-    """Quantile mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), a and b the standardised ends.
+    """Return the quantile mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))) with the standardised ends a and b.
 
-    Accurate since the mean is an allowed value, so that neither end is far in the other's tail.
+    It is accurate because the mean is an allowed value, so that the ends are not in the same tail.
     """
     from scipy import special  # takes long to import, and most files need none
 
@@ -206,7 +209,7 @@ def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[
         above = special.ndtr((allowed.high - mean) / std)
     least = math.nextafter(allowed.low, math.inf) if allowed.low_open else allowed.low
     greatest = math.nextafter(allowed.high, -math.inf) if allowed.high_open else allowed.high
-    # A key that may be infinite still has no infinite draws.
+    # Draws are finite even if the key may be infinite.
     greatest = min(greatest, float(np.finfo(float).max))
 
     def quantile(uniform: np.ndarray) -> np.ndarray:
