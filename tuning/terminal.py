@@ -1,4 +1,4 @@
-"""What commands print: tables and JSON on standard output, progress and notes on standard error."""
+"""Output of the commands: tables and JSON on standard output, progress and notes on standard error."""
 
 import json
 import math
@@ -19,14 +19,14 @@ from rich.text import Text
 
 from jaxhil.errors import InputError, one_line
 
-WIDTH = 110  # where there is no terminal to ask
-SECONDS_BETWEEN_LINES = 10.0  # where there is no terminal for a bar
-SECONDS_OF_SILENCE = 20.0  # after which the last line is said again, with the time left by then
-KNOWN_FROM = 0.05  # share of the work that has to be done before a rate is known
+WIDTH = 110  # width of lines without a terminal
+SECONDS_BETWEEN_LINES = 10.0  # time between lines of progress without a terminal
+SECONDS_OF_SILENCE = 20.0  # time after which the last line is repeated, with the current time left
+KNOWN_FROM = 0.05  # share of the work after which a rate is shown
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
-    """Print on standard output, long texts on several lines. A reader that has gone away is no error."""
+    """Print on standard output and wrap long texts. A closed pipe is no error."""
     with _writing_output():
         for thing in things:
             console = _console(sys.stdout)
@@ -37,29 +37,29 @@ def emit(*things: RenderableType, wrap: bool = True) -> None:
 
 
 def emit_line(text: str) -> None:
-    """Print one line on standard output, however long it is."""
+    """Print one line on standard output, without wrapping."""
     emit(text, wrap=False)
 
 
 def emit_json(document: Mapping[str, Any]) -> None:
-    """Print one JSON document, as `as_json` has it."""
+    """Print one JSON document in the form of `as_json`."""
     with _writing_output():
         print(as_json(document), end="", flush=True)
 
 
 def as_json(document: Mapping[str, Any]) -> str:
-    """A document as lines of JSON, in ASCII; what is not finite as null."""
+    """Return a document as lines of JSON in ASCII, with null for numbers that are not finite."""
     return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
 
 
 def warn(texts: Iterable[str]) -> None:
-    """Say on standard error what may be wrong, a line each."""
+    """Print warnings on standard error, one line each."""
     for text in texts:
         note(f"warning: {text}")
 
 
 def note(text: str) -> None:
-    """Say something on standard error; the work goes on where that cannot be written."""
+    """Print a text on standard error; the work continues if this fails."""
     try:
         _console(sys.stderr).print(text, soft_wrap=True)
     except OSError:
@@ -69,38 +69,40 @@ def note(text: str) -> None:
 def table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
-    """A table; columns whose number is in `texts` hold text, the others numbers."""
-    # In one line, also above a narrow table.
+    """Return a table; columns whose number is in `texts` contain text, the others numbers."""
+    # The title is one line, also above a narrow table.
     heading = Text(title, style="bold", no_wrap=True, overflow="ignore")
-    made = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    result = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(headings):
-        text = number in texts
-        made.add_column(heading, justify="left" if text else "right", overflow="fold", no_wrap=not text)
+        is_text = number in texts
+        result.add_column(
+            heading, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text
+        )
     for row in rows:
-        made.add_row(*(value if isinstance(value, str) else figure(value) for value in row))
-    return made
+        result.add_row(*(value if isinstance(value, str) else figure(value) for value in row))
+    return result
 
 
 def figure(value: Any, digits: int = 4) -> str:
-    """A number in `digits` significant digits; a dash for none."""
+    """Return a number as text with `digits` significant digits, or a dash for none."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def signed(value: float | None) -> str:
-    """A restitution error with its sign; a dash for none."""
+    """Return a restitution error as text with its sign, or a dash for none."""
     return "-" if value is None or value != value else f"{value:+.4f}"
 
 
 def ratio(value: float, ideal: float) -> str:
-    """Return a number over that of the ideal contact, in three decimals; a dash where there is none."""
-    found = value / ideal if ideal else math.nan
-    return f"{found:.3f}" if math.isfinite(found) and math.isfinite(ideal) else "-"
+    """Return a value relative to that of the ideal contact as text with three decimals, or a dash."""
+    quotient = value / ideal if ideal else math.nan
+    return f"{quotient:.3f}" if math.isfinite(quotient) and math.isfinite(ideal) else "-"
 
 
 def finite(value: Any) -> Any:
-    """Mappings, lists, named tuples and numbers, NumPy's as Python's, with None for what is not finite."""
+    """Convert a value to plain data for JSON, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): finite(entry) for key, entry in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -113,9 +115,11 @@ def finite(value: Any) -> Any:
 
 
 class Progress:
-    """How far a known amount of work is, shown on standard error, unless `quiet`: what is done, the rate, the
-    time left, what is going on. A bar on a terminal; elsewhere a line when something else begins, and now and
-    then."""
+    """Display of the progress of a known amount of work on standard error.
+
+    It shows the work done, the rate, the time left and the current activity: by a bar on a terminal, else by
+    a line at regular intervals and when the activity changes, unless `quiet`.
+    """
 
     def __init__(self, total: float, unit: str, bar: rich.progress.Progress | None, quiet: bool):
         self._total, self._unit, self._bar = total, unit, bar
@@ -127,61 +131,63 @@ class Progress:
 
     @property
     def rate(self) -> float | None:
-        """Units per second, of those that were worked on."""
-        worked, took = self._done - self._skipped, time.monotonic() - self._begun
-        return worked / took if worked > 0 and took > 0 else None
+        """Return the rate in units per second, without skipped units; None if it is unknown."""
+        worked, duration = self._done - self._skipped, time.monotonic() - self._begun
+        return worked / duration if worked > 0 and duration > 0 else None
 
     def skip(self, number: float) -> None:
-        """So many units were done before."""
+        """Count units that were done before."""
         self._done += number
         self._skipped += number
         self._begun = time.monotonic()
 
     def advance(self, number: float, text: str | None = None) -> None:
-        """So many units more are done; `text` says what is known by now."""
+        """Count further units as done; `text` replaces the current activity or result."""
         self.reach(self._done + number, text)
 
     def reach(self, done: float, text: str | None = None) -> None:
-        """So many units are done in all."""
+        """Set the total number of units done."""
         with self._lock:
             self._done = max(self._done, done)
             self._text = self._text if text is None else text
             self._show(due=SECONDS_BETWEEN_LINES)
 
     def say(self, text: str) -> None:
-        """What is going on."""
+        """Show the current activity."""
         with self._lock:
-            new, self._text = text != self._text, text
-            self._show(due=0.0 if new else SECONDS_BETWEEN_LINES)
+            is_new, self._text = text != self._text, text
+            self._show(due=0.0 if is_new else SECONDS_BETWEEN_LINES)
 
     def tell(self, text: str, done: float, skipped: float = 0.0) -> None:
-        """What is going on, how many units are done in all, and how many of those were done before."""
+        """Show the current activity, and set the total units done and the units done before."""
         with self._lock:
             self._done, self._skipped = max(self._done, done), skipped
             self.say(text)
 
     def begin(self, text: str) -> None:
-        """The unit before, if any, is done and `text` begins."""
+        """Count the previous unit, if any, as done, and show that `text` begins."""
         with self._lock:
             self._end_unit()
             self.say(text)
 
     def turn_to(self, text: str) -> None:
-        """Like `begin`, for what may be over at once: without a bar it is said only if it takes long."""
+        """Begin a unit that may be short: without a bar its `text` is shown only if it takes long."""
         with self._lock:
             self._end_unit()
             self.reach(self._done, text)
 
     def remind(self) -> None:
-        """Say again how far it is, if nothing was said for long."""
+        """Repeat the last line, with the current progress, if nothing was shown for long."""
         with self._lock:
             self._show(due=SECONDS_OF_SILENCE)
 
     def _end_unit(self) -> None:
+        """Count the previous unit, if any, as done."""
         self._done += self._begun_stage
         self._begun_stage = True
 
     def _show(self, due: float) -> None:
+        """Update the bar, or print a line if the last one is at least `due` seconds old."""
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, description=self._text, pace=self._pace())
         elif time.monotonic() - self._shown >= due and (self._done < self._total or due == 0.0):
@@ -189,6 +195,7 @@ class Progress:
             self._note(", ".join(filter(None, [self._how_far(), self._pace(), self._text])))
 
     def _how_far(self) -> str:
+        """Return the work done as text."""
         if self._done <= 0:
             return ""
         if self._total == 1:
@@ -196,48 +203,51 @@ class Progress:
         return f"{math.floor(self._done)} of {self._total} {self._unit}"
 
     def _pace(self) -> str:
+        """Return the rate and the time left as text, or the time so far."""
         if (rate := self.rate) is None or self._done < KNOWN_FROM * self._total:
             return f"{_span(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
-        # Of a single thing it is the share whose rate says something.
+        # For a single unit the rate is shown in percent.
         scale, unit = (100.0, " %") if self._total == 1 else (1.0, f" {self._unit}")
         hourly = 3600 * scale * rate
-        over, per = next((one for one in ((3600, "s"), (60, "min")) if hourly >= one[0]), (1, "h"))
-        return f"{figure(hourly / over, 3)}{unit}/{per}, {_span(left)} left"
+        divisor, per = next((pair for pair in ((3600, "s"), (60, "min")) if hourly >= pair[0]), (1, "h"))
+        return f"{figure(hourly / divisor, 3)}{unit}/{per}, {_span(left)} left"
 
 
 @contextmanager
 def progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
-    """A bar on a terminal, a plain line now and then elsewhere; nothing if it is not to be shown."""
-    with _bar(shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _State()) as bar:
-        made = Progress(total, unit, bar, quiet=not shown)
-        over = threading.Event()
+    """Display progress by a bar on a terminal, else by lines at intervals; not at all unless `shown`."""
+    with _bar(
+        shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _ActivityColumn()
+    ) as bar:
+        display = Progress(total, unit, bar, quiet=not shown)
+        stop = threading.Event()
 
         def remind() -> None:
-            while not over.wait(SECONDS_BETWEEN_LINES):
-                made.remind()
+            while not stop.wait(SECONDS_BETWEEN_LINES):
+                display.remind()
 
-        reminding = threading.Thread(target=remind, daemon=True)
+        thread = threading.Thread(target=remind, daemon=True)
         if shown and bar is None:
-            reminding.start()
+            thread.start()
         try:
-            yield made
+            yield display
         finally:
-            over.set()
-            if reminding.is_alive():
-                reminding.join()
+            stop.set()
+            if thread.is_alive():
+                thread.join()
 
 
 def stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
-    """Progress through so many stages."""
+    """Display progress through `total` stages."""
     return progress(total, "stages", shown)
 
 
-class _State(TextColumn):
-    """Pace and what is going on. On a narrow terminal their end is cut, and nothing else."""
+class _ActivityColumn(TextColumn):
+    """Column with rate and current activity, the only one that a narrow terminal truncates."""
 
     def __init__(self) -> None:
-        # In the eyes of the table it can be wrapped, so it is the column that gives way.
+        # The table narrows this column first, because it believes that the column can be wrapped.
         super().__init__("{task.fields[pace]}  {task.description}", markup=False, table_column=Column())
 
     def render(self, task: rich.progress.Task) -> Text:
@@ -248,7 +258,7 @@ class _State(TextColumn):
 
 @contextmanager
 def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
-    """A bar if it is to be shown and there is a terminal, else none."""
+    """Display a bar if it is `shown` and there is a terminal; else yield None."""
     console = _console(sys.stderr)
     if not shown or not console.is_terminal:
         yield None
@@ -258,13 +268,15 @@ def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.p
 
 
 def _fitted(table: Table, console: Console) -> int:
-    """The width at which a table loses no digit and breaks no word, at least the terminal's. Where that is
-    narrow its headings take a line a word; what is wider even so is for the terminal to wrap."""
+    """Return the width, at least the terminal's, at which a table truncates no digit and breaks no word.
 
-    def natural() -> int:
+    If the terminal is too narrow, each heading has one word per line; the terminal wraps what is still wider.
+    """
+
+    def full_width() -> int:
         return console.measure(table, options=console.options.update(max_width=10_000)).maximum
 
-    if natural() <= console.width:
+    if full_width() <= console.width:
         return console.width
     table.padding, broken = 0, 0
     for column in table.columns:
@@ -273,21 +285,25 @@ def _fitted(table: Table, console: Console) -> int:
         if not column.no_wrap:
             words = [word for text in (*cells, column.header) for word in text.split()]
             broken += max(map(len, cells), default=0) - max(map(len, words), default=0)
-    return max(console.width, natural() - max(broken, 0))
+    return max(console.width, full_width() - max(broken, 0))
 
 
 def _span(seconds: float) -> str:
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    """Return a duration as text, h:mm:ss."""
+    rounded = round(seconds)
+    return f"{rounded // 3600}:{rounded // 60 % 60:02d}:{rounded % 60:02d}"
 
 
 class _Console(Console):
+    """Console on which a closed pipe is no error."""
+
     def on_broken_pipe(self) -> None:
         _detach(self.file)
 
 
 def _console(stream) -> Console:
-    # Names come from files: they are text, never markup.
+    """Return a console for a stream."""
+    # Names come from files, so that they must not be interpreted as markup.
     console = _Console(file=stream, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
         console.width = WIDTH
@@ -296,7 +312,7 @@ def _console(stream) -> Console:
 
 @contextmanager
 def _writing_output() -> Iterator[None]:
-    """Raise `InputError` if standard output cannot be written; a reader that has gone away is no error."""
+    """Raise `InputError` if standard output cannot be written; a closed pipe is no error."""
     try:
         yield
     except BrokenPipeError:
@@ -308,10 +324,10 @@ def _writing_output() -> Iterator[None]:
 
 
 def _detach(stream: Any) -> None:
-    """Let what is still printed go nowhere: the exit code remains the verdict."""
+    """Redirect further output of a stream to the null device, so that the exit code does not change."""
     try:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
     except (OSError, ValueError):
         pass

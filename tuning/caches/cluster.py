@@ -1,7 +1,7 @@
-"""Pieces of work handed to the workers of a dask.distributed cluster (`tuning.caches.worker`).
+"""Distribution of work units ("pieces") to the workers of a dask.distributed cluster.
 
-A worker that dies costs the time of the pieces that it had. A piece of which several died, and any piece
-while there are no workers, is computed here.
+If a worker dies, its pieces are computed again. A piece that several workers died of, and any piece while
+there are no workers, is computed in this process. `tuning.caches.worker` is the workers' side.
 """
 
 import asyncio
@@ -18,30 +18,30 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, one_line, shown
 from tuning.caches.worker import Setting, run
 
-WAIT = 10  # s for a scheduler to answer
-PATIENCE = 20.0  # s without a piece done, after which it is asked whether there are workers
-RECOUNT = 2.0  # s, after which it is asked how many there are
-EACH = 2  # pieces under way per worker
+WAIT = 10  # s; limit on the time in which a scheduler must answer
+PATIENCE = 20.0  # s without a finished piece, after which the workers are counted again
+RECOUNT = 2.0  # s; time between counts of the workers
+EACH = 2  # number of submitted pieces per worker
 
 
 class Piece(NamedTuple):
-    """Something to compute."""
+    """Work unit."""
 
-    name: Any  # one of its own
-    arguments: tuple[Any, ...]  # of the function
+    name: Any  # unique name
+    arguments: tuple[Any, ...]  # arguments of the function
 
 
 def on_workers(
     address: str, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
 ) -> Generator[tuple[Any, Any], None, None]:
-    """`Workers.run` of those of the scheduler at this address."""
+    """Call `Workers.run` with the workers of the scheduler at this address."""
     with connected(address) as workers:
         yield from workers.run(function, pieces, setting, what)
 
 
 @contextmanager
 def connected(address: str) -> Iterator["Workers"]:
-    """The workers of the scheduler at this address. Raises `InputError`, one line, where there is none."""
+    """Connect to the workers of the scheduler at this address. Raise `InputError` if there is none."""
     with ExitStack() as stack:
         try:
             import distributed  # pyright: ignore[reportMissingImports]
@@ -50,7 +50,7 @@ def connected(address: str) -> Iterator["Workers"]:
             raise InputError(f"--scheduler: found {missing}") from None
         stack.enter_context(_quiet())
         try:
-            with ThreadPoolExecutor(1) as thread:  # the caller's may have a loop of its own
+            with ThreadPoolExecutor(1) as thread:  # the caller's thread may already run an event loop
                 thread.submit(asyncio.run, _answered(address)).result()
             client = stack.enter_context(distributed.Client(address, timeout=WAIT, set_as_default=False))
         except (OSError, ValueError, TypeError) as error:  # a TimeoutError is an OSError
@@ -62,8 +62,10 @@ def connected(address: str) -> Iterator["Workers"]:
 
 
 async def _answered(address: str) -> None:
-    """Something there greets as schedulers do, in time: a client would wait for that without end. Raises
-    `OSError` or `ValueError` where it does not."""
+    """Check that a scheduler answers in time, for which a client would wait without limit.
+
+    Raise OSError or ValueError if it does not.
+    """
     from distributed import Security  # pyright: ignore[reportMissingImports]
     from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
 
@@ -71,7 +73,7 @@ async def _answered(address: str) -> None:
         async with asyncio.timeout(WAIT):
             greeted = await connect(address, timeout=WAIT, **Security().get_connection_args("client"))
     except TypeError:
-        return  # how to encrypt, a client's configuration may tell
+        return  # The client's configuration may contain the missing encryption settings.
     except TimeoutError:
         raise TimeoutError(f"nothing that answers within {WAIT} s") from None
     except (MemoryError, struct.error):  # the length and the content of a greeting
@@ -81,7 +83,7 @@ async def _answered(address: str) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """A scheduler that is lost is told in one line: what the package logs of it is not shown."""
+    """Suppress the logs of dask.distributed, since a lost scheduler is reported in one line."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "distributed" in name]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -94,7 +96,7 @@ def _quiet() -> Iterator[None]:
 
 
 class Workers:
-    """Those of a scheduler that is connected."""
+    """Workers of a connected scheduler."""
 
     def __init__(self, address: str, client: Any):
         self._address, self._client = address, client
@@ -102,14 +104,11 @@ class Workers:
     def run(
         self, function: Callable[..., Any], pieces: Iterable[Piece], setting: Setting | None, what: str
     ) -> Generator[tuple[Any, Any], None, None]:
-        """(name, result of `function`) of every piece, in the order in which workers finish them; a few are
-        under way per worker, of those that join later too.
+        """Yield (name, result of `function`) of every piece, in the order in which workers finish them.
 
-        `function` is one of a module, and is called on workers that are as `setting` says; with None it has
-        to see to that itself. `what` names the work, differently from any other under way.
-
-        Raises `InputError`, one line, where the cluster is lost, and where a worker is not as `setting` says;
-        and whatever the function raises.
+        Workers may join later. `function` is defined at the top of a module. Workers must have the `setting`;
+        with None the function has to check it. `what` is a unique name of the work. Raise `InputError` if the
+        cluster is lost or a worker has another setting, and any exception that the function raises.
         """
         with _told_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
@@ -119,20 +118,21 @@ class Workers:
 
             def submit(number: int) -> None:
                 for piece in islice(waiting, number):
-                    # As bytes: what is in it may import jax, which is to start as a command starts it.
-                    asked = dumps((function, piece.arguments))
-                    future = client.submit(run, asked, setting, key=f"jaxhil-{what}-{piece.name}", pure=False)
+                    # Unpickling may import JAX; the worker does it after setting the flags of JAX.
+                    content = dumps((function, piece.arguments))
+                    key = f"jaxhil-{what}-{piece.name}"
+                    future = client.submit(run, content, setting, key=key, pure=False)
                     running[future] = piece
                     future.add_done_callback(ended.put)
 
             workers, counted = _workers(client), time.monotonic()
             submit(max(2, EACH * workers))
             while running:
-                future, found = _next(ended), None
+                future, result = _next(ended), None
                 if time.monotonic() - counted > RECOUNT or future is None:
                     workers, counted = _workers(client), time.monotonic()
                 if future is not None and future in running:
-                    found = _found(future)
+                    result = _result(future)
                 elif future is None and not workers:
                     future = next(iter(running))
                     future.cancel()
@@ -140,23 +140,24 @@ class Workers:
                     continue
                 piece = running.pop(future)
                 submit(max(1, EACH * workers - len(running)))
-                yield piece.name, function(*piece.arguments) if found is None else found[0]
+                yield piece.name, function(*piece.arguments) if result is None else result[0]
 
 
 def _workers(client: Any) -> int:
+    """Return the number of workers."""
     return client.scheduler_info(n_workers=0)["n_workers"]
 
 
 def _next(ended: "SimpleQueue[Any]") -> Any:
-    """One that has ended; None if that takes long."""
+    """Return the next future that ends, or None if this takes longer than `PATIENCE`."""
     try:
         return ended.get(timeout=PATIENCE)
     except Empty:
         return None
 
 
-def _found(future: Any) -> tuple[Any] | None:
-    """What a worker found of a piece; None if several died of it."""
+def _result(future: Any) -> tuple[Any] | None:
+    """Return a worker's result as a tuple of length 1, or None if several workers died of the piece."""
     from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
     try:
@@ -172,12 +173,12 @@ def _found(future: Any) -> tuple[Any] | None:
 
 @contextmanager
 def _told_if_lost(address: str) -> Iterator[None]:
-    """A scheduler that is lost is an `InputError`, one line."""
+    """Raise `InputError` if the scheduler is lost."""
     from distributed import CancelledError  # pyright: ignore[reportMissingImports]
 
     try:
         yield
     except (CancelledError, OSError) as error:
         reason = one_line(str(getattr(error, "reason", None) or error) or type(error).__name__, 100)
-        kept = "what is finished is kept, --resume goes on"
-        raise InputError(f"--scheduler: {one_line(address)}: lost, {reason}; {kept}") from None
+        advice = "what is finished is kept, --resume goes on"
+        raise InputError(f"--scheduler: {one_line(address)}: lost, {reason}; {advice}") from None

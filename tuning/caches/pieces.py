@@ -1,12 +1,12 @@
-"""Finished pieces of long work, each kept at once, so that a run that was interrupted can go on.
+"""Checkpoints ("pieces") of long work, with which an interrupted run can resume.
 
-A piece is a value that took long to compute, in a sealed file of its own beside the results. With it stands
-a digest of all that it follows from: what was asked for, and the code that computed it. A run that resumes
-takes a piece whose digest is that of what it is about to compute, which would be the same to the bit; it
-computes any other anew, and writes it in the old one's place. Reading runs no code: the content is
-MessagePack, decoded into the types that are asked for, with every bit of every number.
+A piece is a value that took long to compute, in a sealed file beside the results. It contains a digest of
+everything that determines it: the inputs and the code. A run that resumes uses a piece if the digest is that
+of the value it is about to compute, which would be equal to the bit; otherwise it computes the value and
+replaces the piece. Reading executes no code: the content is MessagePack, decoded into the requested types,
+with all bits of every number.
 
-Whoever computes pieces on several machines can do it by the same digests: a piece does not say who made it.
+Several machines can share pieces by these digests, since a piece does not depend on the machine that made it.
 """
 
 import hashlib
@@ -24,35 +24,35 @@ from jaxhil.files import make_folder, read_sealed, remove_stale, write_sealed, w
 from jaxhil.simulation.environment import rounding_flags, xla_flags
 from jaxhil.simulation.sources import sources_sha256, versions
 
-FOLDER = ".pieces"  # beside the results of a command
+FOLDER = ".pieces"  # name of the folder, beside the results of a command
 SUFFIX = ".piece"
 
 
 class Pieces:
-    """The pieces in a folder; without one nothing is kept. Only to `resume` are those that are there read."""
+    """Pieces in a folder; without a folder nothing is stored, and only to `resume` are pieces read."""
 
     def __init__(self, folder: Path | None = None, resume: bool = False):
         self._folder, self._resume = folder, resume
-        # Those met that follow from something else or are damaged, and why some could not be written: neither
-        # stops a computation that needs them no more.
+        # Names of pieces that have another digest or are damaged, and errors of pieces that could not be
+        # written. Neither stops the computation.
         self.other: list[str] = []
         self.unwritten: list[InputError] = []
 
     @property
     def keeps(self) -> bool:
-        """Whether there is a folder."""
+        """Return whether there is a folder."""
         return self._folder is not None
 
     @property
     def resumes(self) -> bool:
-        """Whether pieces that are there are read."""
+        """Return whether existing pieces are read."""
         return self._resume and self.keeps
 
     def read(self, name: str, inputs: Any, kind: Any) -> Any:
-        """The piece of this name, a `kind`, if it follows from these inputs; else None.
+        """Return the piece of this name, of type `kind`, if it has these inputs; else None.
 
-        `inputs` is anything made of mappings, sequences, records, text and numbers, and tells all that the
-        piece follows from but for the code.
+        `inputs` consists of mappings, sequences, records, text and numbers. Together with the code it must
+        determine the piece.
         """
         path = self._path(name)
         if path is None or not self._resume or not path.exists():
@@ -64,32 +64,32 @@ class Pieces:
                 if digest == digest_of(inputs):
                     return decode(value, kind)
             except (msgspec.MsgspecError, ValueError, TypeError):
-                pass  # sealed, but by a version that wrote something else
+                pass  # The file is intact, but another version wrote another type.
         self.other.append(name)
         return None
 
     def write(self, name: str, inputs: Any, value: Any) -> None:
-        """Keep a piece, as far as it can be written."""
+        """Write a piece; an error is added to `unwritten`."""
         path = self._path(name)
         if path is None:
             return
         content = encode((digest_of(inputs), msgspec.Raw(encode(value))))
-        with self._as_far_as_it_goes(path):
+        with self._recording_errors(path):
             make_folder(path.parent)
             remove_stale(path.parent)
             write_sealed(path, content)
 
     def journal(self, name: str, inputs: Any) -> "Journal":
-        """The steps of one piece of work, which follows from these inputs."""
+        """Return the journal of a computation with these inputs."""
         steps = Pieces(None if self._folder is None else self._folder / _file_name(name), self._resume)
         steps.other, steps.unwritten = self.other, self.unwritten
         return Journal(steps, inputs)
 
     def remove(self) -> None:
-        """Remove all of them, and the folder that was made for them, as far as it goes."""
+        """Remove all pieces, and their folder if it is then empty; an error is added to `unwritten`."""
         if self._folder is None or not self._folder.is_dir():
             return
-        with self._as_far_as_it_goes(self._folder):
+        with self._recording_errors(self._folder):
             remove_stale(self._folder)
             for path in self._folder.glob(f"*{SUFFIX}"):
                 if path.is_file() and not path.is_symlink():
@@ -98,10 +98,12 @@ class Pieces:
                 self._folder.rmdir()
 
     def _path(self, name: str) -> Path | None:
+        """Return the path of a piece, or None without a folder."""
         return None if self._folder is None else self._folder / f"{_file_name(name)}{SUFFIX}"
 
     @contextmanager
-    def _as_far_as_it_goes(self, path: Path) -> Iterator[None]:
+    def _recording_errors(self, path: Path) -> Iterator[None]:
+        """Add an error of writing to `unwritten` instead of raising it."""
         try:
             with writing(path):
                 yield
@@ -110,10 +112,9 @@ class Pieces:
 
 
 class Journal:
-    """The steps of one piece of work, each kept until the whole is.
+    """Pieces of the steps of one computation, which are stored until the whole computation is finished.
 
-    What a step gives follows from the inputs and from the steps before it alone. Steps of one name are
-    counted.
+    The inputs and the previous steps must determine the result of a step. Steps of equal name are numbered.
     """
 
     def __init__(self, pieces: Pieces, inputs: Any):
@@ -121,17 +122,17 @@ class Journal:
         self._numbers: dict[str, int] = {}
 
     def step(self, name: str, kind: Any, make: Callable[[], Any]) -> Any:
-        """What `make` gives, a `kind`: kept from before, or made now."""
+        """Return the stored result of a step, of type `kind`, or call `make` and store its result."""
         number = self._numbers[name] = self._numbers.get(name, 0) + 1
         inputs = self._inputs, name, number
-        found = self._pieces.read(f"{name} {number}", inputs, kind)
-        if found is None:
-            found = make()
-            self._pieces.write(f"{name} {number}", inputs, found)
-        return found
+        result = self._pieces.read(f"{name} {number}", inputs, kind)
+        if result is None:
+            result = make()
+            self._pieces.write(f"{name} {number}", inputs, result)
+        return result
 
     def finish(self) -> None:
-        """The whole is kept: its steps are of no more use."""
+        """Remove the steps, after the whole result was stored."""
         self._pieces.remove()
 
 
@@ -139,28 +140,29 @@ NOTHING_KEPT = Pieces()
 
 
 def digest_of(inputs: Any) -> str:
-    """SHA-256 of the inputs, whatever their order in mappings, of the code, and of how it is compiled."""
+    """Return the SHA-256 of inputs, code and compiler flags; the order of mappings does not matter."""
     whole = (inputs, sources_sha256(), versions(), rounding_flags(xla_flags()))
     return hashlib.sha256(encode(whole, order="deterministic")).hexdigest()
 
 
 def encode(value: Any, order: Literal["deterministic"] | None = None) -> bytes:
-    """Mappings, sequences, records, arrays, text and numbers as MessagePack. TypeError for anything else."""
+    """Encode mappings, sequences, records, arrays, text and numbers as MessagePack. Raise TypeError."""
     return msgspec.msgpack.encode(value, enc_hook=_plain, order=order)
 
 
 def decode(content: bytes | msgspec.Raw, kind: Any) -> Any:
-    """The value of that `kind` which `encode` got. Raises `msgspec.MsgspecError` for anything else."""
+    """Decode a value of type `kind`. Raise `msgspec.MsgspecError` if the content has another type."""
     return msgspec.msgpack.decode(content, type=kind, dec_hook=_array)
 
 
 def _file_name(name: str) -> str:
-    """One for each name, and readable."""
+    """Return a unique and readable file name for a piece's name."""
     readable = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:80]
     return f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def _plain(value: Any) -> Any:
+    """Return NumPy numbers and arrays as plain data. Raise TypeError for anything else."""
     if isinstance(value, np.generic):
         return value.item()
     if hasattr(value, "__array__") and (array := np.asarray(value)).dtype.kind in "biuf":
@@ -169,5 +171,6 @@ def _plain(value: Any) -> Any:
 
 
 def _array(kind: type, value: Any) -> Any:
+    """Return the array that `_plain` converted."""
     name, shape, content = value
     return np.frombuffer(content, np.dtype(name)).reshape(shape).copy()

@@ -1,8 +1,8 @@
-"""Programs kept between calls: what tracing made of a function, beside what the compiler made of it.
+"""Cache of traced programs on disk, in addition to the compiler's cache.
 
-Tracing a solve takes longer than running it. `run` keeps the traced program in a file whose name is made of
-all it depends on: the sources, the versions of what they stand on, static arguments, shapes. The file is
-sealed: a bit that flipped in it could crash the process that reads it, or change what it computes.
+Tracing a solver takes longer than running it. `run` stores the traced program in a file whose name is a
+digest of everything it depends on: sources, versions of the dependencies, static arguments and shapes. The
+file is sealed, because a damaged program could crash the process that reads it, or give wrong results.
 """
 
 import hashlib
@@ -24,18 +24,21 @@ from jaxhil.simulation.environment import TICKS, known_options
 from jaxhil.simulation.kept_programs import is_foreign
 from jaxhil.simulation.sources import sources_sha256, versions
 
-# Calls into LAPACK have no promise to mean the same in other versions; the name has the version in it.
+# JAX does not guarantee that calls of LAPACK are stable between versions; the file's name has the version.
 LAPACK = ("lapack_dpotrf_ffi", "lapack_dtrsm_ffi")
 
 
 def run(
     function: Callable[..., Any], static: Any, arguments: Any, folder: str | os.PathLike[str] | None
 ) -> Any:
-    """`function(static, arguments)`, a named tuple of arrays, compiled.
+    """Return `function(static, arguments)`, a named tuple of arrays, from the cached or compiled program.
 
-    `function` is one of a module, with an annotated result. `static` is hashable, and its `repr` tells all of
-    it; `arguments` is a pytree of arrays. Programs are kept in `folder`; none without one, and none of
-    compensators or contact laws from elsewhere, whose sources are not known.
+    Args:
+        function: function at the top of a module, with an annotated result.
+        static: hashable constants of the program, which their `repr` must describe completely.
+        arguments: pytree of arrays.
+        folder: folder of the cache, or None. Programs with user-registered compensators or contact laws are
+            not stored, since their sources are unknown.
     """
     program, leaves = _look_up(function, static, arguments, folder)
     return function.__annotations__["return"](*program(*leaves))
@@ -44,12 +47,13 @@ def run(
 def prepare(
     function: Callable[..., Any], static: Any, arguments: Any, folder: str | os.PathLike[str] | None
 ) -> None:
-    """Trace and compile what `run` will run on such arguments, into `folder` and the compile cache."""
+    """Trace and compile the program of `run` for such arguments, into `folder` and the compiler's cache."""
     program, leaves = _look_up(function, static, arguments, folder)
     kept_programs.make(program, leaves)
 
 
 def _look_up(function, static, arguments, folder):
+    """Return the program and the flat arguments."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
     return _program(function, static, structure, shapes, None if is_foreign(static) else folder), leaves
@@ -57,7 +61,7 @@ def _look_up(function, static, arguments, folder):
 
 @cache
 def _program(function, static, structure, shapes, folder):
-    """The program of `run`, from and to flat arrays."""
+    """Return the program of `run`, a function from flat arrays to flat arrays."""
 
     def flat(*leaves):
         return tuple(function(static, jax.tree.unflatten(structure, leaves)))
@@ -70,6 +74,7 @@ def _program(function, static, structure, shapes, folder):
 
 
 def _traced(name, flat, like, folder):
+    """Return the jitted program from the file of this name, or trace `flat` and write the file."""
     path = Path(folder) / f"{name}.program"
     exported = _read(path)
     if exported is None:
@@ -85,25 +90,26 @@ def _traced(name, flat, like, folder):
 
 
 def _name(function, static, structure, shapes) -> str:
-    wide = jnp.result_type(float).name
-    flags = wide, jax.default_backend(), jax.device_count()
-    made_of = static, structure, shapes, versions(), flags
-    text = repr((function.__module__, function.__qualname__, sources_sha256(), *made_of))
+    """Return the digest of everything that a program depends on."""
+    float_type = jnp.result_type(float).name
+    flags = float_type, jax.default_backend(), jax.device_count()
+    inputs = static, structure, shapes, versions(), flags
+    text = repr((function.__module__, function.__qualname__, sources_sha256(), *inputs))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(path: Path) -> export.Exported | None:
-    """The program kept in a file; None if there is none, or none that can be read."""
+    """Return the program in a file, or None if there is none or it cannot be read."""
     content = read_sealed(path)
     try:
         return None if content is None else export.deserialize(bytearray(content))
     except Exception:
-        # Written whole, but by something else.
+        # The file is intact, but its content is no program.
         return None
 
 
 def _write(path: Path, content: bytes | bytearray) -> None:
-    """All or nothing; a folder that has become full or read-only costs only the next call's time."""
+    """Write a program; errors are ignored, because they only make the next call slower."""
     with suppress(OSError):
         remove_stale(path.parent)
         write_sealed(path, content, lasting=False)

@@ -1,8 +1,7 @@
-"""What a worker of a dask.distributed cluster does.
+"""Code that runs on the workers of a dask.distributed cluster.
 
-A worker imports this module when its first piece comes, and jax after its flags are set, as a command does:
-nothing here imports jax before. Where something else on the worker starts jax first, this module has to be
-there before that, as a preload: `PRELOAD`.
+A worker imports this module with its first piece, and JAX only after the flags of JAX are set, as a command
+does. If other code on the worker starts JAX earlier, this module has to be a preload: `PRELOAD`.
 """
 
 import pickle
@@ -15,31 +14,33 @@ from jaxhil.simulation.sources import sources_sha256, versions
 
 PRELOAD = "dask worker ADDRESS --preload tuning.caches.worker"
 
-# A worker may have several threads, and no two programs may run at a time.
+# A worker may have several threads, but only one program may run at a time.
 _one_at_a_time = threading.Lock()
 
 
 class Setting(NamedTuple):
-    """What decides the last bits of a result beside what it is asked of."""
+    """Properties of a process that affect the last bits of a result."""
 
-    sources_sha256: str  # of the packages' files
-    versions: dict[str, str]  # of what they stand on
-    xla_flags: str | None  # those that change rounding; None: they change nothing
+    sources_sha256: str  # SHA-256 of the packages' files
+    versions: dict[str, str]  # versions of Python and of the dependencies
+    xla_flags: str | None  # flags of XLA that change rounding; None: any flags are allowed
 
 
 def setting() -> Setting:
-    """That of this process."""
+    """Return the setting of this process."""
     return Setting(sources_sha256(), versions(), rounding_flags(xla_flags()))
 
 
 def dask_setup(worker: Any) -> None:
-    """As a preload: jax is started with the flags of a command."""
+    """Start JAX with the flags of a command, when dask preloads this module."""
     prepare()
 
 
 def run(content: bytes, asked: Setting | None) -> Any:
-    """What a pickled function makes of its arguments. Raises what that does, and `InputError` where this
-    process is not as `asked` says."""
+    """Call a pickled function with its pickled arguments.
+
+    Raise `InputError` if this process does not have the setting `asked`, and any exception of the function.
+    """
     with _one_at_a_time:
         prepare()
         if asked is not None:
@@ -49,7 +50,7 @@ def run(content: bytes, asked: Setting | None) -> Any:
 
 
 def check_setting(asked: Setting, here: Setting) -> None:
-    """Raises `InputError` where a worker's results may differ from those of the process that asks."""
+    """Raise `InputError` if the results of a worker may differ from those of the process that asks."""
     for name in Setting._fields:
         found, allowed = getattr(here, name), getattr(asked, name)
         if found == allowed or allowed is None:
@@ -60,6 +61,6 @@ def check_setting(asked: Setting, here: Setting) -> None:
 
 
 def differs(what: str, flags: bool) -> InputError:
-    """A worker that is not as its asker; where its flags are others, how to start it."""
-    how = f"; start workers by: {PRELOAD}" if flags else ""
-    return InputError(f"--scheduler: a worker: {what}: its results would differ{how}")
+    """Return the error for a worker with another setting; if `flags` differ, it says how to start workers."""
+    advice = f"; start workers by: {PRELOAD}" if flags else ""
+    return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

@@ -1,1 +1,1 @@
-"""Optimisers in the unit box, and what they say of the optimum; they know nothing of docking."""
+"""Optimisers in the unit box and the sensitivity at the optimum, independent of docking."""

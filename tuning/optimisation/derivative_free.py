@@ -1,8 +1,8 @@
-"""Search without derivatives in the unit box, batched: near a point or everywhere.
+"""Batched derivative-free optimisation in the unit box, near a point or in the whole box.
 
-Gradients end at kinks and in the nearest basin; these searches do not. Both see an objective as a function
-from NumPy to NumPy that takes the same number of points at every call, so that a compiled one is compiled
-once. A point holds unit coordinates: each gain's place in its range, 0 at the lower bound and 1 at the upper.
+Unlike gradient methods, these searches pass kinks and leave the nearest basin. The objective is a function
+from NumPy to NumPy arrays, called with the same number of points each time, so that a compiled one is
+compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 its upper bound.
 """
 
 from collections.abc import Callable
@@ -12,24 +12,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import qmc
 
-CANDIDATES = 16  # of a generation of `polish`
-PER_BASIN = 32  # of a generation of `search_globally`, for each basin of its first round
-BASINS = 8  # that `search_globally` goes down into at once
-SCAN = 8  # the part of its budget that is the scan
-APART = 0.1  # of the box's diagonal
-REACHES = 0.1, 0.2, 0.01  # of its first round, of those between, of the last
-# What a failed evaluation counts as: worse than all others, and still a number.
+CANDIDATES = 16  # candidates in a generation of `polish`
+PER_BASIN = 32  # candidates in a generation of `search_globally`, for each basin of the first round
+BASINS = 8  # basins that `search_globally` searches simultaneously
+SCAN = 8  # the scan of `search_globally` uses 1/SCAN of the budget
+APART = 0.1  # minimum distance of starts, relative to the box's diagonal
+REACHES = 0.1, 0.2, 0.01  # `reach` of the first, the intermediate and the last round of `search_globally`
+# Loss of a failed evaluation, which is worse than all others but finite.
 WORST = np.finfo(float).max
 
 Losses = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
 
 
 class SearchResult(NamedTuple):
-    """What a search found; `polish` of several starts gives each its own."""
+    """Result of a search, or of several searches by `polish`."""
 
-    point: Float[np.ndarray, "*starts gains"]  # the best point
-    loss: Float[np.ndarray, "*starts"]  # there
-    evaluations: int  # of the objective that it took
+    point: Float[np.ndarray, "*starts gains"]  # best point
+    loss: Float[np.ndarray, "*starts"]  # loss at the best point
+    evaluations: int  # number of evaluations of the objective, per start
 
 
 def polish(
@@ -44,19 +44,22 @@ def polish(
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
 ) -> SearchResult:
-    """Local minimum near `start` by evolution of a normal distribution (CMA-ES), never worse than `start`.
+    """Find a local minimum near `start` by CMA-ES; the result is never worse than `start`.
 
-    `losses` gets (*starts, candidates, gains) and gives (*starts, candidates); starts are searched side by
-    side and do not depend on each other. `evaluations` are those of each start, rounded down to whole
-    generations of `candidates`, at least one. The first generation holds the start itself.
+    Points outside the box are mirrored back into it. The first generation contains the start itself. Source:
+    Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive weights and the default constants
+    for the number of candidates.
 
-    `reach` is the first standard deviation as a share of the box, of a gain on average; `covariance`, of
-    any scale, is the first distribution's shape: an inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1
-    with the residuals' Jacobian J and the loss L, spares the search its learning; the 16 keeps what nothing
-    depends on to a quarter of the box. Points outside the box are mirrored back into it.
-
-    Source: Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive weights and the default
-    constants for the number of candidates.
+    Args:
+        losses: function from (*starts, candidates, gains) to (*starts, candidates).
+        start: starting points, which are searched independently of each other.
+        evaluations: number of evaluations per start, rounded down to whole generations, at least one.
+        candidates: number of candidates in a generation.
+        reach: initial standard deviation, relative to the box, on average over the gains.
+        covariance: shape of the initial distribution, of any scale. The inverse Hessian of least squares,
+            (J^T J / (2 L) + 16)^-1 with the residuals' Jacobian J and the loss L, saves the adaptation; 16
+            limits the spread of gains without effect to a quarter of the box.
+        seed: seed of the random numbers.
     """
     start = np.clip(np.asarray(start, float), 0, 1)
     state = _first_generation(start, reach, covariance)
@@ -65,20 +68,20 @@ def polish(
     best, best_loss = start, np.full(start.shape[:-1], np.inf)
     generations = max(1, evaluations // candidates)
     for generation in range(generations):
-        # All starts draw alike: what one finds does not hang on the others.
+        # All starts use the same random numbers, so that a result does not depend on the other starts.
         normal = generator.standard_normal((candidates, start.shape[-1]))
         points = mirror(
             state.mean[..., None, :] + state.step[..., None, None] * (normal @ _transposed(state.root))
         )
         if generation == 0:
             points[..., 0, :] = start
-        found = _finite(losses(points))
-        order = np.argsort(found, axis=-1, kind="stable")
-        found = np.take_along_axis(found, order, axis=-1)
+        values = _finite(losses(points))
+        order = np.argsort(values, axis=-1, kind="stable")
+        values = np.take_along_axis(values, order, axis=-1)
         points = np.take_along_axis(points, order[..., None], axis=-2)
-        better = found[..., 0] < best_loss
-        best_loss = np.where(better, found[..., 0], best_loss)
-        best = np.where(better[..., None], points[..., 0, :], best)
+        is_better = values[..., 0] < best_loss
+        best_loss = np.where(is_better, values[..., 0], best_loss)
+        best = np.where(is_better[..., None], points[..., 0, :], best)
         state = _evolve(state, points, constants, generation)
     return SearchResult(best, best_loss, generations * candidates)
 
@@ -92,13 +95,13 @@ def search_globally(
     basins: int = BASINS,
     seed: int = 0,
 ) -> SearchResult:
-    """Best point of the whole box within `budget` evaluations: a scan, then the best basins.
+    """Find the best point of the whole box within `budget` evaluations, by a scan and restarts of CMA-ES.
 
-    An eighth of the budget is a scrambled Sobol sequence. The best points of it that lie apart are then
-    polished side by side, in rounds of equal cost: each goes on with the better half, from the bottoms found,
-    with twice the candidates (which see over the ripples of a rough objective) and afresh, without the shape
-    that the last had shrunk to. The last round goes into the best one closely. `losses` always gets
-    basins * candidates points; `basins` is a power of two.
+    An eighth of the budget is a scrambled Sobol sequence. Its best points with a minimum distance start
+    simultaneous runs of `polish`, in rounds of equal cost. Each round continues from the better half of the
+    minima, with twice as many candidates (which average over a rough objective) and a new isotropic
+    distribution. The last round refines the best minimum. `losses` always gets basins * candidates points;
+    `basins` is a power of two.
 
     Source: restarts with a growing population, Auger and Hansen, "A restart CMA evolution strategy with
     increasing population size" (2005); halving, Jamieson and Talwalkar (2016).
@@ -106,24 +109,24 @@ def search_globally(
     together = basins * candidates
     scan = max(1, budget // (SCAN * together))
     sequence = qmc.Sobol(gains, rng=np.random.default_rng(seed))
-    # Drawn as a power of two, used in order: what is left of the balance is that of its prefix.
+    # A Sobol sequence is drawn in a power of two; its first points are used, in order.
     points = sequence.random(1 << (scan * together - 1).bit_length())[: scan * together]
     points = points.reshape(scan, together, gains)
-    scanned = np.concatenate([_finite(losses(part)) for part in points])
+    scanned = np.concatenate([_finite(losses(batch)) for batch in points])
     points = points.reshape(-1, gains)
     starts = apart(points[np.argsort(scanned, kind="stable")], None, basins)
 
     used = scan * together
     rounds = [basins >> turn for turn in range(basins.bit_length())] + [1]
-    bottoms, bottom_losses = np.empty((0, gains)), np.empty(0)
+    minima, minimum_losses = np.empty((0, gains)), np.empty(0)
     for turn, number in enumerate(rounds):
 
-        def side_by_side(points, number=number):
+        def batched_losses(points, number=number):
             return losses(points.reshape(together, gains)).reshape(number, -1)
 
         generations = max(1, (budget - used) // together // (len(rounds) - turn))
-        found = polish(
-            side_by_side,
+        result = polish(
+            batched_losses,
             starts,
             generations * together // number,
             candidates=together // number,
@@ -131,46 +134,47 @@ def search_globally(
             seed=seed + turn,
         )
         used += generations * together
-        bottoms = np.concatenate([found.point, bottoms[number:]])
-        bottom_losses = np.concatenate([found.loss, bottom_losses[number:]])
-        order = np.argsort(bottom_losses, kind="stable")
-        bottoms, bottom_losses = bottoms[order], bottom_losses[order]
-        starts = bottoms[: max(1, number // 2)]
-    return SearchResult(bottoms[0], bottom_losses[0], used)
+        minima = np.concatenate([result.point, minima[number:]])
+        minimum_losses = np.concatenate([result.loss, minimum_losses[number:]])
+        order = np.argsort(minimum_losses, kind="stable")
+        minima, minimum_losses = minima[order], minimum_losses[order]
+        starts = minima[: max(1, number // 2)]
+    return SearchResult(minima[0], minimum_losses[0], used)
 
 
 def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:
-    """Points outside [0, 1] reflected at its ends."""
+    """Reflect coordinates outside [0, 1] at its ends."""
     folded = np.mod(points, 2)
     return np.where(folded > 1, 2 - folded, folded)
 
 
 class _Generation(NamedTuple):
-    """The normal distribution that candidates are drawn from, of every start."""
+    """Normal distribution of the candidates, for every start."""
 
-    mean: np.ndarray  # its mean
-    step: np.ndarray  # sigma
-    covariance: np.ndarray  # C: that of the distribution is sigma^2 C
-    root: np.ndarray  # of C
-    inverse_root: np.ndarray  # of C
+    mean: np.ndarray  # mean
+    step: np.ndarray  # step size sigma
+    covariance: np.ndarray  # C; the covariance of the distribution is sigma^2 C
+    root: np.ndarray  # symmetric square root of C
+    inverse_root: np.ndarray  # its inverse
     step_path: np.ndarray  # evolution path of the step
     shape_path: np.ndarray  # evolution path of C
 
 
 class _Constants(NamedTuple):
-    """Constants of the evolution; in brackets the tutorial's names."""
+    """Constants of CMA-ES; the tutorial's names are in brackets."""
 
-    weights: np.ndarray  # of the better half of the candidates
-    step_rate: float  # of the step (c_sigma)
-    damping: float  # of the step (d_sigma)
-    path_rate: float  # of the covariance's path (c_c)
-    rank_one: float  # of the covariance (c_1)
-    rank_mu: float  # of the covariance (c_mu)
-    effective: float  # number of candidates (mu_eff)
-    length: float  # of a path of random steps, expected (E|N(0, I)|)
+    weights: np.ndarray  # weights of the better half of the candidates
+    step_rate: float  # learning rate of the step size's path (c_sigma)
+    damping: float  # damping of the step size (d_sigma)
+    path_rate: float  # learning rate of the covariance's path (c_c)
+    rank_one: float  # learning rate of the rank-one update (c_1)
+    rank_mu: float  # learning rate of the rank-mu update (c_mu)
+    effective: float  # effective number of selected candidates (mu_eff)
+    length: float  # expected length of a path of random steps (E|N(0, I)|)
 
 
 def _constants(gains: int, candidates: int) -> _Constants:
+    """Return the tutorial's default constants."""
     half = candidates // 2
     weights = np.log(candidates / 2 + 0.5) - np.log(np.arange(1, half + 1))
     weights /= weights.sum()
@@ -191,10 +195,11 @@ def _constants(gains: int, candidates: int) -> _Constants:
 
 
 def _first_generation(start, reach, covariance) -> _Generation:
+    """Return the initial distribution of every start."""
     gains = start.shape[-1]
     shape = np.broadcast_to(np.eye(gains), (*start.shape[:-1], gains, gains))
     if covariance is not None:
-        # A mean variance of one: what is sloppy reaches further than what is stiff, and `reach` on average.
+        # The mean variance is scaled to 1, so that the spread is `reach` on average over the gains.
         average = np.trace(covariance, axis1=-2, axis2=-1) / gains
         shape = np.broadcast_to(covariance / average[..., None, None], shape.shape)
     root, inverse_root = _roots(shape)
@@ -204,7 +209,7 @@ def _first_generation(start, reach, covariance) -> _Generation:
 
 
 def _evolve(state, points, constants, generation) -> _Generation:
-    """The next distribution, from points sorted by their loss."""
+    """Return the next distribution from points sorted by their loss."""
     gains = state.mean.shape[-1]
     weights = constants.weights
     steps = (points[..., : len(weights), :] - state.mean[..., None, :]) / state.step[..., None, None]
@@ -213,21 +218,21 @@ def _evolve(state, points, constants, generation) -> _Generation:
     whitened = np.einsum("...ij,...j->...i", state.inverse_root, move)
     step_path = (1 - rate) * state.step_path + np.sqrt(rate * (2 - rate) * constants.effective) * whitened
     size = np.linalg.norm(step_path, axis=-1)
-    # A path grown long by a large step does not widen the distribution as well.
-    usual = np.sqrt(1 - (1 - rate) ** (2 * (generation + 1)))
-    going = (size / usual < (1.4 + 2 / (gains + 1)) * constants.length)[..., None]
+    # While the path is long, the step size grows; the covariance's path then does not grow as well.
+    scale = np.sqrt(1 - (1 - rate) ** (2 * (generation + 1)))
+    grows = (size / scale < (1.4 + 2 / (gains + 1)) * constants.length)[..., None]
     rate = constants.path_rate
     shape_path = (1 - rate) * state.shape_path
-    shape_path = shape_path + going * np.sqrt(rate * (2 - rate) * constants.effective) * move
-    kept = 1 - constants.rank_one - constants.rank_mu
-    lost = (1 - going) * constants.rank_one * rate * (2 - rate)
+    shape_path = shape_path + grows * np.sqrt(rate * (2 - rate) * constants.effective) * move
+    decay = 1 - constants.rank_one - constants.rank_mu
+    correction = (1 - grows) * constants.rank_one * rate * (2 - rate)
     covariance = (
-        (kept + lost)[..., None] * state.covariance
+        (decay + correction)[..., None] * state.covariance
         + constants.rank_one * shape_path[..., :, None] * shape_path[..., None, :]
         + constants.rank_mu * np.einsum("c,...ci,...cj->...ij", weights, steps, steps)
     )
     growth = constants.step_rate / constants.damping * (size / constants.length - 1)
-    # Wider than the box, mirrored points are uniform and teach nothing.
+    # If the distribution is wider than the box, mirrored points are uniform and carry no information.
     step = np.clip(state.step * np.exp(np.minimum(growth, 1)), 1e-12, 0.5)
     root, inverse_root = _roots(covariance)
     return _Generation(
@@ -236,7 +241,7 @@ def _evolve(state, points, constants, generation) -> _Generation:
 
 
 def _roots(covariance):
-    """Symmetric root of a covariance and its inverse."""
+    """Return the symmetric square root of a covariance and its inverse."""
     values, vectors = np.linalg.eigh(covariance)
     roots = np.sqrt(np.maximum(values, 1e-20 * np.max(values, axis=-1, keepdims=True)))
     root = (vectors * roots[..., None, :]) @ _transposed(vectors)
@@ -253,9 +258,9 @@ def _finite(losses):
 
 
 def apart(ranked, known, number):
-    """The known points and the best of the `ranked` ones that lie apart, so many in all.
+    """Return `number` points: the `known` ones, then the best `ranked` ones at a distance from all others.
 
-    Apart is a tenth of the box's diagonal, less where there are not enough of them.
+    The distance is a tenth of the box's diagonal, or less if there are not enough such points.
     """
     known = np.zeros((0, ranked.shape[-1])) if known is None else known
     distance = APART * np.sqrt(ranked.shape[-1])
@@ -267,12 +272,12 @@ def apart(ranked, known, number):
 
 
 def far_apart(ranked, known, number, distance=None):
-    """The same, but fewer where no more lie so far apart, by default a tenth of the diagonal."""
+    """Return points as `apart` does, but fewer if not enough have the `distance`, by default a tenth."""
     distance = APART * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(known[:number], 0, 1))
     for point in ranked:
         if len(chosen) == number:
             break
-        if all(np.linalg.norm(point - other) >= distance for other in chosen):
+        if all(np.linalg.norm(point - neighbour) >= distance for neighbour in chosen):
             chosen.append(point)
     return np.array(chosen)

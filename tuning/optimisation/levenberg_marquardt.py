@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt in the unit box, many starts in one program: the one file that imports optimistix.
+"""Levenberg-Marquardt method in the unit box, with many starts in one program, by optimistix.
 
-A step minimises the damped linear model within the box: gains that the model would push through a bound end
-on it, and the others move as if those were constants (`_BoxedDescent`). The residuals' Jacobian is computed
-in forward mode, once per step and next to the residuals themselves.
+A step minimises the damped linear model within the box: gains that the model would move beyond a bound stop
+at it, and the others move as if those were constant (`_BoxedDescent`). The residuals' Jacobian is computed in
+forward mode, once per step and together with the residuals.
 """
 
 import math
@@ -22,9 +22,9 @@ from jaxtyping import Array, Float, Int
 from tuning.optimisation.solution import Solution
 from tuning.optimisation.unit_box import Bounds, to_gains
 
-DAMPING = 0.1  # of the first step, relative to the mean diagonal of J^T J
-STANDSTILL = 1e-6  # of the box: a step no longer than that is the end
-PATIENCE, PROGRESS = 5, 1e-3  # steps in which the loss must fall by that share of itself
+DAMPING = 0.1  # damping of the first step, relative to the mean diagonal of J^T J
+STANDSTILL = 1e-6  # a step shorter than this, relative to the box, means convergence
+PATIENCE, PROGRESS = 5, 1e-3  # number of steps, and relative decrease of the loss required within them
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
@@ -40,14 +40,25 @@ def solve(
     rtol: float = 1e-4,
     atol: float = 1e-6,
 ) -> Solution:
-    """Minimise sum(residuals(static, gains, arguments)^2) / 2 of many problems at once, in at most `steps`
-    steps, themselves at most `longest`. Problems are sharded over the devices.
+    """Minimise sum(residuals(static, gains, arguments)^2) / 2 for many problems, sharded over the devices.
 
-    A problem is a start: unit coordinates of its gains, their bounds and its arguments. It has converged
-    when residuals and coordinates have settled (`rtol`, `atol`), when a step is shorter than `STANDSTILL`, or
-    when the loss has fallen by less than `PROGRESS` of itself in `PATIENCE` steps. `residuals` gets several,
-    a leading axis of problems, which must not mix: `tile` of them at a time, by default all that a device has
-    to do."""
+    A problem has converged when residuals and coordinates have settled (`rtol`, `atol`), when a step is
+    shorter than `STANDSTILL`, or when the relative decrease of the loss in `PATIENCE` steps is below
+    `PROGRESS`.
+
+    Args:
+        residuals: function of `static`, gains and arguments with a leading axis of problems, which it must
+            not mix.
+        static: first argument of `residuals`, a constant of the compiled program.
+        arguments: third argument of `residuals`, with a leading axis of problems.
+        bounds: bounds of the gains.
+        starts: unit coordinates of the gains at the start of each problem.
+        steps: limit on the number of steps, not above `longest`.
+        longest: limit on `steps`, a constant of the compiled program.
+        tile: number of problems that are evaluated together; by default all problems of a device.
+        rtol: relative tolerance of convergence.
+        atol: absolute tolerance of convergence.
+    """
 
     def of_coordinates(coordinates, arguments):
         bounds, arguments = arguments
@@ -57,9 +68,9 @@ def solve(
 
     def one_device(starts, bounds, arguments):
         function = _with_jacobian(of_coordinates, starts, (bounds, arguments), tile)
-        return jax.vmap(partial(one, function))(starts, bounds, arguments)
+        return jax.vmap(partial(one_problem, function))(starts, bounds, arguments)
 
-    def one(function, start, bounds, arguments):
+    def one_problem(function, start, bounds, arguments):
         solution = optx.least_squares(
             function,
             solver,
@@ -79,55 +90,56 @@ def solve(
 
 
 def _sharded(one_device: Callable[..., Solution], *arguments: Any) -> tuple[Array, ...]:
-    """`one_device` of arguments whose leading axis is shared out among the devices."""
+    """Call `one_device` on each device with its share of the arguments' leading axis."""
     leaves, structure = jax.tree.flatten(arguments)
     devices = math.gcd(jax.device_count(), len(leaves[0]))
-    # Traced outside of `jax.shard_map`, inside of which the solver's linear algebra does not trace.
+    # Tracing is done outside `jax.shard_map`, because the solver's linear algebra cannot be traced inside.
     local = [jax.ShapeDtypeStruct((len(leaf) // devices, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
     traced = jax.make_jaxpr(lambda *leaves: one_device(*jax.tree.unflatten(structure, leaves)))(*local)
     mesh = jax.make_mesh(
         (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
     )
-    own = PartitionSpec("device")
-    # Each device goes its own way to the end: nothing is exchanged, nothing waits for another.
-    run = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=own, out_specs=own, check_vma=False)
+    spec = PartitionSpec("device")
+    # Devices exchange nothing, so that none waits for another.
+    run = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     return tuple(run(*leaves))
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
-    """(residuals, loss) of one problem, to be called under a `jax.vmap` over all of them.
+    """Return a function that returns (residuals, loss) of one problem, for a `jax.vmap` over all problems.
 
-    Its derivative is one product with a Jacobian computed once, in forward mode, for all problems side by
-    side, `tile` at a time. `free` and `arguments` are like those to come, problems first.
+    Its derivative is one product with a Jacobian that is computed once, in forward mode, for `tile` problems
+    at a time. `free` and `arguments` are examples of the function's arguments, with a leading axis of
+    problems.
     """
 
     def value_and_jacobian(free, arguments):
         def along(direction):
-            every = jnp.broadcast_to(direction, free.shape)
-            return jax.jvp(lambda free: residuals(free, arguments), (free,), (every,))
+            directions = jnp.broadcast_to(direction, free.shape)
+            return jax.jvp(lambda free: residuals(free, arguments), (free,), (directions,))
 
-        # Problems do not mix: one direction serves all of them.
+        # Since problems do not mix, one direction serves all of them.
         basis = jnp.eye(free.shape[-1], dtype=free.dtype)
         return jax.vmap(along, out_axes=(None, -1))(basis)
 
     def in_tiles(free, arguments):
-        # A tile ends with its own slowest lane, and its numbers stay in the cache.
+        # A tile waits only for its slowest problem, and its data stay in the processor's cache.
         size = math.gcd(len(free), tile or len(free))
         shape = len(free) // size, size
         tiles = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (free, arguments))
-        done = jax.lax.map(lambda one: value_and_jacobian(*one), tiles)
-        return jax.tree.map(lambda leaf: leaf.reshape(len(free), *leaf.shape[2:]), done)
+        results = jax.lax.map(lambda tile: value_and_jacobian(*tile), tiles)
+        return jax.tree.map(lambda leaf: leaf.reshape(len(free), *leaf.shape[2:]), results)
 
-    # Traced once, however often the solver asks for it: tracing costs more than many a step.
+    # The function is traced once for all calls by the solver, because tracing costs more than many steps.
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), (free, arguments))
     number = len(free)
     traced = jaxpr_as_fun(jax.make_jaxpr(in_tiles)(*shapes))
 
     @jax.custom_batching.custom_vmap
     def several(free, arguments):
-        # One problem alone, run as often as there are problems: the program traced serves.
-        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), (free, arguments))
-        return tuple(leaf[0] for leaf in traced(*jax.tree.leaves(same)))
+        # A single problem is repeated to the traced number of problems.
+        copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), (free, arguments))
+        return tuple(leaf[0] for leaf in traced(*jax.tree.leaves(copies)))
 
     @several.def_vmap
     def rule(axis_size, in_batched, free, arguments):
@@ -152,16 +164,18 @@ def _with_jacobian(residuals, free, arguments, tile=None):
 
 
 class _Model(NamedTuple):
-    """The linear model that a step is made of."""
+    """Linear model of the residuals at the start of a step."""
 
-    coordinates: Float[Array, "gains"]  # where the step begins
-    curvature: Float[Array, "gains gains"]  # J^T J there
-    gradient: Float[Array, "gains"]  # of the loss, J^T r
+    coordinates: Float[Array, "gains"]  # start of the step
+    curvature: Float[Array, "gains gains"]  # J^T J
+    gradient: Float[Array, "gains"]  # gradient of the loss, J^T r
 
 
 class _BoxedDescent(optx.AbstractDescent):
-    """The step d in the unit box from the damped linear model: (J^T J + D) d = -J^T r for the gains that are
-    free, D = `DAMPING` mean(diag(J^T J)) / step_size."""
+    """Step d in the unit box from the damped linear model.
+
+    It solves (J^T J + D) d = -J^T r for the gains that are free, D = `DAMPING` mean(diag(J^T J)) / step_size.
+    """
 
     def init(self, y, f_info_struct):
         return _Model(y, jnp.zeros((len(y), len(y)), y.dtype), jnp.zeros_like(y))
@@ -176,28 +190,28 @@ class _BoxedDescent(optx.AbstractDescent):
         number, dtype = len(coordinates), coordinates.dtype
         damping = DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
         identity = jnp.eye(number, dtype=dtype)
-        # What no residual depends on has no curvature; it stays.
+        # The small number keeps gains in place on which no residual depends, since their curvature is 0.
         damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
         room = -coordinates, 1 - coordinates
         free = ~((coordinates <= 0) & (gradient > 0) | (coordinates >= 1) & (gradient < 0))
 
-        def bind(_, found):
-            free, step = found
+        def bind(_, state):
+            free, step = state
             step = jnp.where(free, 0, step)
             both = free[:, None] & free[None, :]
             matrix = jnp.where(both, damped, identity)
             force = jnp.where(free, -gradient - curvature @ step, 0)
-            wanted = cho_solve((jnp.linalg.cholesky(matrix), True), force)
-            inside = jnp.clip(wanted, *room)
-            return free & (wanted == inside), jnp.where(free, inside, step)
+            unbounded = cho_solve((jnp.linalg.cholesky(matrix), True), force)
+            inside = jnp.clip(unbounded, *room)
+            return free & (unbounded == inside), jnp.where(free, inside, step)
 
-        # Each turn binds at least one gain more, or none ever after.
+        # Each iteration fixes at least one further gain at a bound, or the step is final.
         _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(coordinates)))
         return step, optx.RESULTS.successful
 
 
 class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
-    """Levenberg-Marquardt whose steps end in the unit box."""
+    """Levenberg-Marquardt solver whose steps end in the unit box."""
 
     rtol: float
     atol: float
@@ -209,20 +223,20 @@ class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
     def __init__(self, rtol: float, atol: float):
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = _BoxedDescent()
-        # Longer steps wherever the model holds roughly: it is never as good as the default asks for.
+        # The trust region grows already if the model is roughly right; the default condition is never met.
         self.search = optx.ClassicalTrustRegion(0.75, 1e-3, 3.0, 0.25)
         self.verbose = lambda **_: None
 
 
 class _Recording(optx.AbstractLeastSquaresSolver):
-    """A solver that keeps the loss of every accepted iterate."""
+    """Solver that records the loss of every accepted iterate."""
 
     rtol: float
     atol: float
     norm: Callable[[Any], Array]
     inner: optx.AbstractLeastSquaresSolver
-    steps: Int[Array, ""]  # after which it ends: a number that is no part of the program
-    longest: int = eqx.field(static=True)  # the most there can be, which is
+    steps: Int[Array, ""]  # limit on the number of steps, an argument of the compiled program
+    longest: int = eqx.field(static=True)  # limit on `steps`, a constant of the compiled program
 
     def __init__(self, inner: optx.AbstractLeastSquaresSolver, steps: Int[Array, ""], longest: int):
         self.rtol, self.atol, self.norm = inner.rtol, inner.atol, inner.norm
@@ -236,7 +250,7 @@ class _Recording(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         inner, history, count = state
         y, inner, aux = self.inner.step(fn, y, args, options, inner, tags)
-        # What it returns is one step old.
+        # The returned `aux` belongs to the previous step; `inner.aux` is the current loss.
         best = jnp.minimum(inner.aux, jnp.where(count > 0, history[count - 1], jnp.inf))
         history = jnp.where(jnp.arange(self.longest) >= count, best, history)
         return y, (inner, history, count + 1), aux
@@ -261,6 +275,7 @@ class _Recording(optx.AbstractLeastSquaresSolver):
 
 
 def _status(result, converged, loss):
+    """Return the index into `STATUSES` for a result of optimistix."""
     ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
     status = jnp.where(ended, jnp.where(converged, 0, 1), 3)
     return jnp.where(jnp.isfinite(loss), status, 2).astype(jnp.int32)

@@ -1,6 +1,6 @@
-"""How far each gain may move from the optimum before the objective rises by a given share of itself.
+"""Tolerance of each gain: its distance from the optimum at which the objective rises by a given share.
 
-Read off the residuals' Jacobian at the optimum. Kinks of the objective are not seen.
+It follows from the residuals' Jacobian at the optimum, and does not take kinks of the objective into account.
 """
 
 from typing import NamedTuple
@@ -8,39 +8,40 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-RISE = 0.01  # of the loss
+RISE = 0.01  # relative rise of the loss
 
 
 class Sensitivity(NamedTuple):
-    """How far each gain may move, as a share of its range; see `sensitivity`."""
+    """Tolerance of each gain, as a share of its range."""
 
-    alone: Float[np.ndarray, "gains"]  # the others held
-    together: Float[np.ndarray, "gains"]  # the others moved along, at their best
+    alone: Float[np.ndarray, "gains"]  # with all other gains fixed
+    together: Float[np.ndarray, "gains"]  # with all other gains readjusted to their best values
 
 
 def sensitivity(jacobian: Float[np.ndarray, "residuals gains"], loss: float) -> Sensitivity:
-    """Which gains the objective L = |r|^2 / 2 holds at its optimum, and which it leaves open.
+    """Return the tolerance of each gain at the optimum of the objective L = |r|^2 / 2.
 
-    `jacobian` is J = dr/du, u each gain as a share of its range. Around the optimum
+    `jacobian` is J = dr/du, with the gains u as shares of their ranges. Around the optimum
 
         L(u + d) = L (1 + d^T A d rise),    A = J^T J / (2 rise L)
 
-    so that d^T A d <= 1 is where L rises by no more than `RISE` of itself. No gain moves by more than its
-    range, whatever the objective says: B = A + 1 in place of A, and
+    so that L rises by at most `RISE` of itself for d^T A d <= 1. To limit the movement of a gain to its
+    range, B = A + 1 replaces A, and
 
         alone_p = B_pp^(-1/2),        together_p = ((B^-1)_pp)^(1/2)
 
-    A gain with `together` near one is of no account or made up for by others; `alone` tells which.
+    A gain with `together` near 1 is insensitive or is compensated by other gains; `alone` distinguishes the
+    two cases.
 
     Source: Transtrum, Machta, Sethna, "Geometry of nonlinear least squares with applications to sloppy
     models and optimization", Phys. Rev. E 83, 036701 (2011).
     """
     gains = jacobian.shape[1]
-    # Fewer residuals than gains leave directions that nothing depends on.
+    # With fewer residuals than gains, zero rows add the directions on which no residual depends.
     padded = np.concatenate([jacobian, np.zeros((max(0, gains - len(jacobian)), gains))])
     _, values, directions = np.linalg.svd(padded, full_matrices=False)
     scale = 2 * RISE * max(loss, np.finfo(float).tiny)
-    # Half axes of the region, along its principal directions.
+    # These are the semi-axes of the region.
     radius = 1 / np.hypot(values / np.sqrt(scale), 1)
     covariance = (directions.T * radius**2) @ directions
     alone = 1 / np.sqrt(np.sum(jacobian**2, axis=0) / scale + 1)

@@ -1,4 +1,4 @@
-"""Where a solve with derivatives ended: known without its solver, which a kept program needs no more."""
+"""Result of the solver with derivatives, without an import of the solver, which a cached program spares."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ STATUSES = ("converged", "step limit", "not finite", "failed")
 
 
 class Solution(NamedTuple):
-    """Where the starts ended."""
+    """Result of the solver for each start."""
 
     coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
-    curvature: Float[Array, "starts gains gains"]  # J^T J there, J the residuals' Jacobian by the coordinates
+    curvature: Float[Array, "starts gains gains"]  # J^T J, J = Jacobian of the residuals by the coordinates
     loss: Float[Array, "starts"]  # half the sum of squared residuals
-    history: Float[Array, "starts steps"]  # loss after every step, the last repeated
-    steps: Int[Array, "starts"]  # steps taken
-    status: Int[Array, "starts"]  # an index into `STATUSES`
+    history: Float[Array, "starts steps"]  # loss after every step; the last one repeats
+    steps: Int[Array, "starts"]  # number of steps
+    status: Int[Array, "starts"]  # index into `STATUSES`

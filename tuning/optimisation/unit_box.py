@@ -1,4 +1,4 @@
-"""Gains as points of the unit box: each coordinate a gain's place in its range, linear or logarithmic."""
+"""Conversion between gains and unit coordinates, which are shares of a linear or logarithmic range."""
 
 from typing import Any, NamedTuple
 
@@ -9,16 +9,18 @@ from jaxtyping import Array, Float
 
 
 class Bounds(NamedTuple):
-    """The range of each gain."""
+    """Range of each gain."""
 
     lower: Float[Array | np.ndarray, "*problems gains"]  # lower bound
     upper: Float[Array | np.ndarray, "*problems gains"]  # upper bound
-    logarithmic: Float[Array | np.ndarray, "*problems gains"]  # 1 where the scale is logarithmic, else 0
+    logarithmic: Float[Array | np.ndarray, "*problems gains"]  # 1 for a logarithmic scale, else 0
 
 
 def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:
-    """Gains at `coordinates` of their ranges; NumPy in, NumPy out. A share outside [0, 1] counts as the
-    nearest one inside, with the derivative of one inside."""
+    """Return the gains at unit `coordinates`, as NumPy or JAX arrays like the input.
+
+    A coordinate outside [0, 1] is clipped, but keeps the derivative of one inside.
+    """
     xp = jnp if isinstance(coordinates, jax.Array) else np
     inside = xp.clip(coordinates, 0, 1)
     if xp is jnp:
@@ -32,7 +34,7 @@ def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[
 def to_coordinates(
     gains: Float[np.ndarray, "*points gains"], bounds: Bounds
 ) -> Float[np.ndarray, "*points gains"]:
-    """Inverse of `to_gains`; of a gain beyond its bounds the nearest bound's, 0 where both bounds are one."""
+    """Return the unit coordinates of gains, clipped to [0, 1]; 0 if both bounds are equal."""
     lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
     curved = (np.asarray(bounds.logarithmic) > 0) & (upper > lower)
     span = np.where(upper > lower, upper - lower, 1)

@@ -1,1 +1,1 @@
-"""Pictures of tuning and of runs."""
+"""Plots of tuning results and of six-axis runs."""

@@ -1,4 +1,4 @@
-"""A contact in six axes as a film: in space beside that on the rig."""
+"""Animation of a six-axis contact: the ideal contact beside the contact on the rig."""
 
 import tempfile
 from pathlib import Path
@@ -18,21 +18,18 @@ from jaxhil.sixdof.recording import Recorded
 from tuning.pictures.outlines import Line, outlines, rotation_matrix
 from tuning.pictures.six_axes import AXES, VIEWS, origin_of, rotation_of, window
 
-FRAMES, RATE = 60, 12  # how many there are, and how many are shown in a second
-ROUND = 3.0  # of the motion, how far around it is seen
+FRAMES, RATE = 60, 12  # number of frames, and frames per second
+ROUND = 3.0  # margin around the contact, relative to the motion
 COLUMNS = ("in space", "on the rig")
 
 
 @matplotlib.style.context("default")
 def animate(recorded: Recorded, title: str, path: str | Path) -> None:
-    """Write the film, whole or not at all: both mechanisms where they touch, from two sides.
-
-    Raises OSError when that is not possible.
-    """
+    """Write an animation of both mechanisms near the contact, in two views. Raise OSError if this fails."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    shown_ = window(recorded)
-    ticks = np.unique(np.linspace(shown_.start, shown_.stop - 1, FRAMES).astype(int))
+    ticks_shown = window(recorded)
+    ticks = np.unique(np.linspace(ticks_shown.start, ticks_shown.stop - 1, FRAMES).astype(int))
     figure = new_figure((7.6, 8), title, above=0.9, below=0.6)
     FigureCanvasAgg(figure)
     figure.subplots_adjust(hspace=0.28, wspace=0.28)
@@ -41,22 +38,23 @@ def animate(recorded: Recorded, title: str, path: str | Path) -> None:
     origin, since = origin_of(recorded)
     writer = _writer(target)
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / f"film{target.suffix.lower()}"
-        with writer.saving(figure, str(made), 64):
+        film = Path(folder) / f"film{target.suffix.lower()}"
+        with writer.saving(figure, str(film), 64):
             for tick in ticks:
                 clock.set_text(f"{1e3 * (recorded.time[tick] - recorded.time[origin]):.0f} ms {since}")
-                for lines, chaser, place, view in moving:
-                    lines.set_segments(_seen(chaser, place[tick], view))
+                for lines, chaser, poses, view in moving:
+                    lines.set_segments(_seen(chaser, poses[tick], view))
                 writer.grab_frame()
-        write_whole(target, made.read_bytes())
+        write_whole(target, film.read_bytes())
 
 
 def _writer(target: Path) -> AbstractMovieWriter:
+    """Return the writer for a file's format."""
     return PillowWriter(fps=RATE) if target.suffix.lower() == ".gif" else FFMpegWriter(fps=RATE)
 
 
 def _scene(figure: Figure, recorded: Recorded) -> list[tuple[LineCollection, list[Line], np.ndarray, Any]]:
-    """Axes with the target in them; per axes the chaser's lines there and in C, its poses, the view."""
+    """Draw the target in every axes; return each axes' chaser lines, chaser outline in C, poses and view."""
     target, chaser = outlines(recorded.groups)
     middle, half = _region(recorded)
     moving = []
@@ -74,22 +72,24 @@ def _scene(figure: Figure, recorded: Recorded) -> list[tuple[LineCollection, lis
 
 
 def _region(recorded: Recorded) -> tuple[np.ndarray, float]:
-    """Middle and half the width [m] of what is shown: where forces are, and as far around as things move."""
+    """Return middle and half width [m] of the region shown: the points of contact, and a margin."""
     touching = recorded.depth > 0
     points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]
-    shown_ = window(recorded)
-    moved = np.ptp(recorded.desired[shown_, :3], axis=0).max()
+    ticks = window(recorded)
+    moved = np.ptp(recorded.desired[ticks, :3], axis=0).max()
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, float(np.max(high - low) / 2 + ROUND * moved + 0.01)
 
 
 def _frame(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
-    across, up = (1e3 * (one + half * np.array([-1, 1])) for one in middle)
+    """Set limits, labels and grid of an axes."""
+    across, up = (1e3 * (centre + half * np.array([-1, 1])) for centre in middle)
     axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
     axes.set(xlabel=f"{AXES[view[0]]} of T [mm]", ylabel=f"{AXES[view[1]]} of T [mm]")
     axes.grid(True, color="0.9", linewidth=0.6)
 
 
-def _seen(chaser: list[Line], place: np.ndarray, view: tuple[int, int]) -> Any:
-    turn = rotation_matrix(rotation_of(place[3:]))
-    return [1e3 * (line @ turn.T + place[:3])[:, list(view)] for line in chaser]
+def _seen(chaser: list[Line], pose: np.ndarray, view: tuple[int, int]) -> Any:
+    """Return the chaser's outline at a pose in a view, in mm."""
+    rotation = rotation_matrix(rotation_of(pose[3:]))
+    return [1e3 * (line @ rotation.T + pose[:3])[:, list(view)] for line in chaser]

@@ -1,4 +1,4 @@
-"""Outlines of the shapes that may touch, as lines in space: what pictures of six axes draw of a mechanism."""
+"""Outlines of the shapes that may touch, as lines in space, for the plots of a six-axis mechanism."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,41 +14,44 @@ from jaxhil.sixdof.vectors import Vector
 
 Line = np.ndarray  # (points, 3) [m]
 
-TURN = np.linspace(0, 2 * np.pi, 49)
-MERIDIANS = 24  # of a surface of revolution
-MARK = 0.02  # of the size of the mechanism: a point's cross
+TURN = np.linspace(0, 2 * np.pi, 49)  # angles of the points of a circle
+MERIDIANS = 24  # number of meridians of a surface of revolution
+MARK = 0.02  # half size of the cross that marks a point, relative to the mechanism
 
 
 def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Line], list[Line]]:
-    """Of the first lane's target, in T axes, and chaser, in C axes; each line once."""
+    """Return the outlines of the target, in T axes, and of the chaser, in C axes, without duplicate lines.
+
+    They are those of the first batch element.
+    """
     pairs = [pair for group in groups for pair in _pairs(group.candidates)]
-    places = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])
-    size = float(np.max(np.linalg.norm(places, axis=1), initial=1e-3))
-    drawn = []
+    corners = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])
+    size = float(np.max(np.linalg.norm(corners, axis=1), initial=1e-3))
+    bodies = []
     for shapes in ([target for _, target in pairs], [chaser for chaser, _ in pairs]):
         lines = {line.round(9).tobytes(): line for shape in shapes for line in _lines(shape, size)}
-        drawn.append(list(lines.values()))
-    return drawn[0], drawn[1]
+        bodies.append(list(lines.values()))
+    return bodies[0], bodies[1]
 
 
 def _pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
-    """(chaser's, target's) shapes of the first lane."""
+    """Return the pairs (chaser's, target's shape) of the first batch element."""
 
-    def every(shape: Any) -> list[Any]:
+    def unstack(shape: Any) -> list[Any]:
         leaves, structure = jax.tree.flatten(shape)
         rows = np.asarray([np.broadcast_arrays(*leaves)], float)[0, :, :, 0]
         return [structure.unflatten(list(row)) for row in rows.T]
 
     if isinstance(candidates, Capsules):
-        return list(zip(every(candidates.chaser), every(candidates.target), strict=True))
+        return list(zip(unstack(candidates.chaser), unstack(candidates.target), strict=True))
     assert isinstance(candidates, (ChaserSpheres, TargetSpheres))
-    balls, others = every(Ball(candidates.centre, candidates.radius)), every(candidates.shape)
-    one_on_chaser = isinstance(candidates, ChaserSpheres)
-    return list(zip(balls, others, strict=True) if one_on_chaser else zip(others, balls, strict=True))
+    balls, shapes = unstack(Ball(candidates.centre, candidates.radius)), unstack(candidates.shape)
+    ball_on_chaser = isinstance(candidates, ChaserSpheres)
+    return list(zip(balls, shapes, strict=True) if ball_on_chaser else zip(shapes, balls, strict=True))
 
 
 def _corners(shape: Any) -> np.ndarray:
-    """Points (n, 3) that say how large a shape is; of a plane or a cone without end none."""
+    """Return points (n, 3) that span a shape; none for a plane or an infinite cone."""
     if isinstance(shape, (Ball, Cavity)):
         reach = 0.0 if isinstance(shape, Cavity) else float(shape.radius)
         return _point(shape.centre)[None] + reach * np.eye(3)
@@ -62,6 +65,7 @@ def _corners(shape: Any) -> np.ndarray:
 
 
 def _lines(shape: Any, size: float) -> list[Line]:
+    """Return the outline of a shape of a mechanism of this `size` [m]."""
     if isinstance(shape, (Ball, Cavity)):
         radius = float(shape.radius)
         circles = [radius * np.roll(_circle(), turn, axis=1) for turn in range(3)] if radius else _cross(size)
@@ -96,7 +100,7 @@ def _plane(plane: Plane, size: float) -> list[Line]:
 
 
 def _drogue(drogue: Drogue, size: float) -> list[Line]:
-    """Meridians and parallels of the bottom and the cone, up to the mouth."""
+    """Return meridians and parallels of the bottom and of the cone up to the mouth."""
     angle, bottom = float(drogue.half_angle), float(drogue.bottom_radius)
     mouth = float(drogue.mouth_radius) if isinstance(drogue, Shell) else 1.2 * size
     below = np.linspace(0, np.pi / 2 - angle, 9)
@@ -121,12 +125,12 @@ def _box(box: Box) -> list[Line]:
     half = _point(box.half_lengths)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     edges = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
-    turned = (corners * half) @ rotation_matrix(box.attitude).T + _point(box.centre)
-    return [turned[list(edge)] for edge in edges]
+    points = (corners * half) @ rotation_matrix(box.attitude).T + _point(box.centre)
+    return [points[list(edge)] for edge in edges]
 
 
 def rotation_matrix(attitude: Quaternion) -> np.ndarray:
-    """R (3, 3) of a unit quaternion."""
+    """Return the rotation matrix (3, 3) of a unit quaternion."""
     w, (x, y, z) = float(attitude.w), _point(attitude.v)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,4 +1,4 @@
-"""Pictures of tuning, in the units and colours of those of a run (`jaxhil.simulation.contact_plot`)."""
+"""Plots of tuning results, in the units and colours of `jaxhil.simulation.contact_plot`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,21 +30,21 @@ MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
 
 @matplotlib.style.context("default")
 def errors_plot(result: TuneResult, limit: float) -> Figure:
-    """How large errors are and how often, and at which contact frequency, before and after tuning."""
+    """Plot distribution and contact frequency of the restitution errors, before and after tuning."""
     figure = new_figure(
         (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
     )
     left, right = figure.subplots(1, 2)
-    # A limit of 0 or inf has no place on a logarithmic axis.
-    drawn = 0 < limit < np.inf
-    sizes: list[float] = [limit] if drawn else []
+    # A limit of 0 or infinity cannot be drawn on a logarithmic axis.
+    has_limit = 0 < limit < np.inf
+    sizes: list[float] = [limit] if has_limit else []
     for name, outcome in result.outcomes.items():
         size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
         if not len(size):
             continue
         colour, line, width = STYLES[name]
         total = int(np.sum(outcome.wanted))
-        # Contacts that did not end are larger than any error: they raise the whole curve.
+        # Contacts that did not end count as larger than any error and raise the whole curve.
         share = (np.arange(1, len(size) + 1) + total - len(size)) / total
         left.step(
             size, share, where="post", color=colour, linestyle=line, linewidth=width, label=LABELS[name]
@@ -64,19 +64,19 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
             label=LABELS[name],
             rasterized=True,
         )
-    if drawn:
+    if has_limit:
         left.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
         right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
     positive = [value for value in sizes if value > 0] or [1.0]
     left.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
     left.set(xlabel="size of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
     right.axhline(0, color=BLACK, linewidth=0.6)
-    right.set_yscale("symlog", linthresh=limit if drawn else 0.01)
+    right.set_yscale("symlog", linthresh=limit if has_limit else 0.01)
     right.set(xlabel="contact frequency [Hz]", ylabel="error e - e* [1]  (above 0: divergence)")
     finish(left, "lower left")
     finish(right, None)
     if right.get_legend_handles_labels()[0]:
-        # Above the axes: points are everywhere inside.
+        # The legend is above the axes, because there are points everywhere inside.
         style: dict[str, Any] = {"fontsize": 8, "frameon": False, "markerscale": 2.5, "columnspacing": 1.2}
         legend = right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, **style)
         for handle in legend.legend_handles:
@@ -87,7 +87,7 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def two_errors_plot(result: TuneResult, limit: float) -> Figure:
-    """Of six axes, how large the errors of energy and twist are and how often, before and after tuning."""
+    """Plot the distributions of the energy and twist errors of six axes, before and after tuning."""
     figure = new_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
     shown = {"energy_error": "size of the energy error [1]", "twist_error": "twist error [1]"}
     for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
@@ -99,7 +99,7 @@ def two_errors_plot(result: TuneResult, limit: float) -> Figure:
                 continue
             colour, line, width = STYLES[name]
             total = int(np.sum(part.wanted))
-            # Episodes that did not end are larger than any error: they raise the whole curve.
+            # Episodes that did not end count as larger than any error and raise the whole curve.
             share = (np.arange(1, len(size) + 1) + total - len(size)) / total
             style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
             axes.step(size, share, where="post", label=LABELS[name], **style)
@@ -115,17 +115,17 @@ def two_errors_plot(result: TuneResult, limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def loss_plot(result: TuneResult) -> Figure:
-    """The objective that each start of the solver had reached after each step."""
+    """Plot the objective of each start against the steps of the solver."""
     figure = new_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
     best = min(finite, key=lambda start: start.rms) if finite else None
     for number, start in enumerate(result.starts):
         steps = np.arange(1, len(start.history) + 1)
-        first = number == 0
-        colour, width = (BLUE, 2.5) if start is best else (ORANGE, 1.8) if first else ("0.6", 1.0)
+        is_first = number == 0
+        colour, width = (BLUE, 2.5) if start is best else (ORANGE, 1.8) if is_first else ("0.6", 1.0)
         label = "best start" if start is best else None
-        if first:
+        if is_first:
             label = "start at the literature's gains" + (" (best)" if start is best else "")
         elif label is None and number == next(
             (i for i, s in enumerate(result.starts) if i and s is not best), 0
@@ -145,7 +145,7 @@ def loss_plot(result: TuneResult) -> Figure:
 
 @matplotlib.style.context("default")
 def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
-    """The rms restitution error of every mechanism before tuning, with the literature's gains, and tuned."""
+    """Plot the rms error of every mechanism before tuning, with the literature's gains, and after tuning."""
     height = 1.6 + 0.2 * len(results)
     figure = new_figure(
         (8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9
@@ -169,35 +169,35 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
-    """Restitution error against what it is traded for: numbered points, the front as a line of what
-    is reached, the literature's gains and those tuned beside."""
+    """Plot restitution error against cost: the front, all numbered points, literature's and tuned gains."""
     figure = new_figure(
         (7, 5), f"{result.mechanism.name}: restitution error against {front.axis.name}, fresh scenarios"
     )
     axes = figure.subplots()
-    kept = sorted((one for one in front.points if one.on_front), key=lambda one: one.cost)
-    axes.step([p.cost for p in kept], [p.error for p in kept], where="post", color=BLUE)
+    best = sorted((point for point in front.points if point.on_front), key=lambda point: point.cost)
+    axes.step([p.cost for p in best], [p.error for p in best], where="post", color=BLUE)
     for points, label, marker, size, edge, face in (
-        (kept, "front", "o", 7, BLUE, BLUE),
-        ([one for one in front.points if not one.on_front], "beaten by another", "o", 7, BLUE, "white"),
+        (best, "front", "o", 7, BLUE, BLUE),
+        ([p for p in front.points if not p.on_front], "beaten by another", "o", 7, BLUE, "white"),
         ([front.literature], LABELS["literature"], "s", 7, ORANGE, ORANGE),
-        # Open: what was tuned before may be a point too.
+        # The marker is open, because the tuned gains may also be a point of the front.
         ([front.tuned], LABELS["tuned"], "D", 10, BLACK, "none"),
     ):
         if points:
-            places = [one.cost for one in points], [one.error for one in points]
+            values = [point.cost for point in points], [point.error for point in points]
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": size}
-            axes.plot(*places, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
+            axes.plot(*values, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
     if 0 < limit < np.inf:
         axes.axhline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
-    numbers: dict[tuple[float, float], list[str]] = {}  # points that came out alike share a place
-    for number, one in enumerate(front.points, start=1):
-        numbers.setdefault(one.place, []).append(str(number))
-    for turn, (error, noise) in enumerate(sorted(numbers)):
-        where = {"xytext": (6, -14 if turn % 2 else 6), "textcoords": "offset points"}  # one above, one below
-        axes.annotate(", ".join(numbers[error, noise]), (noise, error), fontsize=8, **where)
-    _scale(axes, "x", [one.cost for one in (*front.points, front.literature, front.tuned)])
-    _scale(axes, "y", [one.error for one in (*front.points, front.literature, front.tuned)])
+    numbers: dict[tuple[float, float], list[str]] = {}  # equal points share one label
+    for number, point in enumerate(front.points, start=1):
+        numbers.setdefault(point.place, []).append(str(number))
+    for index, (error, cost) in enumerate(sorted(numbers)):
+        # Labels alternate above and below the points, so that they do not overlap.
+        offset = {"xytext": (6, -14 if index % 2 else 6), "textcoords": "offset points"}
+        axes.annotate(", ".join(numbers[error, cost]), (cost, error), fontsize=8, **offset)
+    _scale(axes, "x", [point.cost for point in (*front.points, front.literature, front.tuned)])
+    _scale(axes, "y", [point.error for point in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
     name = result.settings.objective.name
     axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of e - e* [1]")
@@ -206,12 +206,12 @@ def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
 
 
 def _scale(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """A logarithmic axis, its ticks plain numbers, where values of different orders are on it."""
+    """Make an axis logarithmic with plain tick labels if its values differ by more than a factor of 3."""
     low, high = min(values), max(values)
     if not 0 < 3 * low < high:
         return
     axes.set(**{f"{name}scale": "log"})
     axis = {"x": axes.xaxis, "y": axes.yaxis}[name]
     axis.set_minor_locator(LogLocator(subs=(2, 3, 5) if high > 5 * low else range(2, 10)))
-    for plainly in (axis.set_major_formatter, axis.set_minor_formatter):
-        plainly(lambda value, _: f"{value:g}")
+    for set_formatter in (axis.set_major_formatter, axis.set_minor_formatter):
+        set_formatter(lambda value, _: f"{value:g}")

@@ -1,4 +1,4 @@
-"""Pictures of a run in six axes: poses and forces over time, and the mechanism as it touches."""
+"""Plots of a six-axis run: poses and forces over time, and views of the mechanism in contact."""
 
 from typing import Any
 
@@ -14,23 +14,25 @@ from tuning.pictures.outlines import Line, outlines, rotation_matrix
 
 AXES = ("x", "y", "z")
 COLOURS = (BLUE, VERMILION, GREEN)
-MANY = (BLUE, VERMILION, GREEN, ORANGE, SKY, "0.35")  # candidates; further ones repeat them, dashed
-MARGIN = 0.05  # s shown before the first force and after the last
-FLATTEST = 0.3  # height of a view over its width, at least
-MOST_NAMES = 12  # candidates in a legend
-VIEWS = ((0, 2), (1, 2))  # what is across and what is up
+MANY = (BLUE, VERMILION, GREEN, ORANGE, SKY, "0.35")  # colours of candidates; repeated with dashed lines
+MARGIN = 0.05  # s; time shown before the first and after the last contact
+FLATTEST = 0.3  # least ratio of a view's height to its width
+MOST_NAMES = 12  # limit on the number of candidates in a legend
+VIEWS = ((0, 2), (1, 2))  # horizontal and vertical axis of each view
 
 
 @matplotlib.style.context("default")
 def six_axes_plot(recorded: Recorded, title: str) -> Figure:
-    """Pose, forces of the candidates and load over time, beside the same contact in space; below, the
-    mechanism at the first touch and at the deepest contact."""
+    """Plot pose, normal forces and moments over time, and the mechanism at first touch and deepest contact.
+
+    Grey lines show the ideal contact.
+    """
     figure = new_figure((12, 8.8), title, above=0.6, below=0.75)
     rows = figure.add_gridspec(3, 4, height_ratios=(1, 1, 0.75), hspace=0.38, wspace=0.36)
     shown, (origin, since) = window(recorded), origin_of(recorded)
     time = 1e3 * (recorded.time[shown] - recorded.time[origin])
-    for place, name, part in ((rows[0, :2], "position [mm]", 0), (rows[0, 2:], "rotation [mrad]", 3)):
-        axes = figure.add_subplot(place)
+    for cell, name, part in ((rows[0, :2], "position [mm]", 0), (rows[0, 2:], "rotation [mrad]", 3)):
+        axes = figure.add_subplot(cell)
         for axis, colour in enumerate(COLOURS):
             entry = part + axis
             curves = (curve[shown, entry] - recorded.in_space[origin, entry] for curve in recorded[1:4])
@@ -59,7 +61,7 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
 
 
 def origin_of(recorded: Recorded) -> tuple[int, str]:
-    """The tick from which time is counted, and what it is: the first touch, in space if there is one."""
+    """Return the tick of time 0 and its description: the first touch, of the ideal contact if it touches."""
     in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
     if len(in_space):
         return int(in_space[0]), "since first touch in space"
@@ -68,7 +70,7 @@ def origin_of(recorded: Recorded) -> tuple[int, str]:
 
 
 def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
-    """Ticks at which the mechanism is drawn, and what they are."""
+    """Return descriptions and ticks of the two moments at which the mechanism is drawn."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
         return ("start", 0), ("end", len(recorded.time) - 1)
@@ -76,36 +78,36 @@ def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
 
 
 def window(recorded: Recorded) -> slice:
-    """The ticks worth showing: those with contact on the rig or in space, and some around them."""
+    """Return the ticks from first to last contact, on the rig or ideal, with a margin; else all ticks."""
     touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_in_space != 0, axis=1)
     ticks = np.flatnonzero(touching)
     if not len(ticks):
         return slice(0, len(recorded.time))
-    around = round(MARGIN / float(recorded.time[1] - recorded.time[0])) + 1
-    return slice(max(ticks[0] - around, 0), min(ticks[-1] + around, len(recorded.time)))
+    margin = round(MARGIN / float(recorded.time[1] - recorded.time[0])) + 1
+    return slice(max(ticks[0] - margin, 0), min(ticks[-1] + margin, len(recorded.time)))
 
 
 def draw_view(
     axes: Axes, recorded: Recorded, tick: int, target: list[Line], chaser: list[Line], across: int, up: int
 ) -> None:
-    """Both mechanisms at a tick, seen along the third axis, in mm."""
-    place = recorded.actual[tick]
-    turn = rotation_matrix(rotation_of(place[3:]))
-    moved = [line @ turn.T + place[:3] for line in chaser]
+    """Draw both mechanisms at a tick, seen along the third axis, in mm."""
+    pose = recorded.actual[tick]
+    rotation = rotation_matrix(rotation_of(pose[3:]))
+    moved = [line @ rotation.T + pose[:3] for line in chaser]
     for lines, colour in ((target, "0.55"), (moved, BLUE)):
         flat: Any = [1e3 * line[:, [across, up]] for line in lines]
         axes.add_collection(LineCollection(flat, colors=colour, linewidths=0.9))
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="box")
-    wide, high = (float(np.ptp(one)) for one in (axes.dataLim.intervalx, axes.dataLim.intervaly))
-    # A flat mechanism still has room for its forces.
-    missing = max(FLATTEST * wide - high, 0.0)
+    width, height = (float(np.ptp(limits)) for limits in (axes.dataLim.intervalx, axes.dataLim.intervaly))
+    # A flat mechanism needs additional height for its forces.
+    missing = max(FLATTEST * width - height, 0.0)
     axes.set_ylim(axes.get_ylim()[0] - missing / 2, axes.get_ylim()[1] + missing / 2)
     largest = max(float(np.max(recorded.force)), 1e-12)
-    reach = 0.4 * max(high, FLATTEST * wide)
+    length = 0.4 * max(height, FLATTEST * width)
     for candidate in np.flatnonzero(recorded.depth[tick] > 0):
         start = 1e3 * recorded.point[tick, candidate][[across, up]]
-        push = reach * recorded.push[tick, candidate][[across, up]] / largest
+        push = length * recorded.push[tick, candidate][[across, up]] / largest
         axes.plot(*start, marker=".", color=BLACK, markersize=5)
         axes.annotate("", start + push, start, arrowprops={"arrowstyle": "->", "color": BLACK})
     axes.set(xlabel=f"{AXES[across]} of T [mm]", ylabel=f"{AXES[up]} of T [mm]")
@@ -113,7 +115,7 @@ def draw_view(
 
 
 def rotation_of(theta: np.ndarray) -> Any:
-    """The quaternion of a rotation vector [rad]."""
+    """Return the quaternion of a rotation vector [rad]."""
     import jax.numpy as jnp
 
     from jaxhil.sixdof.rotations import exponential
@@ -123,19 +125,19 @@ def rotation_of(theta: np.ndarray) -> Any:
 
 
 def _forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Normal force of every candidate that touches, and the whole force in space."""
-    whole = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
-    axes.plot(time, whole, color="0.7", linewidth=3, label="in space, whole")
-    for place, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
-        colour, line = MANY[place % len(MANY)], "-" if place < len(MANY) else "--"
-        name = recorded.names[candidate] if place < MOST_NAMES else None
+    """Plot the normal force of every candidate in contact, and the total force of the ideal contact."""
+    total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
+    axes.plot(time, total, color="0.7", linewidth=3, label="in space, whole")
+    for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
+        colour, line = MANY[index % len(MANY)], "-" if index < len(MANY) else "--"
+        name = recorded.names[candidate] if index < MOST_NAMES else None
         axes.plot(time, recorded.force[shown, candidate], color=colour, linestyle=line, label=name)
     axes.set(ylabel="normal force of each contact [N]")
     finish(axes, "best")
 
 
 def _moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Moment about T of the real contact, of what moves the numerical model, and in space."""
+    """Plot the moment about T of the real contact, of the command to the numerical model, and ideal."""
     for axis, colour in enumerate(COLOURS):
         axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
         axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXES[axis])

@@ -1,1 +1,1 @@
-"""Statistics of errors and failures: intervals, quantiles, resampling, Sobol indices, rare events."""
+"""Statistics of errors and failures: intervals, quantiles, bootstrap, Sobol indices, subset simulation."""

@@ -1,4 +1,4 @@
-"""Intervals of figures of a batch of scenarios by resampling: of its rms error, of its 99th percentile."""
+"""Bootstrap confidence intervals of the rms error and the 99th percentile of a batch of scenarios."""
 
 from typing import NamedTuple
 
@@ -8,25 +8,25 @@ from scipy.stats import bootstrap
 
 RESAMPLES = 1999
 LEVEL = 0.95
-MANY = 4096  # scenarios
+MANY = 4096  # number of scenarios above which the BCa correction is negligible and its jackknife is slow
 
 
 class Interval(NamedTuple):
-    """Lower and upper end."""
+    """Confidence interval."""
 
     low: float
     high: float
 
 
 class ErrorIntervals(NamedTuple):
-    """Of the rms and of the 99th percentile of |e - e*|; NaN where fewer than two scenarios count."""
+    """Intervals of the rms and the 99th percentile of |e - e*|; NaN if fewer than two scenarios count."""
 
     rms: Interval
     p99: Interval
 
     def plain(self) -> dict[str, dict[str, float]]:
-        """As plain data, for files."""
-        return {name: one._asdict() for name, one in self._asdict().items()}
+        """Return the intervals as plain data for files."""
+        return {name: interval._asdict() for name, interval in self._asdict().items()}
 
 
 def error_intervals(
@@ -37,23 +37,22 @@ def error_intervals(
     level: float = LEVEL,
     seed: int = 0,
 ) -> ErrorIntervals:
-    """Bootstrap confidence intervals of the rms and the 99th percentile of |e - e*| over `good` contacts.
+    """Return bootstrap confidence intervals of the rms and 99th percentile of |e - e*| over `good` contacts.
 
-    Scenarios are resampled, each with all its contacts: those of one scenario depend on each other. Of the
-    rms, a ratio of two means over scenarios, the interval is BCa (bias-corrected and accelerated); of the
-    percentile, which is not smooth and has no use for an acceleration, the percentile interval. That is the
-    interval of the rms too where there are so many scenarios that the correction is nothing and its jackknife
-    is long.
+    Whole scenarios are resampled, because the contacts of a scenario depend on each other. The rms, a ratio
+    of two means over scenarios, has the BCa interval (bias-corrected and accelerated), or with more than
+    `MANY` scenarios the percentile interval. The 99th percentile, which is not smooth enough for an
+    acceleration, has the percentile interval.
 
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 13 and 14.
     """
     size = np.where(good, np.abs(errors), 0)
     counts = np.sum(good, axis=0)
-    met = counts > 0
-    size, good, counts = size[:, met], good[:, met], counts[met]
-    if np.sum(met) < 2:
-        nowhere = Interval(float("nan"), float("nan"))
-        return ErrorIntervals(nowhere, nowhere)
+    has_good = counts > 0
+    size, good, counts = size[:, has_good], good[:, has_good], counts[has_good]
+    if np.sum(has_good) < 2:
+        unknown = Interval(float("nan"), float("nan"))
+        return ErrorIntervals(unknown, unknown)
     squares = np.sum(size**2, axis=0)
     if np.ptp(squares / counts) <= 1e-12 * np.max(squares / counts):
         return ErrorIntervals(*[Interval(float(np.max(size)), float(np.max(size)))] * 2)
@@ -61,7 +60,7 @@ def error_intervals(
     def root_mean_square(squares, counts, axis):
         return np.sqrt(np.sum(squares, axis=axis) / np.sum(counts, axis=axis))
 
-    found = bootstrap(
+    rms = bootstrap(
         (squares, counts),
         root_mean_square,
         paired=True,
@@ -75,26 +74,26 @@ def error_intervals(
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
     percentiles = _resampled_percentile(size, good, 0.99, resamples, np.random.default_rng(seed))
     return ErrorIntervals(
-        Interval(float(found.low), float(found.high)),
+        Interval(float(rms.low), float(rms.high)),
         Interval(*map(float, np.quantile(percentiles, tails))),
     )
 
 
 def _resampled_percentile(size, good, share, resamples, generator):
-    """A quantile of the `good` ones of `size` (slots, scenarios), for so many resamplings of scenarios.
+    """Return the quantile of order `share` of `size` (slots, scenarios) at `good`, for each of the resamples.
 
-    Each resample is a count per scenario. Only the largest contacts are gone through: the quantile of a
-    resample is among the first few of them, however often each counts.
+    A resample is a count per scenario. Its quantile is among the largest contacts, so that only these are
+    used.
     """
     slots, scenarios = size.shape
     contacts = np.flatnonzero(good)
     contacts = contacts[np.argsort(-size.reshape(-1)[contacts], kind="stable")]
-    # Far more than a resample can need: five standard deviations above the share it looks for.
+    # Five standard deviations more than the expected number are far more than a resample can need.
     expected = (1 - share) * len(contacts)
     largest = contacts[: int(np.ceil(expected + 5 * slots * np.sqrt(expected) + 5 * slots))]
     values = size.reshape(-1)[largest]
     counts = np.sum(good, axis=0)
-    found = np.empty(resamples)
+    quantiles = np.empty(resamples)
     batch = max(1, 2_000_000 // scenarios)
     for first in range(0, resamples, batch):
         number = min(batch, resamples - first)
@@ -102,11 +101,11 @@ def _resampled_percentile(size, good, share, resamples, generator):
         drawn += scenarios * np.arange(number)[:, None]
         weights = np.bincount(drawn.reshape(-1), minlength=number * scenarios).reshape(number, scenarios)
         above = np.cumsum(weights[:, largest % scenarios], axis=1)
-        # As `np.quantile` has it, counted from the largest: between two neighbours.
+        # Linear interpolation as in `np.quantile`, with ranks counted from the largest value.
         rank = (1 - share) * (weights @ counts - 1)
         near, far = (
-            values[np.argmax(above > place[:, None], axis=1)]
-            for place in (np.floor(rank), np.floor(rank) + 1)
+            values[np.argmax(above > index[:, None], axis=1)]
+            for index in (np.floor(rank), np.floor(rank) + 1)
         )
-        found[first : first + number] = near + (rank - np.floor(rank)) * (far - near)
-    return found
+        quantiles[first : first + number] = near + (rank - np.floor(rank)) * (far - near)
+    return quantiles

@@ -1,10 +1,10 @@
-"""Quantiles of |error| with intervals that hold for any distribution, in constant memory if need be.
+"""Distribution-free confidence intervals of quantiles of |error|, in constant memory.
 
-Below the quantile of order q lie, of n independent values, a binomial number of them: the order statistics of
-ranks that this number does not leave enclose the quantile, whatever the distribution. The values themselves
-need not be kept. `counts` sorts them into bins of fixed edges, each 1 % above the last: counts of parts add
-up, and the same order statistics are then known to a bin, outward. `replicate_quantile` does it for
-scramblings of a Sobol sequence, whose points no binomial law describes.
+The number of n independent values below the quantile of order q has a binomial distribution. The order
+statistics at bounds of this number therefore enclose the quantile, for any distribution. The values need not
+be stored: `counts` counts them in bins whose edges increase by 1 %. Counts of several batches add up, and
+give the order statistics to within a bin, rounded outward. `replicate_quantile` does the same for scramblings
+of a Sobol sequence, for whose points no binomial distribution applies.
 """
 
 import numpy as np
@@ -13,9 +13,9 @@ from scipy import special
 
 from tuning.statistics.intervals import LEVEL, PRIOR, Estimate, replicate_interval
 
-RESOLUTION = 0.01  # of an edge, to the next one
-_DECADES = -9, 3
-# Below the first edge is a bin of its own, from 0; above the last one too, to infinity.
+RESOLUTION = 0.01  # relative distance of neighbouring edges
+_DECADES = -9, 3  # powers of 10 of the first edge and about the last one
+# Two further bins reach from 0 to the first edge, and from the last edge to infinity.
 EDGES = 10.0 ** _DECADES[0] * (1.0 + RESOLUTION) ** np.arange(
     int(np.ceil((_DECADES[1] - _DECADES[0]) * np.log(10.0) / np.log1p(RESOLUTION))) + 1
 )
@@ -23,14 +23,15 @@ BINS = len(EDGES) + 1
 
 
 def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = False) -> tuple[int, int]:
-    """Ranks (1 the least, 0 and `number` + 1 beyond all) of the order statistics around a quantile.
+    """Return the ranks of the order statistics that enclose a quantile.
 
-    Between X_(low) and X_(high), ends included, is the quantile of order q with probability `level` or more
-    (David and Nagaraja 2003, section 7.1, with ties too). Fixed number: low and high - 1 are the quantiles
-    (1 -+ level) / 2 of the binomial distribution of n and q. Sequential: they are the counts k at which the
-    martingale of `tuning.statistics.intervals.confidence_sequence` at p = q stays below 1 / (1 - level), so
-    that the interval covers whenever one stops (Howard and Ramdas 2022, "Sequential estimation of
-    quantiles"). Raises ValueError unless number >= 0, 0 < order < 1 and 0 < level < 1.
+    Rank 1 is the least value; 0 and `number` + 1 mean no bound. The quantile of order q lies between X_(low)
+    and X_(high), ends included, with at least probability `level`, also with ties (David and Nagaraja 2003,
+    section 7.1). For a fixed number, low and high - 1 are the quantiles (1 -+ level) / 2 of the binomial
+    distribution of n and q. If `sequential`, they are the extreme counts k for which the martingale of
+    `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 - level), so that the interval
+    covers at any stopping rule (Howard and Ramdas 2022, "Sequential estimation of quantiles"). Raise
+    ValueError unless number >= 0, 0 < order < 1 and 0 < level < 1.
     """
     if number < 0 or not (0 < order < 1 and 0 < level < 1):
         raise ValueError(
@@ -39,7 +40,7 @@ def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = Fa
     if number == 0:
         return 0, 1
     if not sequential:
-        # Takes most of a second to import, and only this branch needs it.
+        # The import takes most of a second, and only this branch needs it.
         from scipy import stats
 
         tail = (1.0 - level) / 2.0
@@ -56,25 +57,26 @@ def ranks(number: int, order: float, level: float = LEVEL, sequential: bool = Fa
 
 
 def counts(values: ArrayLike) -> np.ndarray:
-    """How many of |values| lie in each bin, (BINS,) of int64: add those of parts. Non-finite: the last bin.
+    """Count |values| in each bin, (BINS,) of int64; counts of several batches may be added.
 
-    Bin 0 is [0, EDGES[0]), bin i is [EDGES[i - 1], EDGES[i]), the last one from EDGES[-1] on.
+    Bin 0 is [0, EDGES[0]), bin i is [EDGES[i - 1], EDGES[i]), and the last one reaches from EDGES[-1] to
+    infinity. Values that are not finite count in the last bin.
     """
     size = np.abs(np.asarray(values, float)).ravel()
     size = np.sort(np.where(np.isfinite(size), size, np.inf))
-    # Every edge is looked for among the values, which are more.
+    # Searching the edges among the values is faster than the reverse, since there are more values.
     return np.diff(np.searchsorted(size, EDGES), prepend=0, append=len(size)).astype(np.int64)
 
 
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = LEVEL, sequential: bool = False
 ) -> Estimate:
-    """The quantile of order `order` of |values| and its interval, from their `counts`, in their unit.
+    """Return the quantile of order `order` of |values| with its interval, from their `counts`.
 
-    Its ends are the order statistics of `ranks`, 0 and infinity beyond the least and the greatest value, each
-    moved outward, to the edge of its bin: off by less than `RESOLUTION` of itself (between the first edge and
-    the last one). The estimate, the order statistic of rank ceil(order n), is the geometric middle of its
-    bin, off by half of that; 0 in the first bin, infinite in the last one. Raises ValueError as `ranks` does.
+    The interval's ends are the order statistics of `ranks`, or 0 and infinity without a bound. Each is
+    rounded outward to the edge of its bin, with a relative error below `RESOLUTION` between the first and the
+    last edge. The estimate, the order statistic of rank ceil(order n), is the geometric middle of its bin,
+    with half that error; it is 0 in the first bin and infinite in the last. Raise ValueError as `ranks` does.
     """
     number = int(np.sum(counted))
     below = np.cumsum(counted)
@@ -86,23 +88,23 @@ def binned_quantile(
 
 
 def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
-    """The estimate of `binned_quantile` alone, (...), from `counts` (..., BINS); nan without values."""
+    """Return the estimate (...) of `binned_quantile` from `counts` (..., BINS); nan without values."""
     below = np.cumsum(counted, axis=-1)
     number = below[..., -1]
-    place = np.argmax(below >= _rank(number, order)[..., None], axis=-1)
+    index = np.argmax(below >= _rank(number, order)[..., None], axis=-1)
     middles = np.concatenate([[0.0], np.sqrt(EDGES[:-1] * EDGES[1:]), [np.inf]])
-    return np.where(number > 0, middles[place], np.nan)
+    return np.where(number > 0, middles[index], np.nan)
 
 
 def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) -> Estimate:
-    """As `binned_quantile`, from the `counts` (replicates, BINS) of equally many points of each of several
-    independent scramblings of a Sobol sequence.
+    """Return the quantile with its interval from independent scramblings of a Sobol sequence.
 
-    The share of |values| below an edge has the interval of `tuning.statistics.intervals.replicate_interval`.
-    The quantile lies between the edge before the first one where that reaches up to `order`, and the edge
-    after the last one where it reaches down to it: this fails only if the share's interval does at one of the
-    two edges around the quantile, each to its side. Raises ValueError as `ranks` and `replicate_interval` do,
-    and for unequal numbers.
+    `counted` holds the `counts` (replicates, BINS), with an equal number of points in each replicate. The
+    share of |values| below an edge has the interval of `tuning.statistics.intervals.replicate_interval`. The
+    quantile's interval begins at the edge before the first one where this interval's upper end reaches
+    `order`, and ends at the edge after the last one where its lower end is at most `order`. It misses the
+    quantile only if the share's interval fails at one of the two edges around the quantile. Raise ValueError
+    as `ranks` and `replicate_interval` do, and for unequal numbers of points.
     """
     counted = np.asarray(counted)
     numbers = np.sum(counted, axis=-1)
@@ -118,13 +120,14 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = LEVEL) 
 
 
 def _rank(number: ArrayLike, order: float) -> np.ndarray:
-    # Rounding must not lift an exact product to the next rank.
+    """Return the rank ceil(order n), at least 1 and at most n."""
+    # The factor prevents that rounding lifts an exact product to the next rank.
     rank = np.ceil(order * np.asarray(number) * (1.0 - 1e-14))
     return np.clip(rank, 1, np.maximum(number, 1)).astype(np.int64)
 
 
 def _last(inside, within: int, beyond: int) -> int:
-    """The last whole number for which `inside` holds, from `within`, where it does, towards `beyond`."""
+    """Return by bisection the last integer from `within` towards `beyond` for which `inside` holds."""
     while abs(beyond - within) > 1:
         middle = (within + beyond) // 2
         within, beyond = (middle, beyond) if inside(middle) else (within, middle)

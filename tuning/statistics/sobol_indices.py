@@ -1,17 +1,18 @@
-"""Which uncertain input drives a result: first-order and total Sobol indices, with intervals.
+"""First-order and total Sobol indices, with intervals.
 
-Of the variance of y = f(inputs), inputs independent,
+The indices of y = f(inputs) for independent inputs x_i are
 
-    S_i = Var(E[y | x_i]) / Var(y),        T_i = E[Var(y | all but x_i)] / Var(y),
+    S_i = Var(E[y | x_i]) / Var(y),        T_i = E[Var(y | all but x_i)] / Var(y).
 
-is the share that x_i explains by itself, and the share that would be left if only x_i were unknown: all that
-it takes part in. T_i near 0: x_i may be fixed. The sum of S_i near 1: the inputs act one by one.
+S_i is the share of the variance that x_i explains alone. T_i is the share that remains if only x_i is
+unknown; it includes all interactions of x_i. If T_i is near 0, x_i may be fixed. If the sum of all S_i is
+near 1, the inputs do not interact.
 
-They take a design of their own. Two independent sets of scenarios A and B, and for every input the set AB_i:
-A but for that input, which is B's (Saltelli, Annoni, Azzini, Campolongo, Ratto, Tarantola 2010, "Variance
-based sensitivity analysis of model output"). `saltelli_design` gives its uniform numbers, which the quantile
-functions of the inputs make scenarios of; `sobol_indices` makes indices of their results. An input may have
-several columns: what is drawn independently for each contact is one input.
+The design has two independent sets of scenarios A and B, and for every input a set AB_i, which is A with that
+input from B (Saltelli, Annoni, Azzini, Campolongo, Ratto, Tarantola 2010, "Variance based sensitivity
+analysis of model output"). `saltelli_design` returns its uniform numbers, which the quantile functions of the
+inputs convert to scenarios; `sobol_indices` computes the indices from their results. An input may have
+several columns: a number that is drawn independently for each contact is one input.
 """
 
 from collections.abc import Sequence
@@ -23,29 +24,29 @@ import numpy as np
 from tuning.statistics.intervals import LEVEL, Estimate
 
 RESAMPLES = 1000
-_AT_ONCE = 2**22  # numbers of one block of resampling
+_AT_ONCE = 2**22  # limit on the numbers in memory during resampling
 
 
 class Indices(NamedTuple):
-    """First-order and total Sobol indices with their intervals, each (inputs,), as shares of the variance."""
+    """Sobol indices with their intervals, each (inputs,), as shares of the variance."""
 
     first_order: Estimate
     total: Estimate
 
 
 def evaluations(inputs: int | Sequence[int], number: int) -> int:
-    """How many scenarios the design takes: number (inputs + 2)."""
+    """Return the number of scenarios of the design, number (inputs + 2)."""
     return number * (len(_columns(inputs)) + 2)
 
 
 def saltelli_design(inputs: int | Sequence[int], number: int, seed: int) -> np.ndarray:
-    """Uniform numbers of the design, (number (inputs + 2), columns), in [0, 1): A, B, AB_1, AB_2, ...
+    """Return the uniform numbers of the design in [0, 1), (number (inputs + 2), columns): A, B, AB_1, ...
 
-    `inputs` is how many, or how many columns each of them has. A and B are the halves of a scrambled Sobol
-    sequence in twice as many columns. The same seed gives the same design. Raises ValueError unless `number`
-    is a power of two, seed >= 0, and every input has a column.
+    `inputs` is the number of inputs, or the number of columns of each input. A and B are the halves of a
+    scrambled Sobol sequence with twice as many columns. The same seed gives the same design. Raise ValueError
+    unless `number` is a power of two, seed >= 0, and every input has a column.
     """
-    # Takes most of a second to import, and only this function needs it.
+    # The import takes most of a second, and only this function needs it.
     from scipy.stats import qmc
 
     columns = _columns(inputs)
@@ -70,23 +71,22 @@ def sobol_indices(
     level: float = LEVEL,
     cap: float | None = None,
 ) -> Indices:
-    """Indices from the results (number (inputs + 2),) of the design's scenarios, in its order.
+    """Return the indices from the results (number (inputs + 2),) of the design's scenarios, in its order.
 
-    With f_A, f_B, f_i of A, B, AB_i, less the mean of f_A and f_B, and their variance V, over the rows:
+    With the results f_A, f_B, f_i of A, B, AB_i minus the mean of f_A and f_B, and the variance V of these:
 
         S_i = mean(f_B (f_i - f_A)) / V          (Saltelli et al. 2010, table 2 b)
         T_i = mean((f_A - f_i)^2) / (2 V)        (Jansen 1999; table 2 f)
 
-    the estimators of `scipy.stats.sobol_indices`. The interval: the quantiles (1 -+ level) / 2 of the same
-    from rows drawn again with replacement, `RESAMPLES` times, A, B and all AB_i of a row together (Archer,
-    Saltelli, Sobol 1997). The rows of a Sobol sequence are more even than the independent ones that this
-    supposes: it covers more than it states, and by far where f is smooth. Shares are not cut at 0: estimates
-    scatter about it. An input whose change changed no result of the design has total 0 and an interval
-    without width: that says little where the results are rare failures, counted 0 and 1.
+    as in `scipy.stats.sobol_indices`. The interval is a bootstrap percentile interval: rows of A, B and all
+    AB_i together are resampled `RESAMPLES` times (Archer, Saltelli, Sobol 1997). It assumes independent rows.
+    Those of a Sobol sequence are more even, so that it covers more than stated, by far if f is smooth.
+    Estimates may be below 0, since they are not clipped. An input that changed no result of the design has
+    total 0 and an interval of width 0, which says little if the results are rare failures, counted as 0 or 1.
 
-    Results at `cap` or above count as `cap`, and so do those that are not finite: the indices are then of the
-    result so cut. Where nothing varies, indices are nan and intervals 0 to 1. Raises ValueError for another
-    number of results, for non-finite ones without a cap, for a cap that is not finite, and for a level
+    Results at `cap` or above, and results that are not finite, count as `cap`; the indices are those of the
+    clipped result. If nothing varies, indices are nan and intervals 0 to 1. Raise ValueError for a wrong
+    number of results, for non-finite results without a cap, for a cap that is not finite, and for a level
     outside 0 to 1.
     """
     count = len(_columns(inputs))
@@ -105,7 +105,7 @@ def sobol_indices(
     if np.all(rows[:2] == rows[0, 0]):
         unknown = Estimate(np.full(count, np.nan), np.zeros(count), np.ones(count))
         return Indices(unknown, unknown)
-    # The scale drops out, and squares then neither overflow nor vanish.
+    # The scale cancels; with it at 1, squares neither overflow nor underflow.
     rows = rows / np.max(np.abs(rows))
     rows = rows - np.mean(rows[:2])
     a, b, mixed = rows[0], rows[1], rows[2:]
@@ -124,6 +124,7 @@ def sobol_indices(
 
 
 def _columns(inputs: int | Sequence[int]) -> tuple[int, ...]:
+    """Return the number of columns of each input. Raise ValueError if an input has none."""
     columns = (1,) * inputs if isinstance(inputs, int) else tuple(inputs)
     if not columns or min(columns) < 1:
         raise ValueError(f"inputs: found {inputs!r}, allowed one or more, each of one column or more")
@@ -131,13 +132,13 @@ def _columns(inputs: int | Sequence[int]) -> tuple[int, ...]:
 
 
 def _resampled_means(terms: np.ndarray, seed: int) -> np.ndarray:
-    """Means of the terms (number, terms) over rows drawn with replacement, (RESAMPLES, terms)."""
+    """Return the means (RESAMPLES, terms) of the terms (number, terms) over rows drawn with replacement."""
     number = len(terms)
     rng = np.random.default_rng(seed)
-    block = max(1, _AT_ONCE // number)
+    batch = max(1, _AT_ONCE // number)
     means = []
-    for start in range(0, RESAMPLES, block):
-        size = min(block, RESAMPLES - start)
+    for start in range(0, RESAMPLES, batch):
+        size = min(batch, RESAMPLES - start)
         drawn = rng.integers(0, number, (size, number)) + number * np.arange(size)[:, None]
         weights = np.bincount(drawn.ravel(), minlength=size * number).reshape(size, number)
         means.append(weights @ terms / number)
@@ -145,7 +146,7 @@ def _resampled_means(terms: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _ratios(means: np.ndarray) -> np.ndarray:
-    """Indices (resamples, 2 inputs) from the means of the terms."""
+    """Return indices (resamples, 2 inputs) from the means of the terms."""
     variance = means[:, -1] - means[:, -2] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(variance[:, None] > 0.0, means[:, :-2] / variance[:, None], np.nan)

@@ -1,24 +1,27 @@
-"""Probabilities of rare failures, down to 1e-6, by subset simulation, with an interval that covers.
+"""Subset simulation of rare failures, with probabilities down to 1e-6 and confidence intervals.
 
-A probability of 1e-6 is a product of six of 0.1: of failing the worst tenth, of failing the worst tenth of
-those, and so on. Each level's scenarios come from Markov chains that start at the worst of the level before
-and stay above its threshold (Au and Beck 2001, "Estimation of small failure probabilities in high dimensions
-by subset simulation"). A chain moves by conditional sampling in standard-normal space,
+A probability of 1e-6 is a product of six conditional probabilities of 0.1, one for each of a sequence of
+levels with increasing thresholds. The scenarios of a level come from Markov chains that start at the worst
+scenarios of the previous level and stay above its threshold (Au and Beck 2001, "Estimation of small failure
+probabilities in high dimensions by subset simulation"). A chain moves by conditional sampling in
+standard-normal space,
 
     v = sqrt(1 - sigma^2) u + sigma z,    z standard normal,
 
-accepted where the performance stays above the threshold, with sigma adapted to an acceptance of 0.44
+which is accepted if the performance stays above the threshold; sigma is adapted to an acceptance rate of 0.44
 (Papaioannou, Betz, Zwirglmaier, Straub 2015, "MCMC algorithms for subset simulation").
 
-The whole algorithm runs `replicates` times, independently and side by side, and the interval comes from the
-spread of their estimates. The usual formula for one run's coefficient of variation knows the correlation
-along the chains (the factors gamma), but takes chains and levels to be independent of each other, which they
-are not: they descend from the same few scenarios. It is too small by a tenth to a fifth on a plane, and by
-far more where a run may lose one of several failure regions, which no single run can notice. Replicates do,
-unless nearly all lose it. Their estimates are skewed, close to lognormal, with the probability as their mean
-but for a bias of the order of 1 / samples (with 1000, 3 % at 1e-4 and 6 % at 1e-6): the interval is the one
-for the mean of a lognormal distribution, with the formula's coefficient as the least spread, lest a few
-replicates agree by chance.
+The whole algorithm runs `replicates` times, independently and in one batch. The interval comes from the
+spread of their estimates. The usual formula for the coefficient of variation of one run includes the
+correlation along the chains (the factors gamma), but assumes that chains and levels are independent. They are
+not, since they descend from the same few scenarios. The formula is 10 to 20 % too small for a plane limit
+state, and far too small if a run can lose one of several failure regions. A single run cannot detect such a
+loss; replicates can, unless nearly all lose the region.
+
+The estimates are skewed, nearly lognormal, and their mean is the probability with a bias of the order of
+1 / samples (with 1000 samples, 3 % at 1e-4 and 6 % at 1e-6). The interval is therefore that of the mean of a
+lognormal distribution. Its spread is at least that of the formula, because a few replicates may agree by
+chance.
 """
 
 from collections.abc import Callable
@@ -31,48 +34,48 @@ from tuning.statistics.intervals import LEVEL, binomial_interval, lognormal_inte
 
 Performance = Callable[[np.ndarray], np.ndarray]
 
-SHARE = 0.1  # conditional probability of each level: the optimum is flat between 0.1 and 0.3
-STEPS = round(1.0 / SHARE)  # scenarios of each chain, its start included
-ACCEPTANCE = 0.44
+SHARE = 0.1  # conditional probability of each level; the optimum is flat between 0.1 and 0.3
+STEPS = round(1.0 / SHARE)  # scenarios of each chain, with its start
+ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted
 FIRST_SIGMA, LEAST_SIGMA = 0.6, 1e-4
-LEVELS = 12  # at most
-WORST = 10
+LEVELS = 12  # default limit on the number of levels
+WORST = 10  # number of worst scenarios in the result
 
 
 class SubsetSimulation(NamedTuple):
-    """What subset simulation found."""
+    """Result of a subset simulation."""
 
-    probability: float  # of failing
-    low: float  # end of its interval
-    high: float  # end of its interval
-    coefficient_of_variation: float  # of `probability`, from the spread of the replicates' estimates
+    probability: float  # estimated probability of failure
+    low: float  # lower end of its interval
+    high: float  # upper end of its interval
+    coefficient_of_variation: float  # that of `probability`, from the spread of the replicates' estimates
     formula_coefficient_of_variation: float  # the same by the formula for single runs
-    estimates: np.ndarray  # of each, (replicates,)
-    formula_coefficients: np.ndarray  # of variation of each by that formula, (replicates,)
-    thresholds: np.ndarray  # (levels, replicates), the last one the limit; nan where fewer levels were needed
-    evaluations: int  # of the performance
-    worst_points: np.ndarray  # normals of the worst distinct scenarios met, worst first, (worst, inputs)
-    worst_values: np.ndarray  # their performance, infinite where not finite, (worst,)
+    estimates: np.ndarray  # estimate of each replicate, (replicates,)
+    formula_coefficients: np.ndarray  # coefficient of variation of each by the formula, (replicates,)
+    thresholds: np.ndarray  # (levels, replicates); the last is the limit, nan for levels that were not needed
+    evaluations: int  # number of evaluations of the performance
+    worst_points: np.ndarray  # standard normals of the worst distinct scenarios, worst first, (worst, inputs)
+    worst_values: np.ndarray  # their performance, infinite if not finite, (worst,)
 
 
 class _State(NamedTuple):
-    """All replicates at one level."""
+    """State of all replicates at one level."""
 
     points: np.ndarray  # (steps, replicates, chains, inputs), above the replicate's last threshold
     values: np.ndarray  # their performance, (steps, replicates, chains)
-    reached: np.ndarray  # per replicate, probability of the last threshold
-    log_sigma: np.ndarray  # per replicate, of the proposals
-    variance: np.ndarray  # per replicate, sum of squared coefficients of variation so far
-    open: np.ndarray  # per replicate, whether another level is to be run
-    estimates: np.ndarray  # per replicate, where none is
+    reached: np.ndarray  # probability of the last threshold, (replicates,)
+    log_sigma: np.ndarray  # log(sigma) of the proposals, (replicates,)
+    variance: np.ndarray  # sum of squared coefficients of variation so far, (replicates,)
+    open: np.ndarray  # whether a further level is needed, (replicates,)
+    estimates: np.ndarray  # estimate of the replicates that are not `open`, (replicates,)
 
 
 class _Worst(NamedTuple):
-    """The worst distinct scenarios met so far."""
+    """Worst distinct scenarios so far."""
 
     points: np.ndarray  # (worst, inputs)
     values: np.ndarray  # (worst,)
-    evaluations: int  # so far
+    evaluations: int  # number of evaluations so far
 
 
 def subset_simulation(
@@ -85,24 +88,32 @@ def subset_simulation(
     level: float = LEVEL,
     levels: int = LEVELS,
 ) -> SubsetSimulation:
-    """Probability that performance(u) > limit, for u of `inputs` independent standard normals.
+    """Estimate the probability that performance(u) > limit, for `inputs` independent standard normals u.
 
-    `performance` maps (batch, inputs) to (batch,), always with a batch of replicates * samples / 10; what is
-    not finite counts as failed. `samples` per level and replicate, `levels` at most, so that it reaches down
-    to about 10^-levels. The same seed gives the same result.
+    Subset simulation fails if the performance does not show how close a scenario is to failure (plateaus,
+    islands of failure without a slope towards them). If a second failure region becomes relevant only beyond
+    the thresholds that lead to the first (Breitung 2019, "The geometry of limit state function graphs and
+    subset simulation: counterexamples"), most replicates miss it: the interval then covers less than stated,
+    and more samples help. A coefficient of variation far above the formula's indicates this. If a replicate
+    ends without a failure, the interval reaches from 0 to a bound with the probability that it reached.
 
-    Where the performance says nothing of how close a scenario is to failing (plateaus, islands of failure
-    without a slope towards them) no such method finds its way. Where it misleads, and a second way to fail
-    takes over only beyond the thresholds that lead to the first (Breitung 2019, "The geometry of limit state
-    function graphs and subset simulation: counterexamples"), most replicates miss it: the interval then
-    covers less than stated, and more samples help. A coefficient of variation far above the formula's is the
-    sign. A replicate that ends without a failure makes the interval reach from 0 to what that replicate did
-    reach. Raises ValueError unless inputs >= 1, seed >= 0, samples is a multiple of 10 above 0, replicates >=
-    2, levels >= 1, 0 < level < 1 and the limit is finite.
+    Args:
+        performance: function from (batch, inputs) to (batch,), called with replicates * samples / 10 points;
+            a value that is not finite counts as a failure.
+        inputs: number of standard normals, 1 or more.
+        limit: limit of the performance, finite.
+        seed: seed of the random numbers, 0 or more; the same seed gives the same result.
+        samples: number of scenarios per level and replicate, a multiple of 10.
+        replicates: number of independent runs, 2 or more.
+        level: confidence level, between 0 and 1.
+        levels: largest number of levels; the smallest probability is about 10^-levels.
+
+    Raises:
+        ValueError: if an argument is out of its range.
     """
     _check(inputs, limit, seed, samples, replicates, level, levels)
     rng = np.random.default_rng(seed)
-    # The least number beyond the limit: what reaches it has failed.
+    # A scenario fails if it reaches the next number above the limit.
     failing = float(np.nextafter(limit, np.inf))
     worst = _Worst(np.empty((0, inputs)), np.empty(0), 0)
 
@@ -127,23 +138,23 @@ def subset_simulation(
 
 
 def to_uniform(normals: np.ndarray) -> np.ndarray:
-    """The uniform numbers of standard normals, above 0 and below 1, for the inputs' quantile functions."""
+    """Convert standard normals to uniform numbers above 0 and below 1, for the inputs' quantile functions."""
     return np.clip(special.ndtr(normals), np.finfo(float).tiny, 1.0 - 2.0**-53)
 
 
 def _summary(
     state: _State, thresholds: list[np.ndarray], worst: _Worst, failing: float, level: float
 ) -> SubsetSimulation:
-    """What the replicates, all at their end, say together."""
+    """Return the result of all replicates after their last level."""
     formula = np.sqrt(state.variance)
     if len(thresholds) == 1:
-        # Independent scenarios, all of them: the exact interval.
+        # All scenarios are independent, so that the exact interval applies.
         _, low, high = binomial_interval(np.sum(state.values >= failing), state.values.size, level)
     else:
         low, high = lognormal_interval(state.estimates, state.reached, formula, level)
     mean = np.mean(state.estimates)
     spread = np.std(state.estimates, ddof=1) / np.sqrt(len(formula))
-    # Without a failure the formula is infinite, and the estimate says so.
+    # Without a failure the formula is infinite and the estimate is 0.
     weighted = state.estimates * np.where(state.estimates > 0.0, formula, 0.0)
     combined = np.sqrt(np.sum(weighted**2)) / len(formula)
     return SubsetSimulation(
@@ -162,11 +173,11 @@ def _summary(
 
 
 def _levelled(state: _State, failing: float, independent: bool, last: bool) -> tuple[np.ndarray, _State]:
-    """The next threshold of each replicate, (replicates,), and the state with what it takes to reach it.
+    """Return the next threshold of each replicate, (replicates,), and the state with its probability.
 
-    The threshold is the value that a tenth of the points reach; `failing` if more reach that; and the second
-    least value if all have the least, so that plateaus are passed. Without a second one, or at the last
-    level, the replicate ends with the failures it has.
+    The threshold is the value that a tenth of the points reach, or `failing` if more than a tenth reach that,
+    or the second least value if fewer than a tenth exceed the least one, so that plateaus are passed. Without
+    a second value, or at the last level, the replicate ends with its current failures.
     """
     steps, replicates, chains = state.values.shape
     flat = np.sort(np.moveaxis(state.values, 1, 0).reshape(replicates, -1), axis=1)
@@ -183,7 +194,7 @@ def _levelled(state: _State, failing: float, independent: bool, last: bool) -> t
     ends = state.open & (threshold >= failing)
     estimates = np.where(ends, state.reached * share, state.estimates)
     return threshold, state._replace(
-        # A replicate without a failure keeps what it reached: its probability is below that.
+        # A replicate without a failure keeps `reached` as the upper bound of its probability.
         reached=np.where(state.open & (share > 0.0), state.reached * share, state.reached),
         variance=np.where(state.open, state.variance + squared, state.variance),
         open=state.open & ~ends,
@@ -192,9 +203,10 @@ def _levelled(state: _State, failing: float, independent: bool, last: bool) -> t
 
 
 def _correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """gamma of Au and Beck 2001, eq. 27-29: what the correlation along the chains adds to the variance.
+    """Return gamma of Au and Beck 2001, eq. 27-29, the increase of the variance by correlation along chains.
 
-    2 sum over lags k of (1 - k / steps) rho(k), of the indicator `exceeds`, (steps, replicates, chains).
+    It is 2 sum_k (1 - k / steps) rho(k) over the lags k, with the autocorrelation rho of the indicator
+    `exceeds`, (steps, replicates, chains).
     """
     steps = exceeds.shape[0]
     centred = exceeds - share[:, None]
@@ -212,15 +224,16 @@ def _chained(
     worst: _Worst,
     rng: np.random.Generator,
 ) -> tuple[_State, _Worst]:
-    """Chains above the threshold, from points that are; those of replicates at their end run along idly.
+    """Run the Markov chains of the next level, which stay above the threshold of their replicate.
 
-    sigma follows the acceptance of all chains of its replicate, ever less, as in Papaioannou et al. 2015.
+    sigma adapts to the acceptance rate of all chains of its replicate, with decreasing steps, as in
+    Papaioannou et al. 2015. The chains of replicates that have ended also run, without effect.
     """
     steps, replicates, _, inputs = state.points.shape
     seeds = np.stack([_seeds(state.values[:, r], threshold[r], rng) for r in range(replicates)])
-    which = np.arange(replicates)[:, None]
-    points = np.moveaxis(state.points, 1, 0).reshape(replicates, -1, inputs)[which, seeds]
-    values = np.moveaxis(state.values, 1, 0).reshape(replicates, -1)[which, seeds]
+    rows = np.arange(replicates)[:, None]
+    points = np.moveaxis(state.points, 1, 0).reshape(replicates, -1, inputs)[rows, seeds]
+    values = np.moveaxis(state.values, 1, 0).reshape(replicates, -1)[rows, seeds]
     all_points, all_values = [points], [values]
     log_sigma = state.log_sigma
     for step in range(1, steps):
@@ -240,23 +253,22 @@ def _chained(
 
 
 def _seeds(values: np.ndarray, threshold: float, rng: np.random.Generator) -> np.ndarray:
-    """Where the chains of a replicate begin: as many of its points (steps, chains) as chains, in random
-    order.
+    """Return the indices of the points (steps, chains) at which a replicate's chains start, in random order.
 
-    Each once if there are enough that reach the threshold; else, after a plateau, several chains from one.
+    Each point that reaches the threshold is used once, or several times if there are fewer than chains.
     """
     reaching = np.nonzero(values.ravel() >= threshold)[0]
     chains = values.shape[1]
     if not len(reaching):
-        # A replicate at its end, without a failure.
+        # The replicate has ended without a failure, so that any points will do.
         return np.arange(chains)
     return rng.permutation(np.resize(rng.permutation(reaching), chains))
 
 
 def _evaluated(performance: Performance, points: np.ndarray, worst: _Worst) -> tuple[np.ndarray, _Worst]:
-    """Values of points (replicates, chains, inputs), infinite where not finite, and the worst with them.
+    """Evaluate points (replicates, chains, inputs), infinite if not finite, and update the worst scenarios.
 
-    Of equally bad scenarios, the one nearest the origin is the worst: it is the likeliest.
+    Among equally bad scenarios, the one nearest to the origin ranks as the worst, since it is the likeliest.
     """
     batch = points.reshape(-1, points.shape[-1])
     values = np.asarray(performance(batch), float)
@@ -269,6 +281,7 @@ def _evaluated(performance: Performance, points: np.ndarray, worst: _Worst) -> t
 
 
 def _check(inputs, limit, seed, samples, replicates, level, levels) -> None:
+    """Raise ValueError if an argument of `subset_simulation` is out of its range."""
     allowed = {
         "inputs": (inputs, inputs >= 1, "1 or more"),
         "limit": (limit, np.isfinite(limit), "a finite number"),
