@@ -80,10 +80,11 @@ def judge(kind, seed, folder):
     """Write a campaign, identify it and return the outcome."""
     campaign = write_campaign(kind, seed, folder)
     begin, result = time.perf_counter(), folder / "identified"
-    code, _, err = run_command(*campaign.arguments, "-o", result)
+    code, out, err = run_command(*campaign.arguments, "-o", result)
     seconds, check = time.perf_counter() - begin, ""
     e = error = difference = np.nan
-    verdict, message = VERDICTS.get(code, str(code)), " ".join(err.split())
+    # Without a file, the report on standard output says why.
+    verdict, message = VERDICTS.get(code, str(code)), " ".join((out + err).split())
     text = message
     if (result / "mechanism.toml").exists():
         document = json.loads((result / "identification.json").read_text())

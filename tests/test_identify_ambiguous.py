@@ -70,6 +70,16 @@ def test_a_lag_that_is_not_ruled_out_widens_damping_and_delay(monkeypatch):
     assert not found.good and PRESS in found.verdict
 
 
+@pytest.mark.parametrize(("name", "possible"), (("undamped", True), ("plain", False)))
+def test_contact_without_damping_keeps_its_share_of_the_draws(monkeypatch, name, possible):
+    campaign = ambiguous.campaign(monkeypatch, name, 0, seconds=10.0)
+    found = identify(campaign, ambiguous.prior(name), Options(law="kelvin_voigt", hold_out=0.0))
+    posterior = found.contact.posterior
+    share = np.mean(posterior.draws[:, posterior.names.index("damping")] == 0.0)
+    assert (0.05 < share < 1.0) if possible else share == 0.0
+    assert (found["contact.damping.0"].low == 0.0) is possible
+
+
 def test_interval_of_the_delay_includes_the_delay_of_undamped_contact():
     """Draws of damping lie on one side of 0, those of the delay on one side of the true one."""
     rng = np.random.default_rng(0)

@@ -24,6 +24,7 @@ SMOOTHED = 7  # delays of the second grid over which the plane is averaged
 REGION = 30.0  # drop of twice the log posterior below its maximum that the final grid covers
 ROUGH_REGION = 400.0  # the same for the coarse grid, whose log posterior is less accurate near onsets
 FEW_PLANES = 15  # planes of the second grid
+MAX_POSITIONS = 1000  # of cell edges; a surface that nothing determines spans every row of the runs
 ROUGHLY = 2.0  # factor on the plane's standard deviation from the coarse grid
 DELAYS, PLANES = 61, 13  # size of the final grid
 REACH = 0.003  # s, half width of the search about an approximate delay
@@ -167,6 +168,8 @@ def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     Further edges halve the widest cells. If there are too many positions, those that leave the smallest cells
     are dropped.
     """
+    if len(at) > MAX_POSITIONS:
+        at = at[np.linspace(0, len(at) - 1, MAX_POSITIONS).astype(int)]
     edges = [low, *at, high]
     while len(edges) <= number:
         widest = int(np.argmax(np.diff(edges)))
