@@ -1,8 +1,8 @@
-"""The controller as it runs on the rig: plain Python floats, a fixed order of operations, no JAX.
+"""Controller of the rig in plain Python: floats, a fixed order of operations, no JAX.
 
-`Controller.from_file(path)` reads a gain file and refuses one that does not fit; `step` is then called once
-per control period. The compensators are found in the folders of `jaxhil.laws` and enter themselves in
-`COMPENSATORS`. A bundle has controller, one compensator and their imports in one file, `jaxhil_runtime.py`.
+`Controller.from_file(path)` reads a gain file; `step` is then called once per control period. Importing this
+package imports the compensators in the folders of `jaxhil.laws`, which register in `COMPENSATORS`. A bundle
+contains controller, one compensator and the modules that they import in one file, `jaxhil_runtime.py`.
 """
 
 from importlib import import_module

@@ -1,20 +1,23 @@
-"""Guard of the times of the ticks: early, late and missed ticks, and a clock that parts from the ticks."""
+"""Guard of the tick times: detects early, late and missed ticks, and a clock that drifts from the ticks."""
 
 from math import inf, isfinite
 
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
 from jaxhil.rig.types import Limits, NonNegative, Positive
 
-MOST_MISSED = 1_000_000  # periods counted for one gap, so that a wild clock stays a small number
-LONGEST_GAP = 1.5  # periods since the last tick beyond which a tick is missing
-DRIFT_KEPT = 0.99  # of the clock's drift from one tick to the next: it is forgotten over 100 ticks
-MOST_DRIFT = 1.5  # periods: a clock that runs 1.5 % fast or slow comes to it, jitter does not
+MOST_MISSED = 1_000_000  # periods; one gap counts no more, however wrong the clock is
+LONGEST_GAP = 1.5  # periods; after a longer gap a tick is missing
+DRIFT_KEPT = 0.99  # share of the clock's drift that remains after a tick: it decays over 100 ticks
+MOST_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches it, jitter does not
 
 
 class Clock:
-    """The times of the ticks: which came early or late, and how many were missed.
+    """Guard of the tick times.
 
-    Attributes: `missed` and `late`, ticks counted; `fatal`, whether the last tick's fault trips.
+    Attributes:
+        missed: number of missed ticks.
+        late: number of late ticks.
+        fatal: whether the last tick's fault trips the controller.
     """
 
     __slots__ = (
@@ -38,15 +41,15 @@ class Clock:
         self.pause()
 
     def pause(self) -> None:
-        """Let the time until the next tick be any."""
+        """Accept any time until the next tick."""
         self._time = -inf
-        self._drift = 0.0  # periods by which the clock has gone ahead of the ticks, with those missed
-        self._awaited = 0  # ticks counted as missed that may yet come
-        self._in_a_row = 0  # ticks missed since the last one in time
+        self._drift = 0.0  # periods by which the clock is ahead of the ticks, missed ones included
+        self._awaited = 0  # ticks counted as missed that may still arrive
+        self._in_a_row = 0  # ticks missed one after another
         self.fatal = False
 
     def tick(self, time: float) -> int:
-        """The fault of a tick at `time` [s], 0 if it comes as it should."""
+        """Return the fault of a tick at `time` [s], 0 if it is on time."""
         self.fatal = False
         if not isfinite(time):
             self.fatal = True
@@ -68,7 +71,7 @@ class Clock:
         if gap < self._early_gap:
             fault = EARLY_TICK
             if self._awaited:
-                # It was late by more than half a period, not missed.
+                # A tick that was counted as missed was only late, by more than half a period.
                 self._awaited -= 1
                 drift += 1.0
         else:
@@ -79,7 +82,7 @@ class Clock:
         return self._part(drift, fault)
 
     def _miss(self, periods: NonNegative) -> int:
-        """Count the ticks missed in a gap of so many periods; the fault."""
+        """Count the ticks missed in a gap of `periods` control periods; return the fault."""
         left_out = MOST_MISSED - 1
         drift = 0.0
         if periods <= MOST_MISSED:
@@ -92,7 +95,7 @@ class Clock:
         return self._part(drift, MISSED_TICK)
 
     def _part(self, drift: float, fault: int) -> int:
-        """Take note of the drift [periods]; the tick's fault, or that clock and ticks have parted."""
+        """Store the drift [periods]; return the tick's fault, or `CLOCK` if the drift is too large."""
         self._drift = drift
         if abs(drift) > MOST_DRIFT:
             self.fatal = True

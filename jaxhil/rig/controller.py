@@ -1,9 +1,9 @@
-"""The controller that the rig calls once per control period.
+"""Controller that the rig calls once per control period.
 
-It checks what comes in (`inputs`), watches every contact's energy (`watchdog`), leaves the law to the
-compensator that its gain file names, and limits what goes out (`outputs`). What each of them may find, and
-what follows, is the table of `faults`. A trip is latched until `reset`: the force is led to 0, the position
-command to rest out of contact. No method raises once the controller is made; each takes bounded time.
+It checks the inputs (`inputs`), audits the energy of every contact (`watchdog`), computes the force with the
+compensator that the gain file names, and limits the outputs (`outputs`). `faults` lists the faults that they
+detect and the reactions. A trip is latched until `reset`: the force ramps to 0, the position command comes to
+rest out of contact. After construction no method raises, and each takes bounded time.
 """
 
 import os
@@ -35,10 +35,12 @@ from jaxhil.rig.watchdog import Watchdog
 
 
 class Controller:
-    """One compensator with its gains, its guards and its state.
+    """Compensator with its gains, its guards and its state.
 
-    Attributes: `faults`, the bits of the faults of this tick; `seen`, of all ticks since `reset`; `cause`,
-    the bits that tripped it, 0 if nothing has.
+    Attributes:
+        faults: bits of the faults of this tick (`faults.FAULTS`).
+        seen: bits of the faults of all ticks since `reset`.
+        cause: bits of the faults that tripped the controller, 0 if none has.
     """
 
     __slots__ = (
@@ -65,7 +67,7 @@ class Controller:
             raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
 
     def _guard(self, limits: Limits, period: Positive, clearance: float) -> None:
-        """Set up the guards about the law, and begin."""
+        """Create the guards of inputs, contacts and outputs, and reset the controller."""
         self._clock = Clock(limits, period)
         self._tare = Tare(limits)
         self._inputs = InputGuard(limits, period, clearance)
@@ -78,87 +80,105 @@ class Controller:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> "Controller":
-        """The controller of a gain file. Raises GainFileError for a file that does not fit."""
+        """Return the controller of a gain file.
+
+        Args:
+            path: path of the gain file.
+
+        Raises:
+            GainFileError: if the file is invalid.
+        """
         source = os.fspath(path)
         return cls(check_gain_document(read_gain_document(source), source), source)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Controller":
-        """The controller of a gain file's content. Raises GainFileError if it does not fit."""
+        """Return the controller of a gain document.
+
+        Args:
+            document: content of a gain file.
+
+        Raises:
+            GainFileError: if the document is invalid.
+        """
         return cls(check_gain_document(document))
 
     @property
     def control_period(self) -> float:
-        """The control period [s] for which the gains hold."""
+        """Return the control period [s] for which the gains are valid."""
         return self._period
 
     @property
     def tripped(self) -> bool:
-        """Whether a fault has tripped the controller since the last `reset`."""
+        """Return whether a fault has tripped the controller since the last `reset`."""
         return self.cause != 0
 
     @property
     def status(self) -> str:
-        """`ok`, or `tripped: ` and the reason."""
+        """Return `ok`, or `tripped: ` and the cause."""
         if not self.cause:
             return "ok"
         return f"tripped: {', '.join(names(self.cause))}" + (f" ({self._detail})" if self._detail else "")
 
     @property
     def at_rest(self) -> bool:
-        """Whether, after a trip, the position command has come to rest."""
+        """Return whether the position command has come to rest after a trip."""
         return self.tripped and self._positions.at_rest
 
     @property
     def bias(self) -> float:
-        """The force sensor's bias [N] that the last good tare found."""
+        """Return the force sensor's bias [N] by the last successful tare."""
         return self._tare.bias
 
     @property
     def missed_ticks(self) -> int:
-        """The control periods since `reset` without a tick, as far as the times passed to `step` tell."""
+        """Return the number of missed ticks since `reset`, by the times passed to `step`."""
         return self._clock.missed
 
     @property
     def late_ticks(self) -> int:
-        """The ticks since `reset` that came late, as far as the times passed to `step` tell."""
+        """Return the number of late ticks since `reset`, by the times passed to `step`."""
         return self._clock.late
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
+        """Return identified stiffness [N/m] and damping [N s/m]; (0, 0) if none are identified."""
         return self._law.identified
 
     @property
     def force_delay(self) -> float:
-        """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
+        """Return the estimated delay [s] of the force measurement; 0 if none is estimated."""
         return self._law.force_delay
 
     @property
     def law_status(self) -> str:
-        """What the law says of the last command (`law_status.STATUSES`); `unstated` if it says nothing."""
+        """Return the compensator's status of the last command, a name in `law_status.STATUSES`."""
         return STATUS_NAMES[self._status()]
 
     def _status(self) -> SmallInt:
-        """Return what the law says of the last command, by its number."""
+        """Return the number of the compensator's status of the last command."""
         return self._law.status
 
     @property
     def last_contact(self) -> ContactRecord:
-        """What the law said of the contact audited last, whatever follows, `reset` included, until the next
-        one is; contact 0 before the first."""
+        """Return the statuses of the last audited contact; its number is 0 before the first one.
+
+        They remain until the next audit, even after `reset`.
+        """
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return what the law said of the contact audited last, whatever follows, `reset` included, until the
-        next one is."""
+        """Return the statuses of the last audited contact, which remain even after `reset`."""
         return self._watchdog.record
 
     def tare(self, force_measured: float) -> bool:
-        """Take in one reading [N] of the force sensor out of contact; True once there are enough.
+        """Add one reading of the force sensor out of contact; return True once there are enough.
 
-        To be called once a tick before a run. Their mean is then taken from every reading, until the next
-        tare. Readings that will not do trip, with the fault `tare`.
+        Call it once per tick before a run. The mean of the readings is then subtracted from every reading
+        until the next tare. Unusable readings trip the controller with the fault `tare`.
+
+        Args:
+            force_measured: force reading [N].
         """
         if self.cause:
             return True
@@ -175,14 +195,20 @@ class Controller:
         position_measured: float,
         time: float | None = None,
     ) -> float:
-        """The force F_c [N] that the numerical model is to feel this tick.
+        """Return the force F_c [N] on the numerical model for this tick.
 
-        Force in N, positions in m, velocity in m/s. With `time` [s], ticks that come late or were missed
-        are seen. Once tripped, the force goes to 0 and stays there until `reset`.
+        After a trip the force ramps to 0 and stays there until `reset`.
+
+        Args:
+            force_measured: force reading [N].
+            position_desired: position of the numerical model [m].
+            velocity_desired: velocity of the numerical model [m/s].
+            position_measured: position reading of the motion simulator [m].
+            time: time of the tick [s]; without it, late and missed ticks are not detected.
         """
         forces = self._forces
         self.faults = 0
-        # Only what is no float yet takes time to be made one: the rig's numbers are.
+        # The rig passes floats: converting other types only saves time.
         measured = position_measured if type(position_measured) is float else _float(position_measured)
         inputs = self._inputs
         inputs.locate(measured)
@@ -204,13 +230,13 @@ class Controller:
         watchdog = self._watchdog
         if watchdog.on and not fatal:
             status = law.status
-            found = watchdog.tick(forces.output, status, inputs.force, position, velocity, inputs.measured)
-            faults |= found
-            fatal = found & ~LAW_IN_DOUBT
+            alarm = watchdog.tick(forces.output, status, inputs.force, position, velocity, inputs.measured)
+            faults |= alarm
+            fatal = alarm & ~LAW_IN_DOUBT
         if not fatal:
             try:
                 command = law.step(inputs.force, position, velocity, inputs.measured)
-            except Exception:  # a law's; the rig must not be left without a command
+            except Exception:  # of any compensator: the rig always needs a command
                 command = nan
             faults |= forces.limit(command)
             fatal = forces.fatal
@@ -229,15 +255,20 @@ class Controller:
         return forces.output
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The position [m] to command, from the numerical model's motion after this tick's step.
+        """Return the position [m] to command for the numerical model's motion after this tick's step.
 
-        Position in m, velocity in m/s, acceleration in m/s^2. Once tripped, the way to rest out of contact.
+        Two commands in a row differ by at most `velocity_limit` times the period. A run's first command
+        differs as little from the measured position; out of contact, where moving drives lag behind, it may
+        differ by `start_distance`. Before a run's first `step`, the model's position stands for the measured
+        one if it is out of contact.
 
-        Whatever it is given, it is at most `velocity_limit` times the period from the last command. A run's
-        first command is as near to the measured position; out of contact, where drives in motion follow late,
-        it may be within `start_distance` of it. Before a run's first `step`, the model's position, if it is
-        out of contact, is taken for where the rig has been brought to. A trip leads away from the last
-        command, without one from the position measured last, without either from a place out of contact.
+        After a trip the commands lead to rest out of contact. They begin at the last command; without one, at
+        the last measured position; without either, at a position out of contact.
+
+        Args:
+            position: position of the numerical model [m].
+            velocity: velocity of the numerical model [m/s].
+            acceleration: acceleration of the numerical model [m/s^2].
         """
         positions, inputs = self._positions, self._inputs
         measured = inputs.located
@@ -256,31 +287,34 @@ class Controller:
         return positions.output
 
     def _sent(self, position: float, velocity: float, acceleration: float) -> float:
-        """The law's position command [m] for a motion; not a number if that has none."""
+        """Return the compensator's position command [m], NaN if the motion is not finite or it raises."""
         if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
             return nan
         try:
             return self._law.position_command(position, velocity, acceleration)
-        except Exception:  # a law's; the rig must not be left without a command
+        except Exception:  # of any compensator: the rig always needs a command
             return nan
 
     def emergency_stop(self, active: bool) -> None:
-        """Tell the controller the state of the rig's emergency stop; active, it trips.
+        """Set the state of the rig's emergency stop; an active stop trips the controller.
 
-        Handshake: call with True for as long as the stop is active (once is enough); the force goes to 0 and
-        the position command to rest, then `at_rest` is True and the drives may be switched off; call with
-        False when the stop is released; the trip stays latched until `reset`, which is refused before.
+        Call it with True while the stop is active (once is enough). The force ramps to 0 and the position
+        command comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False
+        after the stop is released. The trip stays latched until `reset`, which returns False before.
+
+        Args:
+            active: whether the stop is active.
         """
         self._stopped = bool(active)
         if active:
             self._fail(EMERGENCY_STOP, "")
 
     def reset(self) -> bool:
-        """Restart everything but the tare: filters, identified parameters, a trip, the count of ticks.
+        """Restart everything but the tare; return False, without effect, while the emergency stop is active.
 
-        Without a bump: force and position command go on from the last ones, within their limits. If the
-        drives have been moved since by other means, call `next_contact` as well. Refused, with False, while
-        the emergency stop is active.
+        Filters, identified parameters, trip and counts of ticks restart. Force and position command continue
+        without a jump from their last values, within the limits. If the drives have been moved since by other
+        means, call `next_contact` as well.
         """
         if self._stopped or self.cause & UNUSABLE:
             return False
@@ -298,12 +332,12 @@ class Controller:
         return True
 
     def next_contact(self) -> None:
-        """Begin a fresh run for the next contact: filters, delay lines and covariance restart.
+        """Begin a new run for the next contact: restart filters, delay lines and covariance.
 
-        To be called when the rig has been brought to the start of the run: the first position command goes
-        on from where the drives then read, not from the last command. Identified parameters carry over, a
-        trip stays latched, and the time until the next tick does not count as missed. A contact still under
-        way is audited first: what that finds is in `faults` until the next `step`.
+        Call it when the rig has been moved to the start of the run: the first position command continues from
+        the measured position, not from the last command. Identified parameters remain, a trip stays latched,
+        and the time until the next tick does not count as missed. A contact that is not over yet is audited
+        first; its faults are in `faults` until the next `step`.
         """
         if self.cause:
             return
@@ -322,7 +356,7 @@ class Controller:
         self._positions.release()
 
     def _fail(self, cause: int, detail: str) -> None:
-        # The first cause is the one to look at: what follows a trip may follow from it.
+        # The first cause is the one to look at: later faults may be its consequences.
         if not self.cause:
             self.cause = cause
             self._detail = detail
@@ -331,7 +365,7 @@ class Controller:
 
 
 def _float(value: Any) -> float:
-    """The value as a float; not a number if it is none."""
+    """Convert the value to a float; return NaN if it is no number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -342,13 +376,13 @@ READINGS = "time", "force_measured", "position_desired", "velocity_desired", "po
 
 
 def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
-    """Describe a cause in words, by the values of `READINGS`."""
+    """Describe a cause by the watchdog's audit or by the values of `READINGS` that are not finite."""
     if fatal & RESTITUTION:
         return watchdog.detail()
     if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):
-        given = (
+        items = (
             item for item in zip(READINGS, values, strict=True) if item[1] is not None or item[0] != "time"
         )
-        bad = (item for item in given if not isfinite(_float(item[1])))
+        bad = (item for item in items if not isfinite(_float(item[1])))
         return ", ".join(f"{name} is {shown(value)}" for name, value in bad)
     return ""

@@ -1,12 +1,12 @@
-"""The error of an unusable gain file: always one printable line."""
+"""Error of an invalid gain file, with a message of one printable line."""
 
 
 class GainFileError(ValueError):
-    """An unusable gain file; the message names file, key, what was found and what is allowed."""
+    """Error of an invalid gain file; the message names file, key, what was found and what is allowed."""
 
 
 def printable(text: str) -> str:
-    """`text` with every character that would not print, line breaks included, escaped."""
+    """Return the text with all non-printable characters escaped, line breaks included."""
     return "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
         for character in text
@@ -14,7 +14,7 @@ def printable(text: str) -> str:
 
 
 def shown(value: object, longest: int = 60) -> str:
-    """A value as an error message shows it: short, ASCII, on one line."""
+    """Return a value as short ASCII text on one line, for an error message."""
     if isinstance(value, dict):
         return "an object"
     if isinstance(value, (list, tuple)):
@@ -30,6 +30,6 @@ def shown(value: object, longest: int = 60) -> str:
 
 
 def refusal(source: str, key: str, found: str, allowed: str) -> GainFileError:
-    """The error for `key` of the file `source`; the empty key is the file as a whole."""
-    place = f"{source}: {key}" if key else source
-    return GainFileError(printable(f"{place}: found {found}, allowed {allowed}"))
+    """Return the error for `key` of the file `source`; an empty key stands for the whole file."""
+    location = f"{source}: {key}" if key else source
+    return GainFileError(printable(f"{location}: found {found}, allowed {allowed}"))

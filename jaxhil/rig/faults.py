@@ -1,20 +1,20 @@
-"""What can go wrong on the rig, and what the controller does about it.
+"""Faults that the controller detects on the rig, and its reactions.
 
-Every fault is one bit, raised in `Controller.faults` on the tick at which it happens. `FAULTS` is the table
-that documentation, exports and error texts are made from; the bits are the same in the C controller.
+Every fault is one bit, set in `Controller.faults` on the tick on which the fault occurs. `FAULTS` is the
+source of documentation, exports and error texts; the bits are the same in the C controller.
 
-A *trip* is latched: until `reset` the force is led to 0 and the position command to a halt out of contact.
+A *trip* is latched: until `reset` the force ramps to 0 and the position command comes to rest out of contact.
 """
 
 from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """One fault."""
+    """Fault with its condition and the controller's reaction."""
 
-    bit: int  # its bit in `Controller.faults`
-    name: str  # its name
-    condition: str  # when it is raised
+    bit: int  # bit in `Controller.faults`
+    name: str  # name in texts and exports
+    condition: str  # when the bit is set
     reaction: str  # what the controller does
 
 
@@ -41,19 +41,19 @@ EMERGENCY_STOP = 0x80000
 TARE = 0x100000
 LAW_IN_DOUBT = 0x200000
 EARLY_TICK = 0x400000
-UNUSABLE = 1 << 30  # cause of a controller in C whose gains or limits are refused: Python raises instead
+UNUSABLE = 1 << 30  # cause of a C controller with invalid gains or limits: Python raises an error instead
 
-_HELD = "the last good reading is used; more than `held_readings` in a row trip"
-_HELD_AFTER_THE_FIRST = f"{_HELD}, and so does one on a run's first tick"
+_BRIDGED = "the last good reading is used; more than `held_readings` in a row trip"
+_BRIDGED_AFTER_FIRST = f"{_BRIDGED}, and so does one on a run's first tick"
 _TRIPS = "trips"
 
 FAULTS = (
-    Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", _HELD),
+    Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", _BRIDGED),
     Fault(
         POSITION_NOT_FINITE,
         "position_not_finite",
         "the measured position is not a finite number",
-        _HELD_AFTER_THE_FIRST,
+        _BRIDGED_AFTER_FIRST,
     ),
     Fault(
         MODEL_NOT_FINITE,
@@ -62,19 +62,19 @@ FAULTS = (
         _TRIPS,
     ),
     Fault(
-        FORCE_OUT_OF_RANGE, "force_out_of_range", "the measured force is at or beyond `force_range`", _HELD
+        FORCE_OUT_OF_RANGE, "force_out_of_range", "the measured force is at or beyond `force_range`", _BRIDGED
     ),
     Fault(
         POSITION_OUT_OF_RANGE,
         "position_out_of_range",
         "the measured position is outside `measured_lowest` to `measured_highest`",
-        _HELD_AFTER_THE_FIRST,
+        _BRIDGED_AFTER_FIRST,
     ),
     Fault(
         FORCE_STUCK,
         "force_stuck",
         "in contact, the force reading has stayed the same to the bit while the measured position moved "
-        "by more than `force_stuck_travel`; a reading of no force, while it moved deeper by as much",
+        "by more than `force_stuck_travel`, or, at a reading of no force, deeper by as much",
         _TRIPS,
     ),
     Fault(
@@ -102,14 +102,13 @@ FAULTS = (
         MISSED_TICK,
         "missed_tick",
         "more than one and a half periods have passed since the last tick",
-        "flagged and counted, the law is stepped once; more than `missed_in_a_row` without a tick in time "
-        "between them trip",
+        "flagged and counted, the law is stepped once; more than `missed_in_a_row` one after another trip",
     ),
     Fault(
         CLOCK,
         "clock",
         "the tick's time is not finite, or not after the last tick's; or over about 100 ticks the time "
-        "has parted from the ticks, with those missed, by more than one and a half periods",
+        "has drifted from the ticks, missed ones included, by more than one and a half periods",
         _TRIPS,
     ),
     Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),
@@ -124,7 +123,7 @@ FAULTS = (
         VELOCITY_LIMIT,
         "velocity_limit",
         "the position command changes faster than `velocity_limit`",
-        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, but for the way to the "
+        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, except on the way to the "
         "numerical model at the beginning of a run and after `reset`",
     ),
     Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", _TRIPS),
@@ -138,7 +137,7 @@ FAULTS = (
         ENERGY_BALANCE,
         "energy_balance",
         "watchdog: over a contact the numerical model's kinetic energy has not changed by the work of the "
-        "force it was given: it integrates something else",
+        "controller's force: the model integrates another force",
         _TRIPS,
     ),
     Fault(
@@ -158,8 +157,8 @@ FAULTS = (
     Fault(
         LAW_IN_DOUBT,
         "law_in_doubt",
-        "watchdog: a contact is over of which the law says that it was unsure, too short or noisy "
-        "on more than two fifths of its ticks, or unexplained or saturated on the last of them",
+        "watchdog: a contact is over, and the law's status was unsure, too short or noisy on more than two "
+        "fifths of its ticks, or unexplained or saturated on the last one, or no force was measured",
         "flagged; `last_contact` says which",
     ),
     Fault(
@@ -173,5 +172,5 @@ FAULTS = (
 
 
 def names(bits: int) -> list[str]:
-    """The names of the faults whose bits are set."""
+    """Return the names of the faults whose bits are set."""
     return [fault.name for fault in FAULTS if bits & fault.bit]

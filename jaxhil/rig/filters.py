@@ -1,7 +1,6 @@
-"""The discrete filters that the compensators are built of, one sample per control period.
+"""Discrete filters of the compensators, with one sample per control period.
 
-Each keeps its past in a few floats, evaluates its equation from left to right as written, and
-allocates nothing per tick.
+Each evaluates its equation from left to right as written and allocates nothing per tick.
 """
 
 from math import floor
@@ -11,11 +10,12 @@ from jaxhil.rig.types import Count, Index, Positive
 
 
 class LeadFilter:
-    """Lead (1 + T_1 s)/(1 + T_2 s), T_1 = lead + lag, T_2 = lag, by Tustin's rule at period T:
+    """Lead filter (1 + T_1 s)/(1 + T_2 s) by Tustin's rule, T_1 = lead + lag, T_2 = lag.
 
-    y = ((2 T_2 - T) y_prev + (2 T_1 + T) u - (2 T_1 - T) u_prev) / (2 T_2 + T),
+    y = ((2 T_2 - T) y_prev + (2 T_1 + T) u - (2 T_1 - T) u_prev) / (2 T_2 + T)
 
-    at rest (y_prev = u_prev = 0) to begin with. Times in seconds; the output has the input's unit.
+    T is the period. The filter begins at rest, y_prev = u_prev = 0. Times are in s; the output has the
+    input's unit.
     """
 
     __slots__ = ("_denominator", "_input", "_of_input", "_of_output", "_of_previous", "_output")
@@ -29,12 +29,12 @@ class LeadFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Come to rest."""
+        """Set past input and output to 0."""
         self._input = 0.0
         self._output = 0.0
 
     def step(self, value: float) -> float:
-        """The filtered value."""
+        """Return the filtered value."""
         output = (
             self._of_output * self._output + self._of_input * value - self._of_previous * self._input
         ) / self._denominator
@@ -44,12 +44,12 @@ class LeadFilter:
 
 
 class VelocityFilter:
-    """Filtered derivative s/(1 + T_v s) by Tustin's rule at period T:
+    """Filtered derivative s/(1 + T_v s) by Tustin's rule.
 
-    w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T).
+    w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T)
 
-    Its past is 0 unless `start` says otherwise. Position in m, velocity in m/s, times in s; it serves a
-    force as well.
+    T is the period. The past is 0 unless `start` sets it. Position x in m, velocity w in m/s, times in s; x
+    may also be a force [N].
     """
 
     __slots__ = ("_denominator", "_of_velocity", "_period", "_position", "_velocity")
@@ -62,12 +62,12 @@ class VelocityFilter:
         self._velocity = 0.0
 
     def start(self, position: float, velocity: float) -> None:
-        """Make the past a uniform motion that reaches `position` at the next step."""
+        """Set the past to a uniform motion [m/s] that reaches `position` [m] at the next step."""
         self._position = position - self._period * velocity
         self._velocity = velocity
 
     def step(self, position: float) -> float:
-        """The filtered velocity."""
+        """Return the filtered velocity [m/s]."""
         velocity = (
             self._of_velocity * self._velocity + 2.0 * (position - self._position)
         ) / self._denominator
@@ -77,12 +77,12 @@ class VelocityFilter:
 
 
 class DelayLine:
-    """A position delayed by any time tau >= 0, linear between samples:
+    """Delay of a position by any time tau >= 0, linear between samples.
 
-    r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1].
+    r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1]
 
-    `start` must come before the first `step`. Raises ValueError when the delay spans more than
-    `LONGEST` periods.
+    T is the period. `start` must precede the first `step`. The constructor raises ValueError if the delay
+    spans more than `LONGEST` periods.
     """
 
     LONGEST = 100_000
@@ -94,7 +94,7 @@ class DelayLine:
         ratio = delay / period
         if not 0.0 <= ratio <= self.LONGEST:
             raise ValueError(f"a delay of {ratio!r} periods, allowed 0 to {self.LONGEST}")
-        # The margin keeps a delay of a whole number of periods whole when its ratio rounds down.
+        # The margin keeps a whole number of periods whole if the ratio is rounded down.
         self._whole = floor(ratio + 1e-9)
         self._fraction = ratio - self._whole
         self._remainder = 1.0 - self._fraction
@@ -104,7 +104,7 @@ class DelayLine:
         self._head = 0
 
     def start(self, position: float, velocity: float) -> None:
-        """Make the past, sample j < 0, the uniform motion position + j T velocity."""
+        """Set the past samples, j < 0, to the uniform motion position + j T velocity."""
         period = self._period
         samples = self._samples
         size = self._size
@@ -113,11 +113,11 @@ class DelayLine:
         self._head = 0
 
     def step(self, position: float) -> float:
-        """The delayed position."""
+        """Return the delayed position [m]."""
         head = self._head
         samples = self._samples
         samples[head] = position
-        # Negative indices wrap: the line holds exactly the `whole + 2` latest samples.
+        # Negative indices wrap: the line stores exactly the `whole + 2` latest samples.
         newer: Index = head - self._whole
         older: Index = newer - 1
         delayed = self._remainder * samples[newer] + self._fraction * samples[older]

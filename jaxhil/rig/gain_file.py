@@ -1,9 +1,9 @@
-"""Reading a gain file: JSON in, checked numbers out, or a `GainFileError` of one line.
+"""Reader of gain files: returns checked numbers or raises a `GainFileError` of one line.
 
-A file is refused as a whole: first its form (JSON, schema, digest), then what the digest cannot
-know (compensator, gains, units, bounds, control period). Whoever changes a file can sign it anew: gains and
-limits have to be within the file's bounds and within those of the code too (`bounds`). The digest is the
-SHA-256 of the document's canonical JSON without the date, the timings and the digest itself.
+It checks the form first (JSON, schema, digest), then the content (compensator, gains, units, bounds, control
+period). Whoever changes a file can compute its digest anew: gains must therefore be within the file's bounds
+and those of the code (`bounds`), limits within those of the code. The digest is the SHA-256 of the document's
+canonical JSON without the date, the timings and the digest itself.
 """
 
 import errno
@@ -21,27 +21,36 @@ from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete
 from jaxhil.rig.registry import COMPENSATORS, GainSpecification
 
 SCHEMA = "jaxhil/gains/1"
-LARGEST = 4 * 1024 * 1024
-DEEPEST = 32
-UNSIGNED = ("created", "timings", "sha256")
-RETIRED = ("retrospective_reference", "retrospective_delay_bank")
+LARGEST = 4 * 1024 * 1024  # bytes of a file
+DEEPEST = 32  # levels of nesting
+UNSIGNED = ("created", "timings", "sha256")  # keys without influence on the digest
+RETIRED = ("retrospective_reference", "retrospective_delay_bank")  # replaced by `impulse_ledger`
 NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
-    """What the controller needs of a gain file."""
+    """Checked content of a gain file."""
 
-    compensator: str  # the law's name
+    compensator: str  # name
     gains: Mapping[str, float]  # by name, in SI units
     control_period: float  # [s]
-    clearance: float  # of a contact with two sides [m]; infinite with one
+    clearance: float  # of a two-sided contact [m]; infinite for a one-sided one
     limits: Mapping[str, float] = NO_LIMITS  # by name, in SI units
 
 
 def digest(document: Mapping[str, Any]) -> str:
-    """SHA-256, in hexadecimal, of a gain document without its `created`, `timings` and `sha256`.
+    """Return the SHA-256 in hexadecimal of a gain document without `created`, `timings` and `sha256`.
 
-    Raises ValueError or TypeError for a document that JSON cannot express (NaN, infinity, sets).
+    Args:
+        document: content of a gain file.
+
+    Raises:
+        TypeError: if the document has objects that JSON cannot express.
+        ValueError: if the document has numbers that JSON cannot express (NaN, infinity).
+
+    Example:
+        >>> digest({"schema": "jaxhil/gains/1"}) == digest({"schema": "jaxhil/gains/1", "created": "now"})
+        True
     """
     content = {key: value for key, value in document.items() if key not in UNSIGNED}
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
@@ -49,7 +58,7 @@ def digest(document: Mapping[str, Any]) -> str:
 
 
 def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The JSON object in the file, unchecked but for its form. Raises GainFileError."""
+    """Return the JSON object in a file. Raise GainFileError if there is none."""
     source = os.fspath(path)
     try:
         mode = os.stat(source).st_mode
@@ -84,10 +93,16 @@ def check_gain_document(
     others: Mapping[str, Mapping[str, GainSpecification]] = NO_OTHERS,
     axes: tuple[int, ...] = (1,),
 ) -> GainFile:
-    """The controller's part of a gain document, named `source` in errors. Raises GainFileError.
+    """Check a gain document and return what the controller needs of it.
 
-    `others` are the gains of compensators, by name, that can be simulated but have no class here; `axes` the
-    numbers of axes that the gains may be for.
+    Args:
+        document: content of a gain file.
+        source: name of the document in error messages.
+        others: gains of the compensators that can only be simulated, by compensator.
+        axes: numbers of axes that the gains may be for.
+
+    Raises:
+        GainFileError: if the document is invalid.
     """
     _check_form(document, source)
     number = document.get("axes", 1)
@@ -98,10 +113,10 @@ def check_gain_document(
     if name in RETIRED:
         message = f"compensator: found {shown(name)}, expected 'impulse_ledger', which replaces it"
         raise GainFileError(printable(f"{source}: {message}"))
-    known = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
-    if not isinstance(name, str) or name not in known:
-        raise refusal(source, "compensator", shown(name), f"one of {', '.join(known)}")
-    gains = _gains(document, name, known[name], source)
+    specifications = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
+    if not isinstance(name, str) or name not in specifications:
+        raise refusal(source, "compensator", shown(name), f"one of {', '.join(specifications)}")
+    gains = _gains(document, name, specifications[name], source)
     period = _number(_entry(document, "control_period", source, ""), "control_period", source)
     _check_within(period, *CONTROL_PERIODS, "control_period", source)
     mechanism = _object(document, "mechanism", source, "")

@@ -1,7 +1,7 @@
-"""What comes in, checked: sensor readings, the numerical model's motion.
+"""Checks of the inputs: sensor readings and the numerical model's motion.
 
-A bad sensor reading is replaced by the last good one. `InputGuard.check` says which faults a tick has and
-which of them trip; `force` and `measured` are then what the law is to use.
+The last good sensor reading replaces a bad one. `InputGuard.check` returns the faults of a tick and stores
+which of them trip; `force` and `measured` are then the inputs of the compensator.
 """
 
 from math import inf, isfinite, nan
@@ -19,13 +19,15 @@ from jaxhil.rig.faults import (
 )
 from jaxhil.rig.types import Count, Limits, Positive
 
-TARE_ROUNDING = 1e-9  # of a reading: what the mean of 1e6 equal readings may differ from them by
+TARE_ROUNDING = 1e-9  # relative; by this the mean of 1e6 equal readings may differ from them
 
 
 class Tare:
-    """The bias of the force sensor [N], as the mean of `tare_ticks` readings out of contact.
+    """Tare of the force sensor: its bias is the mean of `tare_ticks` readings out of contact.
 
-    Attributes: `bias`, what to take from every reading; `fatal`, whether the last tare failed.
+    Attributes:
+        bias: force to subtract from every reading [N].
+        fatal: whether the last tare failed.
     """
 
     __slots__ = (
@@ -49,7 +51,7 @@ class Tare:
         self.fatal = False
 
     def take(self, reading: float) -> bool:
-        """Take a reading in; whether the tare is over, well or, then `fatal`, badly."""
+        """Add a reading [N]; return whether the tare is over, successful or `fatal`."""
         if not self._count < self._ticks:
             return True
         if self._count == 0:
@@ -73,16 +75,19 @@ class Tare:
         return True
 
     def restart(self) -> None:
-        """Let the next reading begin a new tare; the bias found holds until that is over."""
+        """Let the next reading begin a new tare; the bias remains until that tare is over."""
         self._begin()
 
 
 class InputGuard:
-    """The readings of one tick, checked one by one; see `faults.FAULTS` for what each check means.
+    """Guard of the inputs; see `faults.FAULTS` for its checks.
 
-    Attributes, of the last tick: `force` [N] without bias and `measured` [m], what the law is to use;
-    `fatal`, the faults that trip. `located` [m] is where the drives were read last, not a number before;
-    `is_located`, whether a reading in range of this run said so.
+    Attributes:
+        force: force of the last tick without bias [N], for the compensator.
+        measured: measured position of the last tick [m], for the compensator.
+        fatal: bits of the last tick's faults that trip.
+        located: position where the drives were measured last [m]; NaN before.
+        is_located: whether `located` is a reading of this run in range.
     """
 
     __slots__ = (
@@ -108,7 +113,7 @@ class InputGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the readings so far, but not where the drives were read last."""
+        """Forget the readings so far, but not where the drives were measured last."""
         self._known = False
         self._bad_forces = 0
         self._bad_positions = 0
@@ -123,9 +128,9 @@ class InputGuard:
         self.fatal = 0
 
     def locate(self, position: float) -> None:
-        """Take note of where the drives read [m], also once tripped.
+        """Store where the drives are measured [m], also after a trip.
 
-        Before a run's first reading in range, any that a rig can have is better than none.
+        Before a run's first reading in range, any reading that a rig can have is stored.
         """
         if self._lowest <= position <= self._highest:
             self.is_located = True
@@ -134,7 +139,15 @@ class InputGuard:
             self.located = position
 
     def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:
-        """The faults of the readings of a tick: force [N], the model's motion [m, m/s], position [m]."""
+        """Return the faults of a tick.
+
+        Args:
+            reading: force reading [N].
+            desired: position of the numerical model [m].
+            velocity: velocity of the numerical model [m/s].
+            position: position reading [m].
+            bias: bias of the force sensor [N].
+        """
         if not (isfinite(desired) and isfinite(velocity)):
             self.fatal = MODEL_NOT_FINITE
             return MODEL_NOT_FINITE
@@ -142,7 +155,7 @@ class InputGuard:
         self.fatal = 0
         first = not self._known
         if first:
-            # Before the first tick there is no good reading: no force, and the position as desired.
+            # Without a reading before the first tick, assume no force and the desired position.
             self._known = True
             self._desired = desired
             self.measured = desired
@@ -184,10 +197,10 @@ class InputGuard:
             self._forces_in_flight = 0
         return faults
 
-    # What only a tick that is not as it should be needs stands in functions of its own, which cost it alone.
+    # The unusual cases are functions of their own, so that a usual tick does not pay for them.
 
     def _bad_position(self, position: float, first: bool) -> int:
-        # On the first tick there is no good one to go on with, and nobody knows where the drives are.
+        # On the first tick there is no good reading yet, and the position of the drives is unknown.
         fault = POSITION_OUT_OF_RANGE if isfinite(position) else POSITION_NOT_FINITE
         self._bad_positions += 1
         self.fatal |= fault if first or self._bad_positions > self._held else 0
@@ -200,16 +213,16 @@ class InputGuard:
         return fault
 
     def _same_position(self, travel: float) -> int:
-        """The position reads as before, while the model's has travelled so far [m]."""
+        """Add the model's travel [m] under an unchanged position reading; return the fault."""
         self._position_travel += travel
         fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
         self.fatal |= fault
         return fault
 
     def _same_force(self, deeper: float) -> int:
-        """The force reads as before, in contact, while the measured position went so much deeper [m]."""
+        """Add the travel into contact [m] under an unchanged force reading; return the fault."""
         if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
-            # A damped mechanism comes out without a force, but none can be pressed in without one.
+            # A damped mechanism may move out of contact without a force, but none moves deeper.
             travel = self._force_travel + deeper
             self._force_travel = travel if travel > 0.0 else 0.0
         else:

@@ -1,52 +1,52 @@
-"""Status of a law: what it says of its own command after each tick, and what that comes to over a contact.
+"""Status of a compensator after each tick, and status of a whole contact.
 
-Every status is one number, the same in the C controller. `STATUSES` is the table that documentation and
-exports are made from. Over a contact the statuses are counted, and the contact is
+Every status is one number, the same in the C controller. The table `STATUSES` is the source of documentation
+and exports. Over a contact the statuses are counted. The first condition that holds gives its status:
 
-    not reached    where no force was measured, whatever the law did,
-    unsure         where the law did not act at all,
-    unsure, too short or noisy
-                   else by the most frequent, where the law was any of them on more than `DOUBTFUL` of the
-                   ticks on which it acted,
+    not_reached    no force was measured
+    unsure         the compensator did not act at all
+    unsure, too_short or noisy
+                   their ticks are more than `DOUBTFUL` of the ticks on which the compensator acted: the most
+                   frequent of the three
     unexplained or saturated
-                   else, where it was so on the last of them: what the law knows once the contact is over,
-    identified     else.
+                   it was the status of the last tick on which the compensator acted
+    identified     otherwise
 
-In all but the last case the law could not identify the contact, or the correction had little time or room.
-How often an identified contact errs: `pytest -m slow -s tests/test_law_status.py`.
+Unless it is identified, the compensator did not identify the contact, or its correction had little time or
+was at its limit. `pytest -m slow -s tests/test_law_status.py` counts how often an identified contact errs.
 """
 
 from typing import NamedTuple
 
 from jaxhil.rig.types import SmallInt
 
-DOUBTFUL = 0.4  # of the ticks on which the law acts
+DOUBTFUL = 0.4  # share of the ticks on which the compensator acts
 
 
 class Status(NamedTuple):
-    """Status of a law."""
+    """Status of a compensator."""
 
-    number: int
-    name: str
-    meaning: str
+    number: int  # same in C
+    name: str  # name in texts and exports
+    meaning: str  # one line
 
 
 OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, UNSTATED = range(6)
-NOISY, NOT_REACHED, UNEXPLAINED = 7, 8, 9  # 6 was `displaced`, of laws that are retired
+NOISY, NOT_REACHED, UNEXPLAINED = 7, 8, 9  # 6 was `displaced`, of retired laws
 
 STATUSES = (
     Status(OUT_OF_CONTACT, "out_of_contact", "the law does not act"),
-    Status(IDENTIFIED, "identified", "the command is that of a contact that has been identified"),
-    Status(UNSURE, "unsure", "nothing is identified yet, or there is nothing to scale by"),
+    Status(IDENTIFIED, "identified", "the command follows from an identified contact"),
+    Status(UNSURE, "unsure", "nothing is identified yet, or the approach speed is unknown"),
     Status(SATURATED, "saturated", "identified, and the correction is at its limit"),
     Status(
         TOO_SHORT,
         "too_short",
-        "half of the contact was over when the hardware entered: little time is left",
+        "most of the contact was over when the hardware touched: little time is left",
     ),
-    Status(UNSTATED, "unstated", "the law says nothing of itself"),
+    Status(UNSTATED, "unstated", "the law has no status"),
     Status(NOISY, "noisy", "noise of force or position, or a dead zone, leaves the contact uncertain"),
-    Status(NOT_REACHED, "not_reached", "said of a whole contact: no force was measured, so there was none"),
+    Status(NOT_REACHED, "not_reached", "status of a whole contact: no force was measured in it"),
     Status(
         UNEXPLAINED,
         "unexplained",
@@ -57,43 +57,43 @@ STATUS_NAMES = {status.number: status.name for status in STATUSES}
 
 
 class ContactCount(NamedTuple):
-    """Statuses of one contact: the number of ticks with each, and the one that counts."""
+    """Statuses of one contact: the number of ticks with each, and that of the whole contact."""
 
     number: int  # of the contact; 0 before the first
-    ticks: int  # on which the law acted
-    unsure: int  # of these, the ticks with that status; so with the others that are counted
+    ticks: int  # on which the compensator acted
+    unsure: int  # ticks with this status, likewise below
     saturated: int
     too_short: int
     noisy: int
-    last: SmallInt  # status on the last tick on which the law acted
-    status: SmallInt  # what counts
+    last: SmallInt  # status of the last tick on which the compensator acted
+    status: SmallInt  # of the whole contact
 
 
 class ContactRecord(NamedTuple):
     """Statuses of one contact, by name."""
 
     number: int = 0  # of the contact; 0 before the first
-    status: str = STATUS_NAMES[UNSTATED]  # what counts, one of `STATUSES` by name
-    ticks: int = 0  # on which the law acted
-    unsure: int = 0  # of these, the ticks with that status; so with the others that are counted
+    status: str = STATUS_NAMES[UNSTATED]  # of the whole contact, a name in `STATUSES`
+    ticks: int = 0  # on which the compensator acted
+    unsure: int = 0  # ticks with this status, likewise below
     saturated: int = 0
     too_short: int = 0
     noisy: int = 0
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the law could not know the contact, or had too little time or room to correct it."""
+        """Return whether the compensator has a status and did not fully identify and correct the contact."""
         return self.status not in (STATUS_NAMES[UNSTATED], STATUS_NAMES[IDENTIFIED])
 
 
 def contact_record(count: ContactCount) -> ContactRecord:
-    """Return the record of a contact with the status by its name."""
+    """Return the record of a contact, with the name of its status."""
     number, ticks, unsure, saturated, too_short, noisy, _, status = count
     return ContactRecord(number, STATUS_NAMES[status], ticks, unsure, saturated, too_short, noisy)
 
 
 class StatusCount:
-    """On how many ticks of a contact a law said what."""
+    """Counter of a compensator's statuses over a contact."""
 
     __slots__ = ("_last", "_noisy", "_saturated", "_ticks", "_too_short", "_unsure")
 
@@ -101,7 +101,7 @@ class StatusCount:
         self.restart()
 
     def restart(self) -> None:
-        """Another contact."""
+        """Begin another contact."""
         self._ticks = 0
         self._unsure = 0
         self._saturated = 0
@@ -110,7 +110,7 @@ class StatusCount:
         self._last = OUT_OF_CONTACT
 
     def take(self, status: int) -> None:
-        """One tick's status."""
+        """Count one tick's status."""
         if status in (UNSTATED, OUT_OF_CONTACT):
             return
         self._ticks += 1
@@ -127,7 +127,7 @@ class StatusCount:
             self._noisy += 1
 
     def count(self, number: int, measured: bool) -> ContactCount:
-        """Return the count of contact `number`, which is over; `measured`: whether there was a force."""
+        """Return the counts of contact `number`, which is over; `measured`: whether a force was measured."""
         ticks, unsure, too_short, noisy = self._ticks, self._unsure, self._too_short, self._noisy
         status = IDENTIFIED
         if not measured:

@@ -1,7 +1,8 @@
-"""The limits that a gain file may carry for the rig: names, units, bounds, and what holds without them.
+"""Limits that a gain file may set for the rig: names, units, bounds and defaults.
 
-`jaxhil export` works the limits out and writes them under the file's digest. No file can set them beyond the
-bounds here; where it has none, or null, the default holds: what limits, limits to the outermost (`bounds`).
+`jaxhil export` computes the limits and writes them into the file under its digest. No file can set them
+beyond their bounds; where it has none, or null, the default holds. The defaults of limits of signals are the
+absolute bounds (`bounds`).
 """
 
 from collections.abc import Mapping
@@ -21,23 +22,26 @@ from jaxhil.rig.bounds import (
 )
 
 BRIDGED = 0.0, 1000.0  # ticks in a row
-COUNTED = 0.0, 1e6  # ticks, beyond the longest gap that the clock counts
-RATIOS = 0.0, 1e300  # of energies or restitutions, the highest beyond all that occurs, however slow an entry
-FEATURES = -1e3, 1e3  # p, w and z of the expected restitution
-COEFFICIENTS = -1e9, 1e9  # of it, by powers of those
+COUNTED = 0.0, 1e6  # ticks; more than the longest gap that the clock counts
+RATIOS = (
+    0.0,
+    1e300,
+)  # of energies or restitutions; the upper bound is never reached, however slow the approach
+FEATURES = -1e3, 1e3  # p, w and z of the expected restitution (`watchdog`)
+COEFFICIENTS = -1e9, 1e9  # of the polynomial in p, w and z
 
 
 class Limit(NamedTuple):
-    """One limit."""
+    """Limit with unit, default and bounds."""
 
-    unit: str  # of its value
-    default: float  # its value where a file has none
-    lowest: float  # its least value
-    highest: float  # its largest value
-    meaning: str  # what it is
+    unit: str  # "1" if it has none
+    default: float  # value where a file has none
+    lowest: float  # lower bound
+    highest: float  # upper bound
+    meaning: str  # one line
 
     def admits(self, value: float) -> bool:
-        """Whether the value is within the bounds."""
+        """Return whether the value is within the bounds."""
         return self.lowest <= value <= self.highest
 
 
@@ -45,18 +49,18 @@ LIMITS: dict[str, Limit] = {
     "force_range": Limit("N", FORCES[1], *FORCES, "a force reading of this size is out of range"),
     "measured_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position that the sensor may read"),
     "measured_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position that the sensor may read"),
-    "held_readings": Limit("1", 0.0, *BRIDGED, "bad readings in a row that are bridged"),
+    "held_readings": Limit("1", 0.0, *BRIDGED, "largest number of bad readings in a row"),
     "force_stuck_travel": Limit("m", DISTANCES[1], *DISTANCES, "travel in contact under one force reading"),
     "position_stuck_travel": Limit(
         "m", DISTANCES[1], *DISTANCES, "the model's travel under one position reading"
     ),
     "free_distance": Limit("m", 0.0, *DISTANCES, "distance from a surface that counts as out of contact"),
-    "settling": Limit("s", 0.0, 0.0, 100.0, "time that force and command need to die out after contact"),
+    "settling": Limit("s", 0.0, 0.0, 100.0, "time in which force and command decay after contact"),
     "free_force": Limit("N", FORCES[1], *FORCES, "largest force reading out of contact"),
     "late_fraction": Limit(
         "1", 0.25, 0.0, 1.0, "lateness or earliness of a tick, in periods, that is flagged; late: below 0.5"
     ),
-    "missed_in_a_row": Limit("1", COUNTED[1], *COUNTED, "missed ticks in a row that are bridged"),
+    "missed_in_a_row": Limit("1", COUNTED[1], *COUNTED, "largest number of missed ticks in a row"),
     "tare_ticks": Limit("1", 0.0, *COUNTED, "readings that a tare averages"),
     "tare_spread": Limit("N", FORCES[1], *FORCES, "largest difference between readings of a tare"),
     "bias_limit": Limit("N", FORCES[1], *FORCES, "largest bias that a tare may find"),
@@ -64,19 +68,21 @@ LIMITS: dict[str, Limit] = {
     "force_slew": Limit(
         "N/s", FORCE_SLEWS[1], *FORCE_SLEWS, "fastest change of the force on the numerical model"
     ),
-    "limited_in_a_row": Limit("1", 0.0, *BRIDGED, "ticks in a row at which a rate may be cut"),
+    "limited_in_a_row": Limit("1", 0.0, *BRIDGED, "largest number of ticks in a row with a cut change"),
     "command_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position command"),
     "command_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position command"),
     "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest change of the position command"),
     "start_distance": Limit(
-        "m", 0.0, *DISTANCES, "distance of a run's first command from where the drives read, out of contact"
+        "m", 0.0, *DISTANCES, "distance of a run's first command from the measured position, out of contact"
     ),
     "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
-    "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the way out of contact after a trip"),
-    "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "the model's; 0: no energies are audited"),
+    "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed out of contact after a trip"),
+    "equivalent_mass": Limit("kg", 0.0, 0.0, MASSES[1], "mass of the model; 0: no energies are audited"),
     "fading": Limit("N", 0.0, *FORCES, "force reading that counts as no contact"),
     "longest_contact": Limit("s", 1e5, 0.0, 1e5, "longest contact"),
-    "energy_balance": Limit("1", RATIOS[1], *RATIOS, "energy out of balance, of the approach's"),
+    "energy_balance": Limit(
+        "1", RATIOS[1], *RATIOS, "largest error of the energy, over that of the approach"
+    ),
     "restitution_margin": Limit("1", RATIOS[1], *RATIOS, "largest difference from the expected restitution"),
     "alignment": Limit("s", 0.0, *TIMES, "delay of the force reading against the position reading"),
     "reference_stiffness": Limit("N/m", 1.0, 1e-3, STIFFNESSES[1], "stiffness at which p is 0"),
@@ -89,24 +95,24 @@ LIMITS: dict[str, Limit] = {
     "loss_highest": Limit("1", 0.0, *FEATURES, "largest z"),
     "expected_1": Limit("1", 1.0, *COEFFICIENTS, "expected restitution at p = w = z = 0"),
     **{
-        f"expected_{term}": Limit("1", 0.0, *COEFFICIENTS, f"coefficient of {' '.join(term)} in it")
+        f"expected_{term}": Limit("1", 0.0, *COEFFICIENTS, f"coefficient of {' '.join(term)}")
         for term in ("p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
     },
 }
 
 
 def complete(limits: Mapping[str, float]) -> dict[str, float]:
-    """All limits, those that are not given at their defaults. Raises ValueError for limits that clash."""
-    found = {name: limits.get(name, one.default) for name, one in LIMITS.items()}
+    """Return all limits, defaults included. Raise ValueError if two of them contradict each other."""
+    values = {name: limits.get(name, limit.default) for name, limit in LIMITS.items()}
     for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
-        if not found[low] < found[high]:
-            raise ValueError(f"{low} {found[low]!r} is not below {high} {found[high]!r}")
-    if found["retreat_velocity"] > found["velocity_limit"]:
+        if not values[low] < values[high]:
+            raise ValueError(f"{low} {values[low]!r} is not below {high} {values[high]!r}")
+    if values["retreat_velocity"] > values["velocity_limit"]:
         raise ValueError(
-            f"retreat_velocity {found['retreat_velocity']!r} is above velocity_limit "
-            f"{found['velocity_limit']!r}"
+            f"retreat_velocity {values['retreat_velocity']!r} is above velocity_limit "
+            f"{values['velocity_limit']!r}"
         )
-    return found
+    return values
 
 
 NO_LIMITS: Mapping[str, float] = MappingProxyType(complete({}))

@@ -1,9 +1,9 @@
-"""What goes out, limited: the force on the numerical model and the position command to the drives.
+"""Limits of the outputs: the force on the numerical model and the position command to the drives.
 
-Both guards hold the last value that they let out, so that nothing jumps: not on a trip, not on a reset.
-Where a run begins, the position command goes on from where the drives read. After a trip the force is led to
-0; the position command brakes, and where it is in contact or nearer to a surface than `free_distance` it
-moves away at `retreat_velocity`, and comes to rest.
+Both guards continue from their last output, so that neither a trip nor a reset makes it jump. At the
+beginning of a run the position command continues from the measured position. After a trip the force ramps to
+0. The position command brakes; in contact, or nearer to a surface than `free_distance`, it moves away at
+`retreat_velocity`; then it comes to rest.
 """
 
 from math import isfinite
@@ -21,9 +21,11 @@ from jaxhil.rig.types import Limits, Positive
 
 
 class ForceGuard:
-    """The force on the numerical model within `force_limit`, its change within `force_slew`.
+    """Limiter of the force on the numerical model (`force_limit`) and of its change (`force_slew`).
 
-    Attributes: `output` [N], the force let out last; `fatal`, the faults that trip.
+    Attributes:
+        output: last force [N].
+        fatal: bits of the faults that trip.
     """
 
     __slots__ = ("_cut", "_cut_tolerated", "_limit", "_most", "fatal", "output")
@@ -36,12 +38,12 @@ class ForceGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; the output stays, for what follows to go on from."""
+        """Forget the faults; the next command continues from the last output."""
         self._cut = 0
         self.fatal = 0
 
     def limit(self, command: float) -> int:
-        """Let the command [N] out as far as the limits allow; the faults of that."""
+        """Move the output to the command [N] as far as the limits allow; return the faults."""
         self.fatal = 0
         if not isfinite(command):
             self.fatal = COMMAND_NOT_FINITE
@@ -61,19 +63,22 @@ class ForceGuard:
         return FORCE_SLEW
 
     def fade(self) -> None:
-        """Lead the output towards 0."""
+        """Move the output towards 0 as far as `force_slew` allows."""
         self.output = _towards(self.output, 0.0, self._most)
 
 
 class PositionGuard:
-    """The position command within the stroke, its change within `velocity_limit`.
+    """Limiter of the position command (stroke) and of its change (`velocity_limit`).
 
-    No command is further from the last one than the velocity limit allows in a period. A run's first one is
-    as near to where the drives read; out of contact, where they follow late, within `start_distance` of it.
-    A command is outside the stroke only on the way back from there.
+    Two commands in a row differ by at most what the velocity limit allows in a period. A run's first command
+    differs as little from the measured position; out of contact, where moving drives lag behind, it may
+    differ by `start_distance`. A command is outside the stroke only on the way back into it.
 
-    Attributes: `output` [m], the command let out last; `known`, whether there has been one; `at_rest`,
-    whether the last one after a trip did not move; `fatal`, the faults that trip.
+    Attributes:
+        output: last command [m].
+        known: whether there has been a command.
+        at_rest: whether the last command after a trip did not move.
+        fatal: bits of the faults that trip.
     """
 
     __slots__ = (
@@ -88,7 +93,7 @@ class PositionGuard:
         self._most = limits["velocity_limit"] * period
         self._braking = limits["deceleration"] * period * period
         self._retreat = limits["retreat_velocity"] * period
-        # In a narrow gap the safest place is its middle.
+        # In a narrow gap the safest position is the middle.
         distance, middle = limits["free_distance"], 0.5 * clearance
         self._distance = distance if distance < middle else middle
         self._cut_tolerated = limits["limited_in_a_row"]
@@ -98,7 +103,7 @@ class PositionGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; the way from the last output to the numerical model may take its time."""
+        """Forget the faults; changes may be cut without limit until the output reaches the next command."""
         self._cut = 0
         self._engaged = False
         self._rate = 0.0
@@ -106,15 +111,18 @@ class PositionGuard:
         self.fatal = 0
 
     def release(self) -> None:
-        """Forget the last output: the drives have been brought elsewhere."""
+        """Forget the last output, because the drives have been moved by other means."""
         self.known = False
         self.restart()
 
     def limit(self, command: float, position: float, measured: float, is_fresh: bool) -> int:
-        """Let the command [m] out as far as the limits allow; the faults of that.
+        """Move the output to the command as far as the limits allow; return the faults.
 
-        `position` [m] is the numerical model's; `measured` [m] is where the drives were read last, not a
-        number if they never were; `is_fresh`, whether that was in this run.
+        Args:
+            command: position to command [m].
+            position: position of the numerical model [m].
+            measured: last measured position of the drives [m]; NaN if there is none.
+            is_fresh: whether that measurement is of this run.
         """
         self.fatal = 0
         if not isfinite(command):
@@ -124,7 +132,7 @@ class PositionGuard:
             self.fatal = STROKE
             return STROKE
         if not self.known:
-            # Drives in motion follow late. Without a reading they have been brought to where the model is.
+            # Moving drives lag behind. Without a reading the drives are assumed at the model's position.
             near = abs(command - (measured if is_fresh else position)) <= self._start
             if near and deflection(position, self._clearance) == 0.0:
                 self.known = True
@@ -148,7 +156,7 @@ class PositionGuard:
         return VELOCITY_LIMIT
 
     def retreat(self, measured: float, position: float) -> None:
-        """Go on for a period to rest out of contact, from where the drives are; positions as in `limit`."""
+        """Move the output by one period on the way to rest out of contact; arguments as in `limit`."""
         if not self.known:
             self._stand(measured, position)
         output = self.output
@@ -166,7 +174,7 @@ class PositionGuard:
         else:
             rate = wanted
         moved = output + rate
-        # What begins outside the stroke may come back, and goes no further out.
+        # An output outside the stroke may come back, but does not move further out.
         if moved < self._lowest and rate < 0.0:
             moved = output if output < self._lowest else self._lowest
             rate = 0.0
@@ -178,7 +186,7 @@ class PositionGuard:
         self.at_rest = rate == 0.0 and wanted == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Begin where the drives read; if they never were, where the model is, but free and in stroke."""
+        """Begin at the measured position; without one, at the model's, moved into stroke and free space."""
         self.known = True
         self.output = measured
         if isfinite(measured):
@@ -196,7 +204,7 @@ class PositionGuard:
 
 
 def _towards(start: float, target: float, most: float) -> float:
-    """The value nearest to the target that is at most `most` from the start."""
+    """Return the value nearest to the target that differs by at most `most` from the start."""
     if target > start:
         moved = start + most
         return moved if moved < target else target

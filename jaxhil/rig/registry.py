@@ -1,7 +1,7 @@
-"""What a compensator of the runtime is, and the table of those known.
+"""Interface of the rig's compensators, and the table of registered ones.
 
-A compensator is a class with the methods of `Compensator`, from which it may take those that do nothing of
-their own; `@register(name)` enters it under the name that gain files use.
+A compensator is a class with the methods of `Compensator`, from which it may inherit the defaults;
+`@register(name)` adds it to the table under the name that gain files use.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,41 +13,42 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class GainSpecification(NamedTuple):
-    """One gain of a compensator: its unit, and the bounds that no gain file can move (`bounds`); the narrower
-    ones used in tuning stand in the gain file itself."""
+    """Unit and absolute bounds of a gain, which no gain file can widen (`bounds`)."""
 
     unit: str  # "1" if it has none
-    lowest: float = -inf  # least value
-    highest: float = inf  # largest value
+    lowest: float = -inf  # lower bound
+    highest: float = inf  # upper bound
 
     def admits(self, value: float) -> bool:
-        """Whether the value is within the bounds."""
+        """Return whether the value is within the bounds."""
         return self.lowest <= value <= self.highest
 
 
 class Compensator(Protocol):
-    """One compensation law, as it is evaluated tick by tick.
+    """Interface of a compensator, which the controller calls once per tick.
 
-    Constructed from its gains by name (SI units), the control period [s] and the clearance [m] of a
-    two-sided contact (infinite when the contact is one-sided).
+    Args:
+        gains: gains by name, in SI units.
+        period: control period [s].
+        clearance: clearance of a two-sided contact [m]; infinite for a one-sided one.
     """
 
     __slots__ = ()
 
     gains: ClassVar[Mapping[str, GainSpecification]]
-    # What stands behind the last command, one of `law_status`; a law says so always or never.
+    # Status of the last command, a number of `law_status`; either always UNSTATED or never.
     status: int = UNSTATED
 
     def __init__(self, gains: Gains, period: Positive, clearance: float) -> None: ...
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Identified stiffness [N/m] and damping [N s/m]; (0, 0) if the law identifies none."""
+        """Return identified stiffness [N/m] and damping [N s/m]; (0, 0) if none are identified."""
         return 0.0, 0.0
 
     @property
     def force_delay(self) -> float:
-        """Estimated delay [s] of the force measurement; 0 if the law estimates none."""
+        """Return the estimated delay [s] of the force measurement; 0 if none is estimated."""
         return 0.0
 
     def step(
@@ -57,19 +58,18 @@ class Compensator(Protocol):
         velocity_desired: float,
         position_measured: float,
     ) -> float:
-        """The force [N] that the numerical model is to feel, from this tick's finite readings."""
+        """Return the force F_c on the numerical model [N]; all arguments are finite, in N, m and m/s."""
         ...
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The position [m] to command, from the numerical model's new motion; its position itself unless the
-        law says otherwise."""
+        """Return the position to command [m] for the numerical model's new motion [m, m/s, m/s^2]."""
         return position
 
     def reset(self) -> None:
-        """Restart everything, identified parameters included; nothing, where a law has no state."""
+        """Restart everything, identified parameters included."""
 
     def next_contact(self) -> None:
-        """Restart filters, delay lines and covariance; keep the identified parameters, if there are any."""
+        """Restart filters, delay lines and covariance; keep the identified parameters."""
         self.reset()
 
 
@@ -79,7 +79,7 @@ COMPENSATORS: dict[str, type[Compensator]] = {}
 
 
 def register(name: str) -> Callable[[AnyCompensator], AnyCompensator]:
-    """A class decorator that enters a compensator in `COMPENSATORS` under `name`."""
+    """Return a class decorator that adds a compensator to `COMPENSATORS` under `name`."""
 
     def enter(compensator: AnyCompensator) -> AnyCompensator:
         COMPENSATORS[name] = compensator

@@ -1,8 +1,8 @@
-"""Where the mechanism's surfaces are: at 0, and at -clearance where the contact is two-sided."""
+"""Surfaces of the mechanism: at position 0, and at -clearance if the contact is two-sided."""
 
 
 def deflection(position: float, clearance: float) -> float:
-    """By how far a position [m] is beyond a surface [m]: x > 0, x + clearance < 0, or 0 in between."""
+    """Return by how much [m] a position x is beyond a surface: x > 0, x + clearance < 0, or 0 in between."""
     if position > 0.0:
         return position
     far = position + clearance

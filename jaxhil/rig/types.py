@@ -1,4 +1,4 @@
-"""Types of the rig's numbers: what the C99 generator (`jaxhil.codegen`) knows of them beside the kind."""
+"""Types of the rig's numbers, with properties that the C99 generator (`jaxhil.codegen`) reads."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 Positive = Annotated[float, "> 0"]
 NonNegative = Annotated[float, ">= 0"]
 Count = Annotated[int, ">= 0"]
-Index = Annotated[int, "index"]  # into a list of its class, which keeps it within: C does not test it
+Index = Annotated[int, "index"]  # into a list; Python code assures that it is in range: C does not test it
 Bits = Annotated[int, "uint32_t"]
 SmallInt = Annotated[int, "int"]
 Limits = Annotated[Mapping[str, float], "limits"]  # by name

@@ -1,29 +1,29 @@
-"""The watchdog: an energy audit of every contact, from the motion of the numerical model.
+"""Watchdog: an energy audit of every contact, from the motion of the numerical model.
 
 A contact begins on the tick on which the model's or the measured position is beyond a specified surface, or
-the law acts, which may find the surface nearer. It is audited once that has not been so for `settling`, the
-model moves away and the force on it has died out, which is waited for at most `PATIENCE`. No threshold
-depends on the noise: a noisy force that happens to be small may not have given all of its impulse. A contact
-is audited at the latest in the middle of the gap or when the next one is announced.
+the compensator acts (it may detect a nearer surface). It is audited once none of this has been so for
+`settling`, the model moves away and the force has decayed; the audit waits for that at most `PATIENCE`. No
+threshold depends on the noise, because a noisy force that happens to be small may still have impulse to give.
+At the latest, the audit takes place in the middle of the gap or when the next contact is announced.
 With v_in the model's velocity on the tick before the contact and v now, the audit asks:
 
-- Is the energy balanced? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the force
-  that the controller gave, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
+- Is the energy consistent? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the
+  controller's force, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
 - Is the restitution |v|/|v_in| the expected one, within `restitution_margin`?
-- Did the law, by its own word, know the contact (`law_status`)? This alone it asks without `equivalent_mass`.
-  A contact in which no reading of the force is beyond `fading` counts as not reached.
+- Did the compensator identify the contact, by its own status (`law_status`)? Without `equivalent_mass` this
+  is the only question. A contact in which no force reading is beyond `fading` counts as not reached.
 
-The expected restitution is that of the contact's own stiffness: k and b are the least squares of the
-measured force on the measured position, delayed by `alignment`, and its rate, over the whole contact. An
-error delta of the delay moves k by a factor cos(omega delta) alone, whatever the compensator does; b it moves
-by -k delta, which nothing on the rig can tell from damping. So where the file knows the damping, the
-polynomial is one of k alone:
+The expected restitution depends on stiffness k and damping b of this contact: the least-squares fit of the
+measured force to the measured position, delayed by `alignment`, and its rate, over the whole contact. An
+error delta of the delay changes k only by a factor cos(omega delta), whatever the compensator does; it
+changes b by -k delta, which nothing on the rig can distinguish from damping. The polynomial therefore has
+terms in z only where they help (`tuning.watchdog.expectation`):
 
     p = sqrt(reference_stiffness / k) - 1,  w = |v_in| / reference_velocity - 1,  z = b / (2 sqrt(k M)),
     e* = c_1 + c_p p + c_pp p^2 + c_ppp p^3 + c_w w + c_ww w^2 + c_pw p w
          + c_z z + c_zz z^2 + c_pz p z + c_wz w z,   within 0 and 1,
 
-each of p, w, z kept to the range that it was fitted over.
+each of p, w, z limited to the range over which the polynomial was fitted.
 """
 
 from math import inf, sqrt
@@ -41,16 +41,26 @@ from jaxhil.rig.law_status import (
 from jaxhil.rig.surfaces import deflection
 from jaxhil.rig.types import Limits, Positive
 
-FADED = 1e-6  # of the largest force, and impulse of the rest over that of the approach
-PATIENCE = 0.1  # s, that the force is given to die out
+FADED = 1e-6  # share of the peak force, or of the approach's momentum: the force has decayed
+PATIENCE = 0.1  # s; longest wait for the force to decay
 
 
 class Watchdog:
-    """One contact after another, audited.
+    """Audit of one contact after another.
 
-    `stated`: whether the law has a status. Attributes: `on`, whether there is anything to watch; `contacts`,
-    those audited; of the last of them `record`, what the law said of it, and, until `restart`, `restitution`,
-    the `expected` one and the energy out of `balance` [J].
+    Args:
+        limits: limits by name, in SI units.
+        period: control period [s].
+        clearance: clearance of a two-sided contact [m]; infinite for a one-sided one.
+        stated: whether the compensator has a status.
+
+    Attributes:
+        on: whether there is anything to audit.
+        contacts: number of audited contacts.
+        record: statuses of the last audited contact.
+        restitution: restitution of that contact [1], until `restart`.
+        expected: expected restitution of that contact [1], until `restart`.
+        balance: energy error of that contact [J], until `restart`.
     """
 
     __slots__ = (
@@ -83,7 +93,7 @@ class Watchdog:
         self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
 
     def restart(self) -> None:
-        """Forget the contact under way and the motion so far, but not `contacts` and `record`."""
+        """Forget the current contact and the motion so far, but not `contacts` and `record`."""
         self._known = False
         self._open = False
         self._entry = 0.0
@@ -106,11 +116,15 @@ class Watchdog:
     def tick(
         self, given: float, status: int, force: float, position: float, velocity: float, measured: float
     ) -> int:
-        """The faults that this tick shows, 0 if none.
+        """Return the faults that this tick shows, 0 if none.
 
-        `given` [N] is the force that the controller gave on the tick before, `status` what the law said of
-        it, `force` [N] and `measured` [m] are this tick's readings, position [m] and velocity [m/s] the
-        numerical model's.
+        Args:
+            given: force F_c of the tick before [N].
+            status: the compensator's status of that force.
+            force: force reading of this tick [N].
+            position: position of the numerical model [m].
+            velocity: velocity of the numerical model [m/s].
+            measured: position reading of this tick [m].
         """
         if self._known:
             before = self._velocity
@@ -155,8 +169,12 @@ class Watchdog:
         return fault
 
     def conclude(self, given: float, status: int) -> int:
-        """Audit the contact under way, if there is one, after the force `given` [N] on the last tick and the
-        law's `status` then."""
+        """Audit the current contact, if there is one, and return the faults.
+
+        Args:
+            given: force F_c of the last tick [N].
+            status: the compensator's status of that force.
+        """
         if not self._open:
             return 0
         self._statuses.take(status)
@@ -168,9 +186,9 @@ class Watchdog:
         return self._audit(velocity)
 
     def detail(self) -> str:
-        """The last audit in words."""
-        found = f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
-        return f"{found}, law {STATUS_NAMES[self.record.status].replace('_', ' ')}" if self._stated else found
+        """Return the last audit in words."""
+        text = f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
+        return f"{text}, law {STATUS_NAMES[self.record.status].replace('_', ' ')}" if self._stated else text
 
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
@@ -186,8 +204,8 @@ class Watchdog:
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
     def _regress(self, force: float, aligned: float) -> None:
-        """Take in the interval between two ticks, if both its ends are in contact."""
-        # Not by the force as well: of noisy readings it would pick the larger ones, and bias the stiffness.
+        """Add the interval between two ticks to the regression if both its ends are in contact."""
+        # A condition on the force would select the larger of noisy readings and bias the stiffness.
         side = self._side
         before = self._aligned
         if aligned * side > 0.0 and before * side > 0.0:
@@ -231,7 +249,7 @@ class Watchdog:
 
 
 class Expectation:
-    """The restitution that a contact should have, by its stiffness [N/m], damping [N s/m], speed [m/s]."""
+    """Expected restitution of a contact, a polynomial of its stiffness, damping and approach speed."""
 
     __slots__ = (
         "_coefficients", "_loss", "_reference_stiffness", "_reference_velocity", "_softness", "_speed",
@@ -251,7 +269,14 @@ class Expectation:
         ]
 
     def restitution(self, stiffness: float, damping: float, speed: float, mass: Positive) -> float:
-        """The polynomial of the module's text; a stiffness that is not above 0 counts as the softest."""
+        """Return the polynomial of the module's docstring; a stiffness <= 0 counts as the softest.
+
+        Args:
+            stiffness: identified stiffness [N/m].
+            damping: identified damping [N s/m].
+            speed: approach speed [m/s].
+            mass: equivalent mass [kg].
+        """
         p, z = self._softness[1], self._loss[0]
         if stiffness > 0.0:
             root = sqrt(stiffness * mass)
@@ -265,7 +290,7 @@ class Expectation:
 
 
 def _within(value: float, span: tuple[float, float]) -> float:
-    # Written so that what is not a number goes to an end as well.
+    # NaN is not above the lower end, so that it gives the lower end.
     if not value > span[0]:
         return span[0]
     return value if value < span[1] else span[1]
