@@ -1,6 +1,6 @@
-"""Former name of `jaxhil.rig`, kept for one release.
+"""Former name of `jaxhil.rig`, available for one more release.
 
-`jaxhil.runtime.controller` and the other modules of the package are those of `jaxhil.rig`.
+Its modules, such as `jaxhil.runtime.controller`, are those of `jaxhil.rig`.
 """
 
 import sys

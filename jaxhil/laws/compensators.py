@@ -1,6 +1,6 @@
-"""Tables of the compensators in JAX, by name, and the gains that the literature's rules give them.
+"""Tables of the compensators in JAX, and their gains by the literature's rules.
 
-Simulation, tuning, gain files and the command line know the compensators entered here: those of this
+Simulation, tuning, gain files and the command line use the compensators in these tables: those of this
 package's folders, and those that `jaxhil.register` adds.
 """
 
@@ -18,11 +18,11 @@ def _table(axes: int) -> dict[str, Compensator]:
 
 
 COMPENSATORS = _table(1)
-SIX_AXES = _table(6)  # each works on the channels of the wrench one by one
+SIX_AXES = _table(6)  # each treats the channels of the wrench separately
 
 
 def compensator_of(name: str) -> Compensator:
-    """Return the compensator of a name, for one axis or for six. Raise KeyError for an unknown name."""
+    """Return the compensator with this name, for one axis or for six. Raise KeyError if there is none."""
     return COMPENSATORS[name] if name in COMPENSATORS else SIX_AXES[name]
 
 
@@ -31,17 +31,22 @@ def literature_gains(
 ) -> dict[str, float]:
     """Return the gains by the literature's rules for a mechanism, or one of the compensator's settings.
 
-    A setting's gains are moved into the bounds that the mechanism has for them. Raise KeyError for a setting
-    that the compensator does not have.
+    Args:
+        mechanism: mechanism with its rig.
+        compensator: name of the compensator.
+        setting: name of the setting; its gains are limited to their bounds for the mechanism.
+
+    Raises:
+        KeyError: if there is no such compensator or setting.
     """
     law = compensator_of(compensator)
     chosen = law.settings[setting] if setting is not None else {}
-    # In six axes the rules read the force sensor and the control period alone.
-    known: Any = mechanism
+    # For six axes the rules read only the force sensor and the control period, which both classes have.
+    source: Any = mechanism
     gains = {}
     for gain in law.gains:
-        value = float(gain.nominal(known))
+        value = float(gain.nominal(source))
         if gain.name in chosen:
-            value = min(max(float(gain.lower(known)), chosen[gain.name]), float(gain.upper(known)))
+            value = min(max(float(gain.lower(source)), chosen[gain.name]), float(gain.upper(source)))
         gains[gain.name] = value
     return gains

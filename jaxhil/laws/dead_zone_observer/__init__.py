@@ -1,1 +1,1 @@
-"""Dead zone observer: the force that a dead zone of the sensor holds back is estimated."""
+"""Dead zone observer: adds the force that the dead zone of the sensor removes."""

@@ -1,8 +1,9 @@
-"""Phase lead, and an observer of what the force sensor's dead zone withholds.
+"""Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone takes clip(F, -dz, dz) from the force F. The observer puts in k_n d for F, d the deflection by the
-measured position as late as the force, through a low pass of first order; the sum is led. After Li et al.
-2026 (phase lead and a disturbance observer near 1 below 15 Hz).
+A dead zone subtracts clip(F, -dz, dz) from the force F. The observer uses k_n d for F, where d is the
+deflection by the measured position, delayed like the force, and adds the result behind a first-order low-pass
+filter; the phase lead acts on the sum. After Li et al. 2026 (phase lead and a disturbance observer near 1
+below 15 Hz).
 """
 
 from collections.abc import Mapping
@@ -17,9 +18,9 @@ from jaxhil.rig.surfaces import deflection
 
 @register("dead_zone_observer")
 class DeadZoneObserver(Compensator):
-    """F_c = lead(F + w), w = Q clip(k_n d, -limit, limit), Q = 1/(1 + s/(2 pi f)) by Tustin's rule:
+    """Compensator F_c = lead(F + w), w = Q u, u = clip(k_n d, -limit, limit), Q = 1/(1 + s/(2 pi f)).
 
-    w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c), c = 2 pi f T.
+    Q is realised by Tustin's rule: w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c), c = 2 pi f T.
     """
 
     __slots__ = (
@@ -51,7 +52,7 @@ class DeadZoneObserver(Compensator):
         self._started = False
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force and what the dead zone withholds of it [N], led."""
+        """Return the phase lead of measured force plus observed dead-zone force [N]."""
         alignment = self._alignment
         if not self._started:
             alignment.start(position_measured, velocity_desired)

@@ -1,19 +1,19 @@
-"""Phase lead, and an observer of what the force sensor's dead zone withholds.
+"""Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the deflection by x_a as late as F is
+    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the deflection by x_a, delayed like F
 
-After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz), of which no more than
-this is known here: what follows is our realisation. A disturbance observer adds Q (F_n - F), F_n the force by
-a nominal model. Of a dead zone more is known: it takes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz), so
-that the nominal model k_n d need only stand for F in there. Where k_n is right the two are the same; else
-k_n is wrong only where |F| < dz, and above it what is added is dz, whatever k_n.
+After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz). No more of it is known
+here: the rest is our realisation. A disturbance observer adds Q (F_n - F), F_n the force by a nominal model.
+More is known of a dead zone: it removes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz), so that the nominal
+model k_n d only replaces F in this expression. If k_n is right, both observers are the same. Otherwise the
+error is limited to |F| < dz; above it the observer adds dz, whatever k_n is.
 
-Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1), 31 Hz. Its
-lag 1/(2 pi f) would be a delay; by so much less is x_a delayed (`identification_delay`), for which f is at
-least 1/(2 pi tau_f).
+Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1), 31 Hz. The
+lag of Q, 1/(2 pi f), would be a delay: x_a is therefore delayed by that much less (`identification_delay`),
+for which f must be at least 1/(2 pi tau_f), tau_f being the force delay.
 
-A dead zone moves the surface of a linear contact by dz/k: its restitution is what it was, with any delay, but
-the hardware is pressed deeper, by dz more than without. That is what the observer makes up for.
+A dead zone moves the surface of a linear contact by dz/k. The restitution stays the same for any delay, but
+the hardware is pressed deeper, with a force larger by dz. The observer corrects this.
 """
 
 import math
@@ -44,11 +44,11 @@ from jaxhil.laws.shared.lead_filter import (
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_gain
 from jaxhil.mechanism.structs import Mechanism
 
-NEAR_1 = 15.0, 0.9  # up to this frequency [Hz] |Q| is at least this
+NEAR_1 = 15.0, 0.9  # frequency [Hz] up to which |Q| is at least the second number
 
 
 def _widest(mechanism: Mechanism) -> float:
-    """Where [Hz] Q's pole is 0: beyond, its output would swing at every second tick."""
+    """Return the bandwidth [Hz] at which Q's pole is 0; beyond it the output alternates from tick to tick."""
     return 1 / (math.pi * mechanism.rig.control_period)
 
 
@@ -64,27 +64,27 @@ def _nominal_alignment(mechanism: Mechanism) -> float:
 
 
 class DeadZoneObserverState(NamedTuple):
-    """What the law carries from tick to tick."""
+    """State of the observer from tick to tick."""
 
-    lead: LeadState  # lead filter
-    withheld: Float[Array, "*batch"]  # Q's input of the tick before [N]
-    observed: Float[Array, "*batch"]  # Q's output of the tick before [N]
+    lead: LeadState
+    withheld: Float[Array, "*batch"]  # input of Q on the last tick [N]
+    observed: Float[Array, "*batch"]  # output of Q on the last tick [N]
     line: DelayLine  # measured positions
 
 
 class Prepared(NamedTuple):
-    """What is worked out once per run."""
+    """Gains and filter coefficients, computed once per run."""
 
-    gains: Gains  # of the law
-    clearance: Float[Array, "*batch"]  # between two surfaces [m]
-    lead: LeadFilter  # lead filter
-    pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1))
-    share: Float[Array, "*batch"]  # of Q's input
-    delay: Delay  # by which positions are aligned
+    gains: Gains
+    clearance: Float[Array, "*batch"]  # of a two-sided contact [m]
+    lead: LeadFilter
+    pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1)) [1]
+    share: Float[Array, "*batch"]  # of Q's input [1]
+    delay: Delay  # of the positions, to align them with the force
 
 
 class DeadZoneObserver(Compensator):
-    """Phase lead of the force and of what the dead zone withholds; see the module's text."""
+    """Phase lead of measured force plus observed dead-zone force; see the module's docstring."""
 
     name: ClassVar[str] = "dead_zone_observer"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)
@@ -145,7 +145,7 @@ class DeadZoneObserver(Compensator):
         return command, DeadZoneObserverState(lead_state, withheld, observed, line)
 
     def noise_amplification(self, gains, constants):
-        # What is observed knows nothing of the force readings.
+        # The observed force does not depend on the force readings.
         return lead_amplification(lead_filter(gains, constants))
 
 

@@ -1,1 +1,1 @@
-"""Impulse ledger: the law of this project. Its parts are the folders beside it."""
+"""Impulse ledger, the compensator of this project; its parts are the subfolders."""

@@ -1,17 +1,18 @@
 """Impulse ledger: a reference trajectory at the time of the readings, bridged to the present.
 
-A force reading tells what the numerical model should have felt D ago, D being the lag of hardware and force
-behind the model, measured in free flight at the onset. The law fits a contact model to the readings
-(`contact_model`), advances a reference trajectory at the time of the readings (`reference_trajectory`),
-bridges the D seconds to now with the fitted model, and steers the numerical model's velocity onto the result:
+A force reading is the force that should have acted on the numerical model D ago. D is the lag of hardware and
+force behind the model, measured in free flight at the onset. The compensator fits a contact model to the
+readings (`contact_model`), advances a reference trajectory at the time of the readings
+(`reference_trajectory`), bridges the D seconds to the present with the fitted model, and controls the
+numerical model's velocity towards the result:
 
     F_c = f_p + clip(c (v_d - T f_p/2 - v_p), -limit p, (1 + limit) p - f_p)
 
 f_p and v_p are force and speed of the bridged trajectory at the middle of the coming period, v_d is the
-model's velocity and p the peak force of contact as far as it is known. Forces are scaled by equivalent mass
-and approach speed, so that one set of gains serves every mechanism. In free flight, until the onset is
-detected (`onset_detection`), F_c = 0. A run that begins in contact has no approach speed to scale by: there
-F_c is the measured force.
+model's velocity, c the velocity gain and p the peak force of contact as far as it is known. Forces are scaled
+by equivalent mass and approach speed, so that one set of gains serves every mechanism. In free flight, until
+the onset is detected (`onset_detection`), F_c = 0. In a run that begins in contact the approach speed is
+unknown, and F_c is the measured force.
 
 Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware leaves the
 surface. The estimate corrects the speed at which this contact ends. From the next contact on, it also aligns
@@ -31,28 +32,28 @@ from jaxhil.rig.law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, 
 from jaxhil.rig.registry import Compensator, GainSpecification, register
 from jaxhil.rig.surfaces import deflection
 
-RELEASE_TIME = 0.03  # s for which the law acts after the hardware has left the surface
-LEAST_MOMENTUM = 1e-9  # kg m/s; below it forces cannot be scaled
-LONGEST_LAG = 0.2  # s; the lag D is at most that
-ONSET_PLACE = -0.5  # periods from the surface to the last free reading
-MISFIT = 0.003  # of a force, by which the contact model errs for `MISFIT_TIME`
+RELEASE_TIME = 0.03  # s; the compensator acts so long after the hardware has left the surface
+LEAST_MOMENTUM = 1e-9  # kg m/s; with less, forces cannot be scaled
+LONGEST_LAG = 0.2  # s; upper bound of the lag D
+ONSET_PLACE = -0.5  # travel per period; the last free reading relative to the surface
+MISFIT = 0.003  # relative error of the contact model's force over `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
-OUTLYING = 16.0  # variances; a reading beyond that tells of contact
-HOLD_TIME = 0.004  # s; time constant of the misfit that the bridge holds
-SLOWEST = 1e-9  # speed; a slower one is at rest, but for rounding
-SHALLOW = 0.001  # s; depth below which a secant stiffness is not taken
+OUTLYING = 16.0  # variances; a larger squared reading shows contact
+HOLD_TIME = 0.004  # s; time constant of the misfit in the bridge
+SLOWEST = 1e-9  # speed [1]; a slower motion is rest with rounding errors
+SHALLOW = 0.001  # s; depth below which the secant stiffness is not computed
 LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
-HIGHEST = 1.5  # peak forces that the bridged force is at most
-FEW_READINGS = 5  # in contact, below which the model is unsure
-LATE = 0.8  # share of the contact that is over at the onset, beyond which little time is left
-UNCERTAIN = 0.006  # standard deviation of the reference's speed, above which restitution is uncertain
+HIGHEST = 1.5  # upper bound of the bridged force, over the peak force
+FEW_READINGS = 5  # readings in contact; with fewer the status is `unsure`
+LATE = 0.8  # share of the contact that is over at the onset; with more the status is `too_short`
+UNCERTAIN = 0.006  # standard deviation of the reference speed [1]; with more the status is `noisy`
 IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
-USUAL_PRELOAD = 1.0  # 1/s; prior spread of a preload, beside a specified one
-LARGEST_DELAY_SPREAD = 0.004  # s; beyond it the first order in the delay does not hold
-MOST_SPREADS = 3.0  # spreads by which the delay differs from the specified one at most
-ONSET_TICKS = 0.3  # periods by which the onset is uncertain: 1/sqrt(12)
-ONSET_MEAN = 0.25  # of the force at which the onset is detected: by how much contact begins too late
-ONSET_SPREAD = 0.4  # likewise, its standard deviation
+USUAL_PRELOAD = 1.0  # 1/s; prior standard deviation of the preload, in addition to a specified one
+LARGEST_DELAY_SPREAD = 0.004  # s; with more the first order in the delay is not accurate
+MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from the specified one
+ONSET_TICKS = 0.3  # periods; standard deviation of the onset, 1/sqrt(12)
+ONSET_MEAN = 0.25  # share of the force at which the onset is detected: mean force at the onset
+ONSET_SPREAD = 0.4  # share of the same force: its standard deviation at the onset
 SPREADS = (
     "prior_stiffness_spread",
     "prior_slope_spread",
@@ -66,7 +67,7 @@ SPREADS = (
 
 @register("impulse_ledger")
 class ImpulseLedger(Compensator):
-    """Compensator with contact model, reference trajectory and bridge; see the module's text."""
+    """Compensator with contact model, reference trajectory and bridge; see the module's docstring."""
 
     __slots__ = (
         "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
@@ -113,7 +114,7 @@ class ImpulseLedger(Compensator):
 
     def reset(self) -> None:
         """Restart everything."""
-        self._delay = 0.0  # by which the force is older than specified, as far as known [s]
+        self._delay = 0.0  # estimated delay of the force beyond the specified one [s]
         self._variance = self._delay_spread * self._delay_spread  # of the delay [s^2]
         self.next_contact()
 
@@ -121,7 +122,7 @@ class ImpulseLedger(Compensator):
         """Restart everything but the estimate of the delay."""
         self._since_start = 0.0  # ticks of this run
         self._side = 1.0  # direction in which the surface is approached
-        self._speed = 0.0  # approach speed [m/s]; 0: nothing can be scaled
+        self._speed = 0.0  # approach speed [m/s]; 0 if unknown
         self._outside = 0.0  # ticks since the hardware left the surface
         self._in_contact = False
         self._detector.restart()
@@ -129,7 +130,7 @@ class ImpulseLedger(Compensator):
 
     @property
     def force_delay(self) -> float:
-        """Estimated delay [s] of the force measurement."""
+        """Return the estimated delay [s] of the force measurement."""
         return self._identification_delay + self._delay
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
@@ -159,12 +160,12 @@ class ImpulseLedger(Compensator):
     def _approach(
         self, force: float, position_desired: float, velocity_desired: float, position: float, settled: bool
     ) -> None:
-        """Watch a reading of free flight; where it shows no contact, contact begins anew after it."""
+        """Test a reading of free flight for contact; without contact, let contact begin after it."""
         side = 1.0 if velocity_desired > 0.0 or self._clearance == inf else -1.0
         speed = side * velocity_desired
         approaches = self._mass * speed > LEAST_MOMENTUM
         detector = self._detector
-        # What comes after a reading of free flight, at a speed and towards a side that it is known for.
+        # The bias is known only after a reading of free flight, at an approach speed towards this side.
         settled = settled and approaches and self._speed > 0.0 and side == self._side
         detector.watch(force, side, self._floor * (self._mass * speed), settled)
         if detector.total > 0.0:
@@ -198,27 +199,27 @@ class ImpulseLedger(Compensator):
         self._deepest = depth if depth > self._deepest else self._deepest
         phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
         reading = side * force / weight
-        off = MISFIT * reading
+        model_error = MISFIT * reading
         noise = self._detector.variance / (weight * weight)
-        variance = noise + self._floor * self._floor + off * off * (MISFIT_TIME / period)
-        tells = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
+        variance = noise + self._floor * self._floor + model_error * model_error * (MISFIT_TIME / period)
+        informs = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
         ended = not depth > 0.0 and rate < 0.0
-        learns = tells and depth > period
+        learns = informs and depth > period
         if learns:
             model.learn(phi, reading, variance)
             self._readings += 1
         if not depth > 0.0:
             onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + self._floor
             onset += sqrt(noise) if noise > 0.0 else 0.0
-            known = self._spreads[-1]
-            spread = sqrt(known * known + (ONSET_SPREAD * onset) ** 2)
+            preload = self._spreads[-1]
+            spread = sqrt(preload * preload + (ONSET_SPREAD * onset) ** 2)
             self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
         if learns or ended:
             model.conclude(self._estimate[0] if ended else 0.0)
         reference.correct(model.theta)
         reference.advance(period, reading, phi)
-        missed = reading - dot(model.theta, phi)
-        self._misfit += period / (period + HOLD_TIME) * (missed - self._misfit)
+        residual = reading - dot(model.theta, phi)
+        self._misfit += period / (period + HOLD_TIME) * (residual - self._misfit)
         push, ahead = reference.bridge(self._lag + 0.5 * period, self._misfit)
         command = self._command(push, ahead, depth, rate, reading, phi, side * velocity_desired / speed)
         self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
@@ -236,26 +237,36 @@ class ImpulseLedger(Compensator):
         phi: Vector,
         desired: float,
     ) -> float:
-        """Return the scaled command [1/s], by the bridged force [1/s] and speed and the model's speed."""
+        """Return the scaled command [1/s].
+
+        Args:
+            push: bridged force [1/s].
+            ahead: bridged speed [1].
+            depth: depth of the hardware [s].
+            rate: speed of the hardware [1].
+            reading: force reading [1/s].
+            phi: features of the reading.
+            desired: speed of the numerical model [1].
+        """
         mean = self._model.mean
         secant = dot(phi[:HINGES], mean[:HINGES]) / (depth if depth > SHALLOW else SHALLOW)
         variance = self._model.covariance[0][0]
-        known = secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS
-        known -= sqrt(variance) if variance > 0.0 else 0.0
-        likely = sqrt(known if known > LEAST_STIFFNESS else LEAST_STIFFNESS)
+        secure = secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS
+        secure -= sqrt(variance) if variance > 0.0 else 0.0
+        predicted = sqrt(secure if secure > LEAST_STIFFNESS else LEAST_STIFFNESS)
         self._peak = max(self._peak, reading, 1.0)
-        peak = likely if rate > SLOWEST and likely > self._peak else self._peak
+        peak = predicted if rate > SLOWEST and predicted > self._peak else self._peak
         push = push if push < HIGHEST * peak else HIGHEST * peak
         wanted = self._gain * (desired - 0.5 * self._period * push - ahead)
         least = -self._correction_limit * peak
         most = (1.0 + self._correction_limit) * peak - push
         correction = most if wanted > most else (least if wanted < least else wanted)
         if self._in_contact:
-            self.status = self._judge(peak, correction == wanted)
+            self.status = self._evaluate(peak, correction == wanted)
         return push + correction
 
-    def _judge(self, peak: float, free: bool) -> int:
-        """Return the status of a command whose correction is `free` of its limits, for a peak force [1/s]."""
+    def _evaluate(self, peak: float, free: bool) -> int:
+        """Return the status for a peak force [1/s]; `free`: the correction is within its limits."""
         reference = self._reference
         if self._readings < FEW_READINGS:
             return UNSURE
@@ -271,7 +282,10 @@ class ImpulseLedger(Compensator):
         return IDENTIFIED if free else SATURATED
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> float:
-        """Return the measured force [N] of a run that began in contact, until both have left the surface."""
+        """Return the measured force [N] in a run that began in contact; 0 while the model is outside.
+
+        The contact ends once the model is outside and the hardware has been outside for `RELEASE_TIME`.
+        """
         side = self._side
         inside = side * deflection(position_desired, self._clearance) > 0.0
         bent = side * deflection(position, self._clearance)
@@ -283,7 +297,7 @@ class ImpulseLedger(Compensator):
         return force if inside and not bent < 0.0 else 0.0
 
     def _end(self) -> None:
-        """End the contact."""
+        """End the contact and keep the estimate of the delay."""
         if self._speed > 0.0:
             limit = MOST_SPREADS * self._delay_spread
             shift, self._variance = self._estimate

@@ -1,8 +1,9 @@
-"""Impulse ledger in JAX: the law of `jaxhil.laws.impulse_ledger.rig`, for batches.
+"""Impulse ledger in JAX: the batched compensator of `jaxhil.laws.impulse_ledger.rig`.
 
-A force reading tells what the numerical model should have felt D ago. The law fits a contact model to the
-readings, advances a reference trajectory at their time, bridges the D seconds to now with the fitted model,
-and steers the numerical model's velocity onto the result. The equations stand there.
+A force reading is the force that should have acted on the numerical model D ago. The compensator fits a
+contact model to the readings, advances a reference trajectory at their time, bridges the D seconds to the
+present with the fitted model, and controls the numerical model's velocity towards the result. `rig.py` states
+the equations.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -30,24 +31,24 @@ USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter where th
 VELOCITY_GAIN = 105.0  # 1/s
 
 
-def _known(name: str, upper, nominal, lower=lambda m: 0.0) -> Gain:
-    """Return a gain that is specified or estimated from the mechanism file and that tuning does not move."""
+def _from_file(name: str, upper, nominal, lower=lambda m: 0.0) -> Gain:
+    """Return a gain that follows from the mechanism file; tuning does not change it."""
     return rig_gain(name, lower, upper, nominal, tuned=lambda m: False)
 
 
 def _prior(name: str, lower: float, upper: float, nominal: float, tuned=lambda m: True) -> Gain:
-    """Return a gain that is the same for every mechanism."""
+    """Return a gain with the same bounds and nominal value for every mechanism."""
     return rig_gain(name, lambda m: lower, lambda m: upper, lambda m: nominal, logarithmic=True, tuned=tuned)
 
 
 GAINS: tuple[Gain, ...] = (
-    _known(
+    _from_file(
         "equivalent_mass", lambda m: 10 * m.bodies.mass, lambda m: m.bodies.mass,
         lambda m: 0.1 * m.bodies.mass,
     ),
-    _known("identification_delay", lambda m: 2 * estimates.force_delay(m) + 0.02, estimates.force_delay),
-    _known("delay_spread", lambda m: rig.LARGEST_DELAY_SPREAD, specified.delay_spread),
-    _known(
+    _from_file("identification_delay", lambda m: 2 * estimates.force_delay(m) + 0.02, estimates.force_delay),
+    _from_file("delay_spread", lambda m: rig.LARGEST_DELAY_SPREAD, specified.delay_spread),
+    _from_file(
         "force_noise", lambda m: m.rig.force_sensor.noise_std + estimates.peak_force(m),
         lambda m: m.rig.force_sensor.noise_std,
     ),
@@ -62,8 +63,8 @@ GAINS: tuple[Gain, ...] = (
         lambda m: max(USUAL_UNLOADING, specified.unloading(m)), logarithmic=True,
         tuned=lambda m: specified.unloading(m) > 0,
     ),
-    _known("prior_friction_spread", lambda m: 50.0 + specified.friction(m), specified.friction),
-    _known("prior_preload_spread", lambda m: 50.0 + specified.preload(m), specified.preload),
+    _from_file("prior_friction_spread", lambda m: 50.0 + specified.friction(m), specified.friction),
+    _from_file("prior_preload_spread", lambda m: 50.0 + specified.preload(m), specified.preload),
     rig_gain(
         "velocity_gain", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
         lambda m: min(VELOCITY_GAIN, 0.7 / m.rig.control_period), logarithmic=True,
@@ -76,20 +77,20 @@ GAINS: tuple[Gain, ...] = (
 
 
 class Contact(NamedTuple):
-    """State that belongs to one contact."""
+    """State of one contact."""
 
     side: Float[Array, "*batch"]  # direction in which the surface is approached, 1 or -1
-    speed: Float[Array, "*batch"]  # approach speed [m/s]; 0: nothing can be scaled
-    origin: Float[Array, "*batch"]  # position of the surface, along the side [m]
+    speed: Float[Array, "*batch"]  # approach speed [m/s]; 0 if unknown
+    origin: Float[Array, "*batch"]  # position of the surface, in the direction of `side` [m]
     lag: Float[Array, "*batch"]  # D [s]
-    deepest: Float[Array, "*batch"]  # of the hardware [s]
-    misfit: Float[Array, "*batch"]  # low-passed y - f(X, V) [1/s]
+    deepest: Float[Array, "*batch"]  # largest depth of the hardware [s]
+    misfit: Float[Array, "*batch"]  # low-pass of y - f(X, V) [1/s]
     peak: Float[Array, "*batch"]  # largest reading so far [1/s]
     outside: Float[Array, "*batch"]  # ticks since the hardware left the surface
 
 
 class LedgerState(NamedTuple):
-    """State from tick to tick."""
+    """State of the impulse ledger from tick to tick."""
 
     line: DelayLine  # of the measured position
     aligned: Aligned  # measured positions as old as the force
@@ -98,21 +99,21 @@ class LedgerState(NamedTuple):
     contact: Contact
     estimate: Estimate  # of the contact model
     reference: Reference
-    delay: Float[Array, "*batch"]  # by which the force is older than specified, as far as known [s]
+    delay: Float[Array, "*batch"]  # estimated delay of the force beyond the specified one [s]
     variance: Float[Array, "*batch"]  # of the delay [s^2]
 
 
 class Prepared(NamedTuple):
-    """Numbers computed once per run."""
+    """Gains and constants, computed once per run."""
 
     gains: Gains  # of the batch shape
     constants: Constants
     delay: Delay  # of the delay line
-    share: Float[Array, "*batch"]  # of the sample before, for the rest of the delay
+    share: Float[Array, "*batch"]  # weight of the previous sample, for the rest of the delay [1]
 
 
 class Reading(NamedTuple):
-    """One tick's readings, as old as the force."""
+    """Readings of one tick, as old as the force."""
 
     force: Float[Array, "*batch"]  # [N]
     position: Float[Array, "*batch"]  # [m]
@@ -120,7 +121,7 @@ class Reading(NamedTuple):
 
 
 class ImpulseLedger(Compensator):
-    """Compensator with contact model, reference trajectory and bridge; see the module's text."""
+    """Compensator with contact model, reference trajectory and bridge; see the module's docstring."""
 
     name: ClassVar[str] = "impulse_ledger"
     knows: ClassVar[tuple[str, ...]] = (
@@ -223,10 +224,10 @@ class ImpulseLedger(Compensator):
         )
 
     def _approach(self, prepared, flight, contact, signals, reading, in_contact):
-        """Watch a reading of free flight; where it shows no contact, contact begins anew after it.
+        """Test a reading of free flight for contact; where there is none, let contact begin after it.
 
         Returns:
-            What free flight shows, the contact, and where it begins anew.
+            Statistics of free flight, contact, and the lanes where contact begins after this reading.
         """
         gains, (period, clearance) = prepared.gains, prepared.constants
         side = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
@@ -235,7 +236,7 @@ class ImpulseLedger(Compensator):
         sigma = _sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
         sigma = jnp.where(approaches, sigma, 1)
-        # What comes after a reading of free flight, at a speed and towards a side that it is known for.
+        # The bias is known only after a reading of free flight, at an approach speed towards this side.
         settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
         settled = settled & approaches & (contact.speed > 0) & (side == contact.side)
         deviation = side * (reading.force - flight.bias) / sigma
@@ -254,8 +255,11 @@ class ImpulseLedger(Compensator):
         return onset_detection.learn(flight, reading.force, free), contact, fresh
 
     def _follow(self, prepared, contact, estimate, reference, signals, reading, flight, before):
-        """Return command [N], contact, estimate and reference after a reading, and the delay's mean and
-        variance as a contact that ends here shows them; `before` is the prior of the contact model."""
+        """Return command [N], contact, estimate, reference, and mean and variance of the delay.
+
+        They follow a reading; the delay is that of a contact that ends here. `before` is the prior of the
+        contact model.
+        """
         gains, period = prepared.gains, prepared.constants.control_period
         side, speed = contact.side, contact.speed
         weight = gains["equivalent_mass"] * speed
@@ -264,13 +268,15 @@ class ImpulseLedger(Compensator):
         deepest = jnp.where(depth > contact.deepest, depth, contact.deepest)
         phi = features(depth, rate, deepest, contact_model.slope(estimate.mean, depth) * (1 - rate))
         force = side * (reading.force - flight.bias) / weight
-        off = rig.MISFIT * force
+        model_error = rig.MISFIT * force
         noise = onset_detection.variance(flight, gains["force_noise"]) / (weight * weight)
-        variance = noise + gains["force_noise_floor"] ** 2 + off * off * (rig.MISFIT_TIME / period)
-        tells = (
+        variance = (
+            noise + gains["force_noise_floor"] ** 2 + model_error * model_error * (rig.MISFIT_TIME / period)
+        )
+        informs = (
             (rate > rig.SLOWEST) | (dot(phi, estimate.mean) > 0) | (force * force > rig.OUTLYING * variance)
         )
-        learns = tells & (depth > period)
+        learns = informs & (depth > period)
         estimate = contact_model.learn(estimate, phi, force, variance, learns)
 
         stiffness = contact_model.slope(estimate.mean, deepest)
@@ -282,16 +288,16 @@ class ImpulseLedger(Compensator):
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
         reference = reference_trajectory.correct(reference, theta - estimate.theta)
         reference = reference_trajectory.advance(reference, theta, period, force, phi)
-        misfit = force - dot(theta, phi) - contact.misfit
-        misfit = contact.misfit + period / (period + rig.HOLD_TIME) * misfit
+        residual = force - dot(theta, phi) - contact.misfit
+        misfit = contact.misfit + period / (period + rig.HOLD_TIME) * residual
         push, ahead = reference_trajectory.bridge(reference, theta, contact.lag + 0.5 * period, misfit)
 
         mean = estimate.mean
         secant = dot(phi[:HINGES], mean[:HINGES]) / jnp.where(depth > rig.SHALLOW, depth, rig.SHALLOW)
         secure = jnp.maximum(secant, rig.LEAST_STIFFNESS) - _sqrt(estimate.covariance[0, 0])
-        coming = jnp.sqrt(jnp.maximum(secure, rig.LEAST_STIFFNESS))
+        predicted = jnp.sqrt(jnp.maximum(secure, rig.LEAST_STIFFNESS))
         largest = jnp.maximum(jnp.maximum(force, contact.peak), 1)
-        peak = jnp.where((rate > rig.SLOWEST) & (coming > largest), coming, largest)
+        peak = jnp.where((rate > rig.SLOWEST) & (predicted > largest), predicted, largest)
         push = jnp.minimum(push, rig.HIGHEST * peak)
         desired = side * signals.velocity_desired / speed
         wanted = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)

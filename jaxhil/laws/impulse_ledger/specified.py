@@ -8,32 +8,28 @@ from jaxhil.mechanism.structs import Mechanism, value_at
 
 
 def delay_spread(mechanism: Mechanism) -> float:
-    """Return the standard deviation [s] that the file states for the force delay, at most 4 ms; else 0."""
-    stated = mechanism.uncertainty.get("rig.force_sensor.delay")
-    if stated is None:
+    """Return the standard deviation [s] of the force delay in the file, at most 4 ms; 0 if it has none."""
+    uncertainty = mechanism.uncertainty.get("rig.force_sensor.delay")
+    if uncertainty is None:
         return 0.0
-    spread = stated.std
+    spread = uncertainty.std
     if spread is None:
         spread = (_spread(mechanism, "rig.force_sensor.delay") or 0.0) / math.sqrt(3)
     return min(spread, LARGEST_DELAY_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:
-    """How large the contact's dry friction may be, over mass and approach speed [1/s]; 0 where it has
-    none."""
+    """Return the largest dry friction over mass and approach speed [1/s]; 0 if there is none."""
     return _size(mechanism, "contact.friction") / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
 def preload(mechanism: Mechanism) -> float:
-    """How large the contact's preload may be, over mass and approach speed [1/s]; 0 where it has none."""
+    """Return the largest preload over mass and approach speed [1/s]; 0 if there is none."""
     return _size(mechanism, "contact.preload") / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
 def unloading(mechanism: Mechanism) -> float:
-    """Return by how much the stiffness over the mass [1/s^2] may be larger in unloading than in loading.
-
-    It is 0 where the contact law has no unloading ratio.
-    """
+    """Return the largest excess of unloading over loading stiffness, over mass [1/s^2]; 0 without a ratio."""
     ratio = mechanism.contact.unloading_ratio
     if ratio is None:
         return 0.0
@@ -42,21 +38,23 @@ def unloading(mechanism: Mechanism) -> float:
 
 
 def _size(mechanism: Mechanism, path: str) -> float:
-    """Return how far a number may lie from 0: its nominal value and its spread."""
+    """Return the largest size of a number: its nominal size plus its spread."""
     return abs(value_at(mechanism, path)) + (_spread(mechanism, path) or 0.0)
 
 
 def _spread(mechanism: Mechanism, path: str, deviations: float = 1.0) -> float | None:
-    """How far a number may lie from its nominal value: the farther end of the range that the file gives it,
-    or so many standard deviations; None where it says nothing of that."""
-    found = mechanism.uncertainty.get(path)
-    if found is None:
+    """Return the largest difference of a number from its nominal value; None if the file states none.
+
+    It is that of the farther end of the number's range, or so many standard `deviations`.
+    """
+    uncertainty = mechanism.uncertainty.get(path)
+    if uncertainty is None:
         return None
-    if found.std is not None:
-        return deviations * found.std
+    if uncertainty.std is not None:
+        return deviations * uncertainty.std
     nominal = value_at(mechanism, path)
-    if found.factor is not None:
-        ends = [factor * nominal for factor in found.factor]
+    if uncertainty.factor is not None:
+        ends = [factor * nominal for factor in uncertainty.factor]
     else:
-        ends = [end for end in (found.low, found.high) if end is not None]
+        ends = [end for end in (uncertainty.low, uncertainty.high) if end is not None]
     return max(abs(end - nominal) for end in ends)

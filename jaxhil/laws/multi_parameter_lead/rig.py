@@ -1,4 +1,4 @@
-"""Multi-parameter phase lead, the measured force and its filtered rate with a gain each."""
+"""Multi-parameter phase lead: measured force and its filtered rate, each with a gain."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,7 +10,7 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("multi_parameter_lead")
 class MultiParameterLead(Compensator):
-    """F_c = a F + b w, w = s/(1 + T_2 s) F by Tustin's rule.
+    """Compensator F_c = a F + b w, w = s/(1 + T_2 s) F by Tustin's rule.
 
     a = force_gain, b = force_rate_gain, T_2 = lead_filter; the literature places a root of the delayed
     contact's characteristic equation with a and b (Osaki, Konno).
@@ -30,10 +30,10 @@ class MultiParameterLead(Compensator):
         self._rate = VelocityFilter(gains["lead_filter"], period)
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N] and its rate, weighed."""
+        """Return the weighted sum of measured force and its rate [N]."""
         rate = self._rate.step(force_measured)
         return self._force_gain * force_measured + self._force_rate_gain * rate
 
     def reset(self) -> None:
-        """Restart the filter: no force so far."""
+        """Restart the filter from no force."""
         self._rate.start(0.0, 0.0)

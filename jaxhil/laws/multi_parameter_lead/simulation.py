@@ -1,12 +1,12 @@
 """Multi-parameter phase lead (Osaki, Konno): a F + b dF/dt, by pole placement at the contact frequency.
 
-Realised as a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead. The
-literature's rule puts a root of s^2 + omega^2 (a + b s) e^(-s tau) = 0, the contact delayed by tau, where the
-damped oscillation of the desired restitution has its own (notebooks/guide/model.md section 6, item 16).
+The filter is a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead. The
+literature's rule places a root of the contact delayed by tau, s^2 + omega^2 (a + b s) e^(-s tau) = 0, at the
+root of the damped oscillation with the desired restitution (notebooks/guide/model.md section 6, item 16).
 
-Nominal is a restitution of 1, tau the delay of the force measurement and the lag of the motion simulator
-together: what the loop adds is undone, and the mechanism's own damping, of which the model has none, is left
-to act.
+The nominal restitution is 1, and tau is the delay of the force measurement plus the lag of the motion
+simulator. This compensates for the loop, while the mechanism's own damping, which the model does not have,
+still acts.
 """
 
 import cmath
@@ -29,10 +29,17 @@ from jaxhil.mechanism.structs import Mechanism
 
 
 def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
-    """Gains a [1] and b [s] that give a contact of angular frequency omega [rad/s] behind a delay tau [s] the
-    desired restitution [1]: a + b s_d = -(s_d^2/omega^2) e^(s_d tau), s_d the damped oscillation's root.
+    """Return the gains a [1] and b [s] with which a delayed contact has the desired restitution.
 
-    Raises InputError unless omega and e are above 0 and all are finite.
+    They solve a + b s_d = -(s_d^2/omega^2) e^(s_d tau), s_d being the root of the damped oscillation.
+
+    Args:
+        frequency: angular frequency omega of the contact [rad/s], above 0.
+        delay: delay tau of the loop [s].
+        restitution: desired restitution [1], above 0.
+
+    Raises:
+        InputError: if an argument is not finite or not above its lower bound.
     """
     for name, value, least in (
         ("frequency", frequency, 0.0),
@@ -55,7 +62,7 @@ def _nominal(mechanism: Mechanism) -> tuple[float, float]:
 
 
 def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
-    """a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
+    """Return the coefficients of a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
     scale = 1 / (slow + period)
@@ -68,12 +75,12 @@ def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
 
 
 class MultiParameterLead(PhaseLead):
-    """F_c = a F + b dF/dt, filtered."""
+    """Compensator F_c = a F + b dF/dt, filtered."""
 
     name: ClassVar[str] = "multi_parameter_lead"
     knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
     waits_for_contact: ClassVar[bool] = True
-    # Beyond a quarter of an oscillation of delay a is negative, beyond half of one b is.
+    # a is negative for a delay of more than a quarter of an oscillation, b for more than half of one.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "force_gain",

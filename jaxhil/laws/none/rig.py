@@ -8,7 +8,7 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("none")
 class NoCompensation(Compensator):
-    """F_c = F. The baseline, whose contacts diverge with the loop's delay."""
+    """Baseline F_c = F, whose contacts diverge because of the loop's delay."""
 
     __slots__ = ()
 
@@ -18,5 +18,5 @@ class NoCompensation(Compensator):
         pass
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N]."""
+        """Return the measured force [N]."""
         return force_measured

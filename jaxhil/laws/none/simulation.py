@@ -1,4 +1,4 @@
-"""No compensation: the measured force goes straight into the numerical model."""
+"""No compensation: the measured force acts on the numerical model."""
 
 from typing import ClassVar
 
@@ -6,7 +6,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 
 
 class NoCompensator(Compensator):
-    """F_c = F."""
+    """Baseline F_c = F."""
 
     name: ClassVar[str] = "none"
     knows: ClassVar[tuple[str, ...]] = ()

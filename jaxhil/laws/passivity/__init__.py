@@ -1,1 +1,1 @@
-"""Passivity control: an adjustable damper dissipates observed energy."""
+"""Passivity control: a variable damper dissipates the energy that the contact seems to generate."""

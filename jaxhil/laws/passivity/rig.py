@@ -1,4 +1,4 @@
-"""Time-domain passivity: the contact never gives back more energy than it has taken (De Stefano et al.)."""
+"""Time-domain passivity control (De Stefano et al.): the contact never returns more energy than it took."""
 
 from collections.abc import Mapping
 from math import inf
@@ -9,9 +9,9 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("passivity")
 class Passivity(Compensator):
-    """F_c = F, but where E = E_before + T F v_d < 0 such that E becomes 0: F_c = -E_before/(T v_d).
+    """Compensator F_c = F, or F_c = -E_before/(T v_d) where E = E_before + T F v_d < 0, which makes E = 0.
 
-    That is virtual damping alpha = -E/(T v_d^2). E_before >= 0, so that T v_d is not 0 there and F_c lies
+    This is virtual damping alpha = -E/(T v_d^2). Because E_before >= 0, T v_d is not 0 there and F_c lies
     between 0 and F.
     """
 
@@ -24,18 +24,18 @@ class Passivity(Compensator):
         self._energy = 0.0
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N], less where the contact would give back more than it has taken."""
+        """Return the measured force [N], reduced if the contact would return more energy than it took."""
         travel = self._period * velocity_desired
         before = self._energy
         energy = before + force_measured * travel
         if energy < 0.0:
             self._energy = 0.0
             return -before / travel
-        # What is beyond all numbers is not taken in: it would stay so.
+        # An infinite or NaN energy is not stored: it would remain so.
         if energy < inf:
             self._energy = energy
         return force_measured
 
     def reset(self) -> None:
-        """Forget the energy."""
+        """Set the energy to 0."""
         self._energy = 0.0

@@ -1,4 +1,4 @@
-"""Phase-lead force compensation, the filtered first-order inverse of a force delay."""
+"""Phase-lead force compensation: the filtered first-order inverse of a force delay."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,10 +10,10 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("phase_lead")
 class PhaseLead(Compensator):
-    """F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
+    """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
 
-    T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`; the literature
-    sets it to the delay of the force measurement.
+    T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`, by the literature's rule
+    the delay of the force measurement.
     """
 
     __slots__ = ("_lead",)
@@ -27,7 +27,7 @@ class PhaseLead(Compensator):
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N], led."""
+        """Return the phase lead of the measured force [N]."""
         return self._lead.step(force_measured)
 
     def reset(self) -> None:

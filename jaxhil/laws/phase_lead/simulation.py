@@ -17,7 +17,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 
 
 class PhaseLead(Compensator):
-    """F_c = F + T_lead dF/dt, filtered."""
+    """Compensator F_c = F + T_lead dF/dt, filtered."""
 
     name: ClassVar[str] = "phase_lead"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)

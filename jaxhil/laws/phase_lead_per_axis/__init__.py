@@ -1,3 +1,3 @@
-"""Phase lead with a lead for each channel of the wrench."""
+"""Phase lead with a lead time for each channel of the wrench."""
 
 AXES = (6,)

@@ -1,7 +1,7 @@
-"""Phase lead with a lead of its own for each of six axes: F + T_lead dF/dt, channel by channel.
+"""Phase lead with a lead time for each of six axes: F + T_lead dF/dt, channel by channel.
 
-The axes of a rig are late by unlike times, and a lead can make up for what its own channel is late by. The
-lead filter is common to all.
+The axes of a rig have different delays, and each lead time can compensate for that of its channel. The lead
+filter is common to all channels.
 """
 
 from typing import ClassVar
@@ -14,7 +14,7 @@ CHANNELS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class PhaseLeadPerAxis(PhaseLead):
-    """F_c = F + T_lead dF/dt of each channel, filtered; six axes alone have it."""
+    """Compensator F_c = F + T_lead dF/dt of each channel, filtered; for six axes only."""
 
     name: ClassVar[str] = "phase_lead_per_axis"
     gains: ClassVar[tuple[Gain, ...]] = (
@@ -23,7 +23,7 @@ class PhaseLeadPerAxis(PhaseLead):
     )
 
     def channel(self, gains: Gains, channel: int) -> Gains:
-        """The gains of one channel, as `PhaseLead` has them."""
+        """Return the gains of one channel, 0 to 5, with the names of `PhaseLead`."""
         return {**gains, PHASE_LEAD.name: gains[f"{PHASE_LEAD.name}_{CHANNELS[channel]}"]}
 
 

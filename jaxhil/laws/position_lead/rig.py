@@ -1,4 +1,4 @@
-"""Position lead: the motion simulator is sent ahead of the model by what it follows late."""
+"""Position lead: the position command is ahead of the model by the motion simulator's lag."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -9,9 +9,9 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("position_lead")
 class PositionLead(Compensator):
-    """F_c = F; position command x + a_1 v + a_2 a, a_1 = position_lead, a_2 = acceleration_lead.
+    """Compensator F_c = F, command x + a_1 v + a_2 a, a_1 = position_lead, a_2 = acceleration_lead.
 
-    With a_1 and a_2 of the motion simulator's inverse 1 + a_1 s + a_2 s^2 + ... its lag is made up for.
+    With a_1 and a_2 of the motion simulator's inverse, 1 + a_1 s + a_2 s^2 + ..., its lag is compensated.
     """
 
     __slots__ = ("_of_acceleration", "_of_velocity")
@@ -26,9 +26,9 @@ class PositionLead(Compensator):
         self._of_acceleration = gains["acceleration_lead"]
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N]."""
+        """Return the measured force [N]."""
         return force_measured
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """The numerical model's position [m], led."""
+        """Return the lead of the numerical model's position [m]."""
         return position + self._of_velocity * velocity + self._of_acceleration * acceleration

@@ -1,14 +1,14 @@
-"""Position lead (Chang et al.): the motion simulator is sent ahead of the model by what it follows late.
+"""Position lead (Chang et al.): the position command is ahead of the model by the motion simulator's lag.
 
     F_c = F,  command (1 + a_1 s + a_2 s^2) x_d = x + a_1 v + a_2 a,
 
-with velocity v and acceleration a = -F_c/M of the numerical model: nothing is differentiated. With a_1 and
-a_2 of the simulator's inverse, 1/G(s) = 1 + a_1 s + a_2 s^2 + ..., x_a follows x_d. Of a second-order one
-without transport delay that is all of the inverse, and what is left is of first order in the control period:
-v and a are those of the step just made, half a period late.
+with velocity v and acceleration a = -F_c/M of the numerical model, so that nothing is differentiated. With
+a_1 and a_2 of the simulator's inverse, 1/G(s) = 1 + a_1 s + a_2 s^2 + ..., x_a follows x_d. For a
+second-order simulator without transport delay this is the whole inverse. The remaining error is of first
+order in the control period, because v and a belong to the step just made, half a period late.
 
-Nominal are the first two terms of the series of e^(s tau)/G(s), tau the transport delay and what the command
-waits. The delay of the force measurement stays: this law does nothing about it.
+The nominal gains are the first two coefficients of the series of e^(s tau)/G(s), tau being the transport
+delay plus the waiting time of the command. The delay of the force measurement is not compensated.
 """
 
 from typing import ClassVar
@@ -18,13 +18,13 @@ from jaxhil.laws.simulation_base import Compensator, Gain, rig_gain
 
 
 class PositionLead(Compensator):
-    """F_c = F, and the position command led; see the module's text."""
+    """Compensator F_c = F with a lead of the position command; see the module's docstring."""
 
     name: ClassVar[str] = "position_lead"
     knows: ClassVar[tuple[str, ...]] = (SIMULATOR_DYNAMICS,)
     waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
-    # Of an ideal simulator under commands held in jumps, or of one with zeros, either may be below 0.
+    # Both may be negative for an ideal simulator with a zero-order hold, or for a simulator with zeros.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "position_lead",

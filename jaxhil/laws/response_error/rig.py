@@ -1,14 +1,13 @@
 """Response-error force compensation with real-time identification of the contact.
 
-F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m)): y is the phase-led force, k and b the
-identified contact stiffness and damping, x_d - x_m the position by which the motion simulator lags
-the numerical model. No model of the simulator is used. The gate lets the response term act while
-the delay-aligned position is in contact, and opens and closes within two periods by where between
-the ticks the surface was met. F_c is not clamped: a clamp makes the divergence worse.
+F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m)): y is the force behind the phase lead, k and b are the
+identified contact stiffness and damping, and x_d - x_m is the distance by which the motion simulator lags
+behind the numerical model. No model of the simulator is used. The response term acts while the gate is open,
+that is while the aligned position is in contact; the gate opens and closes within two periods, depending on
+when between two ticks the surface was crossed. F_c is not clamped, because a clamp increases the divergence.
 
 Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
-stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that
-group.
+stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that group.
 """
 
 from collections.abc import Mapping
@@ -24,13 +23,11 @@ from jaxhil.rig.surfaces import deflection
 
 @register("response_error")
 class ResponseError(Compensator):
-    """Phase lead, plus the force that the motion simulator's response error leaves out.
+    """Phase lead, plus the force that is missing because of the motion simulator's response error.
 
-    The measured force is late against the measured position, so the identification regresses it on
-    the position delayed by `identification_delay` (the delay-aligned position). That position x
-    deflects the contact by x where x > 0, by x + clearance where x < -clearance, and by 0 in
-    between. A reading counts by the gate of the contact times that of the force above
-    `contact_threshold`.
+    The measured force is later than the measured position. The identification therefore regresses it on the
+    position delayed by `identification_delay` (the aligned position). The weight of a reading is the gate of
+    the contact times the gate of the force above `contact_threshold`.
     """
 
     __slots__ = (
@@ -79,11 +76,11 @@ class ResponseError(Compensator):
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Identified stiffness [N/m] and damping [N s/m]."""
+        """Return identified stiffness [N/m] and damping [N s/m]."""
         return self._identification.stiffness, self._identification.damping
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The compensated force F_c [N]."""
+        """Return the compensated force F_c [N]."""
         if not self._started:
             self._start(position_measured, velocity_desired)
         force = self._lead.step(force_measured)
@@ -121,14 +118,14 @@ class ResponseError(Compensator):
         )
 
     def _start(self, position: float, velocity: float) -> None:
-        # Before the first tick the motion is uniform, so every filter begins in steady state.
+        # Assume uniform motion before the first tick, so that every filter begins in steady state.
         alignment = self._alignment
         alignment.start(position, velocity)
         self._velocity.start(position, velocity)
         aligned = alignment.step(position)
         self._aligned_velocity.start(aligned, velocity)
         self._aligned = aligned - self._period * velocity
-        # That step only asked for the aligned position: the tick itself takes the sample in.
+        # The step above only computed the aligned position: the tick itself stores the sample.
         alignment.start(position, velocity)
         self._force = 0.0
         self._contact_share = 0.0

@@ -1,16 +1,17 @@
-"""The paper's compensation: phase lead, response error and real-time identification, delay-aligned.
+"""Compensation of Qi et al.: phase lead, response error and delay-aligned real-time identification.
 
     F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
-The phase lead makes up for the delay of the force measurement, the response error for the dynamics of the
+The phase lead compensates for the delay of the force measurement, the response error for the dynamics of the
 motion simulator, of which no model is used (Qi et al. 2016; notebooks/guide/model.md section 5). k_hat and
-b_hat come from recursive least squares of the measured force on the measured position delayed by the same
-time (`identification_delay`): without that alignment they are biased (section 6, item 6). v_a is a filtered
+b_hat are a recursive least-squares fit of the measured force to the measured position, delayed by the same
+time (`identification_delay`): without this alignment they are biased (section 6, item 6). v_a is a filtered
 difference, s/(1 + T_v s) by Tustin's rule.
 
-`gate` is 1 while the aligned position is in contact and 0 outside; it opens and closes within two periods, by
-where between two ticks the surface was met (see `gates`). A reading's weight in the identification is that
-gate times another, of the measured force above `contact_threshold`: nothing jumps as a delay crosses a tick.
+`gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes within two periods,
+depending on when between two ticks the surface was crossed (`jaxhil.laws.shared.gates`). The weight of a
+reading in the identification is this gate times that of the measured force above `contact_threshold`, so that
+F_c is continuous in the delays.
 """
 
 from typing import ClassVar, NamedTuple
@@ -44,49 +45,49 @@ from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_g
 
 
 def _stiffness_covariance(mechanism) -> float:
-    """One sample at 3 % of the largest depth settles half of k_hat."""
+    """Return the covariance [1/m^2] with which a sample at 3 % of the peak depth sets half of k_hat."""
     return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
 
 def _damping_covariance(mechanism) -> float:
-    """One sample at the approach velocity settles half of b_hat."""
+    """Return the covariance [s^2/m^2] with which a sample at approach speed sets half of b_hat."""
     return 1 / mechanism.approach.velocity**2
 
 
 def _never(mechanism) -> bool:
-    """Of gains whose tuning would lower the error by less than a fifth and blur the search for the others."""
+    """Return False: tuning this gain would reduce the error by less than a fifth and hinder the search."""
     return False
 
 
 class ResponseErrorState(NamedTuple):
-    """What the law carries from tick to tick."""
+    """State of the compensator from tick to tick."""
 
-    lead: LeadState  # lead filter
-    position: Float[Array, "*batch"]  # measured at the tick before [m]
+    lead: LeadState
+    position: Float[Array, "*batch"]  # measured on the last tick [m]
     velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
-    aligned: Float[Array, "*batch"]  # position as old as the force, at the tick before [m]
+    aligned: Float[Array, "*batch"]  # position as old as the force, on the last tick [m]
     aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
-    contact_share: Float[Array, "*batch"]  # of the last period in contact [1]
-    force_share: Float[Array, "*batch"]  # of the last period with a force above the threshold [1]
+    contact_share: Float[Array, "*batch"]  # share of the last period in contact [1]
+    force_share: Float[Array, "*batch"]  # share of the last period with a force above the threshold [1]
     identified: Identified  # stiffness and damping
-    line: DelayLine  # readings that are delayed
+    line: DelayLine  # measured positions
 
 
 class Prepared(NamedTuple):
-    """What is worked out once per run."""
+    """Gains and filter coefficients, computed once per run."""
 
-    gains: Gains  # of the law
+    gains: Gains
     period: Float[Array, "*batch"]  # control period [s]
-    clearance: Float[Array, "*batch"]  # between two surfaces [m]
-    lead: LeadFilter  # lead filter
+    clearance: Float[Array, "*batch"]  # of a two-sided contact [m]
+    lead: LeadFilter
     # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
     rate_pole: Float[Array, "*batch"]
     rate_gain: Float[Array, "*batch"]  # of that filter [1/s]
-    delay: Delay  # by which positions are aligned
+    delay: Delay  # of the positions, to align them with the force
 
 
 class ResponseError(Compensator):
-    """Phase lead + response error + identification; see the module's text."""
+    """Phase lead, response error and identification; see the module's docstring."""
 
     name: ClassVar[str] = "response_error"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
@@ -168,7 +169,7 @@ class ResponseError(Compensator):
     def step(self, prepared, state, signals, tick):
         gains, period = prepared.gains, prepared.period
         force, measured = signals.force_measured, signals.position_measured
-        # Before its first tick a run is in uniform motion: that is what every filter starts from.
+        # Assume uniform motion before the first tick, so that every filter begins in steady state.
         begins = signals.age == 0
         stride = period * signals.velocity_desired
         before = jnp.where(begins, measured - stride, state.position)
@@ -217,9 +218,9 @@ class ResponseError(Compensator):
         )
 
     def noise_amplification(self, gains, constants):
-        # The lead filter's alone. Noise reaches k_hat too, whose part in F_c is smaller by (x_d - x_a)/depth
-        # and by the root of the number of samples remembered: half a percent of the whole in steady contact.
-        # A young contact, whose k_hat rests on a few shallow samples, is noisier in its first tenth.
+        # This is the lead filter's share alone. The noise of k_hat is smaller in F_c by (x_d - x_a)/depth and
+        # by the square root of the number of samples that the identification remembers. Only at the beginning
+        # of a contact, when k_hat depends on a few shallow samples, is F_c noisier.
         return lead_amplification(lead_filter(gains, constants))
 
     def identified(self, state):

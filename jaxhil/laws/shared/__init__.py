@@ -1,1 +1,1 @@
-"""Parts that several compensators have in common."""
+"""Common parts of several compensators."""

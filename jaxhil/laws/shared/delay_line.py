@@ -1,4 +1,4 @@
-"""A measured position some time ago, straight between samples, in uniform motion before the run began."""
+"""Delay line of the measured position, linear between samples, with uniform motion before the run."""
 
 from typing import NamedTuple
 
@@ -11,35 +11,35 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class Delay(NamedTuple):
-    """A delay in control periods."""
+    """Delay in control periods."""
 
     lookback: Int[Array, "*batch"]  # whole periods
-    fraction: Float[Array, "*batch"]  # the rest [1]
+    fraction: Float[Array, "*batch"]  # rest of a period [1]
     period: Float[Array, "*batch"]  # control period [s]
 
 
 class DelayLine(NamedTuple):
-    """Readings of the measured position."""
+    """Delay line of the measured position."""
 
-    first_position: Float[Array, "*batch"]  # the run's first reading [m]
-    first_velocity: Float[Array, "*batch"]  # its speed then [m/s]
-    ring: Float[Array, "samples *batch"]  # of readings [m]
+    first_position: Float[Array, "*batch"]  # first reading of the run [m]
+    first_velocity: Float[Array, "*batch"]  # velocity on the first tick [m/s]
+    ring: Float[Array, "samples *batch"]  # readings [m]
 
 
 def split(delay: Array, period: Array) -> Delay:
-    """`delay` [s] >= 0 in periods; within 1e-9 of a whole number it is that number."""
+    """Convert a delay [s] >= 0 to periods, with a tolerance of 1e-9 below a whole number."""
     periods = delay / period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
     return Delay(whole.astype(jnp.int32), periods - whole, period)
 
 
 def empty(ring: int, zeros: Float[Array, "*batch"]) -> DelayLine:
-    """A line of `ring` samples, a power of two; nothing of it is read before it is written."""
+    """Return a line of `ring` samples, a power of two; no sample is read before it is written."""
     return DelayLine(zeros, zeros, jnp.zeros((ring, *zeros.shape), zeros.dtype))
 
 
 def delayed(delay: Delay, line: DelayLine, signals: Signals, tick: Array) -> tuple[Array, DelayLine]:
-    """The measured position [m] a delay ago, and the line with this tick's reading in it."""
+    """Return the measured position [m] one delay ago, and the line with this tick's reading."""
     measured, age = signals.position_measured, signals.age
     begins = age == 0
     first_position = jnp.where(begins, measured, line.first_position)

@@ -1,7 +1,7 @@
-"""What a law knows of mechanism and rig before a run: estimates, from the nominal values of the file.
+"""Estimates of mechanism and rig that a compensator has before a run: nominal values of the file.
 
-They are never the values of a scenario: where the file states an uncertainty, the draw is what the estimate
-is wrong by. A law names what it must know in `Compensator.knows`.
+They are never the values of a scenario: where the file states an uncertainty, the drawn value differs from
+the estimate. `Compensator.knows` lists the estimates that a compensator needs.
 """
 
 import math
@@ -21,16 +21,16 @@ EQUIVALENT_MASS = "equivalent mass"
 
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
-    """The known delay [s] of the force measurement: transport plus first-order lag."""
+    """Return the nominal delay [s] of the force measurement: transport delay plus first-order lag."""
     sensor = mechanism.rig.force_sensor
     return sensor.delay + sensor.time_constant
 
 
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
-    """a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
+    """Return a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
 
-    tau is the transport delay of the motion simulator and what latency and hold of the command add on
-    average: L T held linearly, (L - 1/2) T in jumps (notebooks/guide/model.md section 6, item 7).
+    tau is the transport delay of the motion simulator plus the average delay of the command: L T with linear
+    interpolation, (L - 1/2) T with zero-order hold (notebooks/guide/model.md section 6, item 7).
     """
     rig = mechanism.rig
     first, second = _inverse(rig.simulator)
@@ -40,17 +40,17 @@ def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
 
 
 def simulator_lag(mechanism: Mechanism) -> float:
-    """By how much [s] the motion simulator follows a uniform motion late: a_1 of `simulator_inverse`."""
+    """Return the time [s] by which the motion simulator lags in uniform motion: a_1 of the inverse."""
     return simulator_inverse(mechanism)[0]
 
 
 def is_damped(mechanism: Mechanism) -> bool:
-    """Whether the mechanism's contact law dissipates, so that damping is worth identifying."""
+    """Return whether the mechanism's contact law dissipates energy."""
     return contact_law(mechanism.contact.law).damped and any(b > 0 for b in mechanism.contact.damping)
 
 
 def peak_force(mechanism: Mechanism) -> float:
-    """Return the order of the contact force [N], of the stiffest entry."""
+    """Return the order of the peak contact force [N], for the stiffest stiffness in the file."""
     contact = mechanism.contact
     stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
@@ -58,29 +58,29 @@ def peak_force(mechanism: Mechanism) -> float:
 
 
 def typical_stiffness(mechanism: Mechanism) -> float:
-    """Order of the contact stiffness [N/m]: M omega^2 of the stiffest entry."""
+    """Return the order of the contact stiffness [N/m], M omega^2 for the stiffest stiffness in the file."""
     return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
 
 
 def contact_frequency(mechanism: Mechanism) -> float:
-    """Order of the contact's angular frequency [rad/s]: omega of the stiffest entry."""
+    """Return the order of the contact's angular frequency [rad/s], with the typical stiffness."""
     return math.sqrt(typical_stiffness(mechanism) / mechanism.bodies.mass)
 
 
 def critical_damping(mechanism: Mechanism) -> float:
-    """2 sqrt(k M) [N s/m] of the stiffest entry."""
+    """Return the critical damping 2 sqrt(k M) [N s/m], with the typical stiffness."""
     return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
 
 
 def noise_level(mechanism: Mechanism) -> float:
-    """What noise hardly ever exceeds [N]. A single reading that does, while penetration is next to nothing,
-    is a wild stiffness identified: beyond 3 standard deviations that happens in one contact of hundreds."""
+    """Return a force [N] that noise hardly ever exceeds."""
     sensor = mechanism.rig.force_sensor
+    # 3 standard deviations are not enough: one reading above, at a small depth, identifies a wrong stiffness.
     return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
 
 
 def _inverse(simulator) -> tuple[float, float]:
-    """First and second coefficient of the series of 1/G."""
+    """Return the coefficients of s [s] and s^2 [s^2] in the series of 1/G."""
     if simulator.model == "first_order":
         return simulator.time_constant, 0.0
     if simulator.model == "second_order":
@@ -89,7 +89,7 @@ def _inverse(simulator) -> tuple[float, float]:
     if simulator.model == "third_order":
         return simulator.coefficients[0], simulator.coefficients[1]
     if simulator.model == "transfer_function":
-        # den/num as a series: the quotient's coefficients one after another, low powers first.
+        # Series division of denominator by numerator, with low powers first.
         low = [*reversed(simulator.denominator), 0.0, 0.0][:3]
         num = [*reversed(simulator.numerator), 0.0, 0.0][:3]
         first = (low[1] - low[0] / num[0] * num[1]) / num[0]

@@ -1,4 +1,4 @@
-"""Lead filter (1 + T_1 s)/(1 + T_2 s) by Tustin's rule, in JAX, and the two gains that set it.
+"""Lead filter (1 + T_1 s)/(1 + T_2 s) by Tustin's rule in JAX, and its two gains.
 
 T_1 = phase_lead + lead_filter and T_2 = lead_filter: the net lead is `phase_lead`. By the literature's rule
 it is the delay of the force measurement, and T_2 is one control period.
@@ -29,22 +29,22 @@ LEAD_FILTER = rig_gain(
 
 
 class LeadState(NamedTuple):
-    """The tick before."""
+    """State of the lead filter after a tick."""
 
-    force: Float[Array, "*batch"]  # at the input [N]
+    force: Float[Array, "*batch"]  # input [N]
     output: Float[Array, "*batch"]  # [N]
 
 
 class LeadFilter(NamedTuple):
     """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
 
-    pole: Array  # of the output before
-    now: Array  # of the force
-    before: Array  # of the force before
+    pole: Array  # of the last output [1]
+    now: Array  # of this force [1]
+    before: Array  # of the last force [1]
 
 
 def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
-    """(1 + T_1 s)/(1 + T_2 s) with T_1 = phase_lead + lead_filter, T_2 = lead_filter, by Tustin's rule."""
+    """Return the coefficients for T_1 = phase_lead + lead_filter and T_2 = lead_filter."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
     fast = slow + 2 * gains["phase_lead"]
@@ -53,16 +53,16 @@ def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
 
 
 def lead(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
-    """One tick of the lead filter."""
+    """Return the filter's output [N] for the force [N] of a tick, and its state."""
     output = filter_.pole * state.output + filter_.now * force + filter_.before * state.force
     return output, LeadState(force, output)
 
 
 def lead_amplification(filter_: LeadFilter) -> Array:
-    """Standard deviation of the filter's output over that of white noise at its input.
+    """Return the standard deviation of the filter's output over that of white noise at its input [1].
 
-    The variance of y(n) = p y(n-1) + a F(n) + b F(n-1) for F of unit variance, stationary:
-    (a^2 + b^2 + 2 a b p)/(1 - p^2), the sum of the squares of its impulse response a, pa + b, p(pa + b), ...
+    The stationary variance of y(n) = p y(n-1) + a F(n) + b F(n-1) for F of unit variance is the sum of the
+    squares of its impulse response a, pa + b, p(pa + b), ...: (a^2 + b^2 + 2 a b p)/(1 - p^2).
     """
     pole, now, before = filter_
     return jnp.sqrt((now**2 + before**2 + 2 * now * before * pole) / (1 - pole**2))

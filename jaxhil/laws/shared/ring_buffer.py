@@ -1,8 +1,8 @@
-"""Delay lines: a ring of past samples, written in place; each lane reads back by a number of its own.
+"""Ring buffer of past samples, written in place; each lane may read a different number of ticks back.
 
-The first axis counts samples and is a power of two long. `tick` is common to all lanes. The compiler updates
-a ring in place only if it sees that the reading comes first: the sample written is tied to what was read.
-Else it copies the ring.
+The first axis is that of the samples, and its length is a power of two. `tick` is common to all lanes. The
+compiler updates a ring in place only if it can see that the read comes first; otherwise it copies the ring.
+`depend_on` therefore makes the written sample depend on what was read.
 """
 
 from typing import Any
@@ -20,10 +20,9 @@ def look_back(
     known: Bool[Array, "*batch"] | bool = True,
     otherwise: Any = 0,
 ) -> Float[Array, "*batch"]:
-    """The sample written `ticks` before `tick`, where it is `known`; only the last `samples` ones are there.
+    """Return the sample written `ticks` before `tick`, less than `samples`; where not `known`, `otherwise`.
 
-    Where all lanes look back alike, that is one row of the ring: much less work than to fetch a number for
-    every lane.
+    If all lanes look back equally far, the result is one row of the ring, which is much faster than a gather.
     """
     first, mask = ticks.reshape(-1)[0], ring.shape[0] - 1
 
@@ -50,7 +49,7 @@ def write(
 def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
     """Store each leaf of `values` in the same leaf of `rings`, one after the other.
 
-    Writes that know nothing of each other the compiler merges into one loop over the whole of the rings.
+    The compiler would merge independent writes into one loop over the whole rings.
     """
     leaves, structure = jax.tree.flatten(rings)
     written = []
@@ -63,7 +62,7 @@ def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
 
 
 def depend_on(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """`value`, made to depend on `reads` (it is NaN where one of them is)."""
+    """Return `value`, but dependent on `reads`: NaN where one of them is NaN."""
     for read in reads:
         value = jnp.where(read == read, value, read)
     return value

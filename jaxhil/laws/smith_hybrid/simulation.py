@@ -1,7 +1,7 @@
-"""The mean of Smith predictor and phase lead: (1 + (1/2) T_s s/(1 + T_s s/2)) (1 + T_l s) F.
+"""Mean of Smith predictor and phase lead: (1 + (1/2) T_s s/(1 + T_s s/2)) (1 + T_l s) F.
 
-Half of the lag T_s is predicted, the other half stays: less amplification of noise for more divergence. See
-`smith_predictor`.
+Half of the lag T_s is predicted, half remains: the noise is amplified less, but contacts diverge more than
+with `smith_predictor`.
 """
 
 from typing import ClassVar
@@ -10,7 +10,7 @@ from jaxhil.laws.shared.smith.simulation import Smith
 
 
 class SmithHybrid(Smith):
-    """F_c = (F_smith + F_lead)/2; see the module's text."""
+    """Compensator F_c = (F_smith + F_lead)/2; see the module's docstring."""
 
     name: ClassVar[str] = "smith_hybrid"
     waits_for_contact: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Smith predictor of the force: phase lead for its delay, a prediction for the motion simulator's lag."""
+"""Smith predictor of the force: phase lead for its delay, prediction for the motion simulator's lag."""
 
 from jaxhil.laws.shared.smith.rig import Smith
 from jaxhil.rig.registry import register
@@ -6,10 +6,10 @@ from jaxhil.rig.registry import register
 
 @register("smith_predictor")
 class SmithPredictor(Smith):
-    """F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, the factors as in `Smith`."""
+    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, with the filters of `Smith`."""
 
     __slots__ = ()
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """The measured force [N], led and predicted."""
+        """Return the force behind lead and predictor [N]."""
         return self._predictor.step(self._lead.step(force_measured))

@@ -1,1 +1,1 @@
-"""Force of a specified contact at the desired position."""
+"""Force of a virtual spring and damper at the desired position."""

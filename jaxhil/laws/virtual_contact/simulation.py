@@ -1,10 +1,10 @@
-"""Virtual contact (EPOS; Zebenay, Boge): spring and damper on the commanded motion, beside the real contact.
+"""Virtual contact (EPOS; Zebenay, Boge): spring and damper on the commanded motion.
 
     F_c = F + k_v d + b_v d',     d the deflection by x_d, d' = v_d, while x_d is in contact
 
-The numerical model feels them without delay. The rigs' operators chose both by experiment. The nominal b_v
-is the stability limit (notebooks/guide/model.md section 6, item 15), at which the contact neither gains nor
-loses; the damping of a damped mechanism is not reckoned with.
+Both act on the numerical model without delay. The operators of the rig chose both by experiment. The nominal
+b_v is the stability limit (notebooks/guide/model.md section 6, item 15), at which the contact neither gains
+nor loses energy; damping of the mechanism is neglected.
 """
 
 import math
@@ -29,14 +29,18 @@ from jaxhil.mechanism.structs import Mechanism
 
 
 def damping_at_the_limit(stiffness: float, frequency: float, delay: float) -> tuple[float, float]:
-    """b_v [N s/m] and omega_c [rad/s] at the stability limit of M s^2 + b_v s + k e^(-s tau) = 0.
+    """Return b_v [N s/m] and omega_c [rad/s] at the stability limit of M s^2 + b_v s + k e^(-s tau) = 0.
 
-    stiffness k [N/m], frequency sqrt(k/M) [rad/s], both > 0, and delay tau [s] >= 0. Of several limits, the
-    least frequency: from there to more damping the contact is stable.
+    Of several limits it is that of the lowest frequency: with more damping the contact is stable.
+
+    Args:
+        stiffness: k [N/m], above 0.
+        frequency: sqrt(k/M) [rad/s], above 0.
+        delay: tau [s], at least 0.
     """
     angle = frequency * delay
-    # cos(u angle) - u^2 falls and is concave from 0 to here, where it is not positive: Newton comes down to
-    # the root, and past it only by rounding.
+    # cos(u angle) - u^2 decreases and is concave from u = 0 to this share, where it is not positive. Newton's
+    # method therefore approaches the root from above, and passes it only by rounding.
     share = min(1.0, math.pi / 2 / angle) if angle > 0 else 1.0
     for _ in range(100):
         excess = math.cos(share * angle) - share**2
@@ -53,7 +57,7 @@ def _nominal_damping(mechanism: Mechanism) -> float:
 
 
 class VirtualContact(Compensator):
-    """F_c = F + k_v d + b_v d' on the commanded motion; see the module's text."""
+    """Compensator F_c = F + k_v d + b_v d' on the commanded motion; see the module's docstring."""
 
     name: ClassVar[str] = "virtual_contact"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG, STIFFNESS, CONTACT_FREQUENCY)

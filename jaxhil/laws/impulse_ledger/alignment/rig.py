@@ -7,25 +7,27 @@ from jaxhil.rig.types import Positive
 
 
 class Alignment:
-    """The hardware's position and velocity as old as the force, which is read this `delay` [s] late."""
+    """Position and velocity of the hardware, delayed like the force by `delay` [s]."""
 
     __slots__ = ("_is_late", "_last", "_line", "_middle", "_period", "_share")
     _line: Annotated[DelayLine, "identification_delay"]
     _period: Positive
 
     def __init__(self, delay: float, period: Positive) -> None:
-        # The line delays by a tick less, so that the speed can be a difference about the middle.
+        # The line delays by one tick less, so that the velocity can be a central difference.
         self._is_late = delay > period
         self._period = period
-        # Of a delay below a period the line is made, and not used.
+        # For a delay below one period the line exists but is not used.
         self._line = DelayLine(delay - period if self._is_late else 0.5 * period, period)
         self._share = 1.0 if self._is_late else delay / period
         self._middle = 0.0
         self._last = 0.0
 
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
-        """Position [m] and velocity [m/s], of a position measured at this tick [m]; a run `begins` in uniform
-        motion at this velocity [m/s]."""
+        """Return delayed position [m] and velocity [m/s].
+
+        `position` [m] is measured on this tick. A run `begins` in uniform motion at `velocity` [m/s].
+        """
         period = self._period
         line = self._line
         newest = position

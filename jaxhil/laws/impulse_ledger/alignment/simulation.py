@@ -9,17 +9,19 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class Aligned(NamedTuple):
-    """Measured positions of the tick before."""
+    """Measured positions of the last tick."""
 
-    middle: Float[Array, "*batch"]  # delayed by tau [m]
-    last: Float[Array, "*batch"]  # delayed by tau + T [m]
+    middle: Float[Array, "*batch"]  # delayed by tau on this tick [m]
+    last: Float[Array, "*batch"]  # delayed by tau + T on this tick [m]
 
 
 def align(
     old: Aligned, newest: Array, share: Array, signals: Signals, period: Array
 ) -> tuple[Array, Array, Aligned]:
-    """Measured position [m] and velocity [m/s] as old as the force that is read, `newest` being the position
-    a tick less than the delay ago; what is kept."""
+    """Return measured position [m] and velocity [m/s], as old as the force, and the state.
+
+    `newest` is the position [m] measured one tick less than the delay ago.
+    """
     begins = signals.age == 0
     stride = period * signals.velocity_desired
     middle = jnp.where(begins, newest - stride, old.middle)

@@ -6,13 +6,13 @@
 
 x is the depth, v the speed and x_m the largest depth so far. All values are scaled by the approach speed v0
 and the equivalent mass M: depth x/v0 [s], speed v/v0 [1], force F/(M v0) [1/s]. The slope at a depth is the
-sum of the hinges above it, so that slopes which change by independent amounts from knot to knot have a
-diagonal prior covariance. The parameters theta are estimated by recursive least squares.
+sum of the hinges of smaller knots, so that slopes which change by independent amounts from knot to knot have
+a diagonal prior covariance. The parameters theta are estimated by recursive least squares.
 
 A force that is older than specified by d adds d k(x) (1 - v) to the readings, k being the slope; d is the
-last parameter. A damper looks like a force that is newer, so that d counts only once contact is over
-(`estimate_delay`). Then the posterior is a mixture of two models: without dissipation, which energy decides
-on, and with it. Where the model errs, by the squared innovations, the readings tell less.
+last parameter. A damper looks like a newer force, so that d is used only once contact is over
+(`estimate_delay`). Then the posterior is a mixture of two models, with and without dissipation, weighted by
+prior odds and evidence. The larger the squared innovations, the less the readings count.
 
 Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; a parameter that is
 zero with a given probability, Mitchell and Beauchamp, "Bayesian variable selection in linear regression"
@@ -31,27 +31,33 @@ KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.14, 
 HINGES = len(KNOTS)
 PARAMETERS = HINGES + 6
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
-DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # each zero or positive
-WANDER = 0.03  # s; over this depth the slope changes by its prior spread
+DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # parameters that are zero or positive
+WANDER = 0.03  # s; over this depth the slope changes by one prior standard deviation
 BROAD = 0.12  # s; beyond this depth the slope does not change
 REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
 ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
-CONCLUDED = (DELAY, *DISSIPATIVE)  # those that change when contact is concluded
-DELAY_PARAMETERS = (0, PRELOAD, *DISSIPATIVE, DELAY)  # those that decide on the delay
+CONCLUDED = (DELAY, *DISSIPATIVE)  # in `conclude`
+DELAY_PARAMETERS = (0, PRELOAD, *DISSIPATIVE, DELAY)  # in `estimate_delay`
 ELASTIC_ODDS = 19.0  # prior odds of contact without dissipation
-WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; mean and spread of the slope at depth 0 that decide on the delay
-SURPLUS = 1.4  # of the variance of the readings, because the misfits of one contact are alike
+WIDE_STIFFNESS = (
+    200.0,
+    300.0,
+)  # 1/s^2; prior mean and spread of the first slope in `estimate_delay`
+SURPLUS = 1.4  # factor of the readings' variance, because the misfits of one contact are correlated
 EXACT = 1e18  # precision of a parameter that is known
-LEAST_VARIANCE = 1e-12  # of a dissipative parameter; below it the parameter is known
+LEAST_VARIANCE = 1e-12  # of a dissipative parameter; with less it counts as known
 Vector = Annotated[list[float], PARAMETERS]
 Matrix = Annotated[list[list[float]], PARAMETERS, PARAMETERS]
 Spreads = Annotated[list[float], 7]
 
 
 def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
-    """Return phi, with which the force is phi.theta; zeros out of contact."""
+    """Return the features phi, so that the force is phi.theta; zeros out of contact.
+
+    Arguments are depth [s], speed [1], largest depth so far [s] and effect of the delay, k (1 - v) [1/s^2].
+    """
     if not depth > 0.0:
         return [0.0] * PARAMETERS
     phi = [depth - knot if depth > knot else 0.0 for knot in KNOTS]
@@ -61,7 +67,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
-    """Return the force [1/s] of the parameters `theta`."""
+    """Return the force [1/s] of the parameters `theta` at depth [s], speed [1] and largest depth [s]."""
     if not depth > 0.0:
         return 0.0
     total = theta[PRELOAD]
@@ -77,7 +83,7 @@ def force(theta: Sequence[float], depth: float, speed: float, deepest: float) ->
 
 
 def slope(theta: Sequence[float], depth: float) -> float:
-    """Return the slope [1/s^2] at a depth, at least 0."""
+    """Return the slope [1/s^2] at a depth [s], at least 0."""
     total = 0.0
     for hinge, knot in zip(theta, KNOTS, strict=False):
         if not depth > knot:
@@ -87,7 +93,7 @@ def slope(theta: Sequence[float], depth: float) -> float:
 
 
 class ContactModel:
-    """Estimate of theta.
+    """Estimate of the parameters theta.
 
     Attributes:
         mean: posterior mean, dissipative parameters of either sign.
@@ -127,7 +133,7 @@ class ContactModel:
         for j, variance in enumerate(variances):
             self.covariance[j][j] = variance
         self._squares = 0.0  # sum of squared innovations over their variances
-        self._count = 0.0  # readings
+        self._count = 0.0  # number of readings
 
     def learn(self, phi: Vector, force: float, variance: float) -> None:
         """Update the estimate with one reading of the force [1/s] whose noise has this variance [1/s^2]."""
@@ -141,7 +147,7 @@ class ContactModel:
         self.mean = [mean + entry * (share * error) for mean, entry in zip(self.mean, column, strict=True)]
         for row, entry in zip(covariance, column, strict=True):
             scaled = share * entry
-            row[:] = [old - scaled * other for old, other in zip(row, column, strict=True)]
+            row[:] = [old - scaled * factor for old, factor in zip(row, column, strict=True)]
         self._squares += share * (error * error)
         self._count += 1.0
 
@@ -158,87 +164,87 @@ class ContactModel:
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Return mean [s] and variance [s^2] of the delay after a contact.
 
-        `preload` and `preload_spread` [1/s] state what is known of the force at the onset.
+        `preload` and `preload_spread` [1/s] are mean and standard deviation of the force at the onset.
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
-        # The prior that steers well pulls a stiff contact's slope down, which would look like a damper.
-        for place in range(2):
-            j = DELAY_PARAMETERS[place]
-            value = WIDE_STIFFNESS[0] if place == 0 else preload
-            spread = WIDE_STIFFNESS[1] if place == 0 else preload_spread
+        # The prior for control reduces the slope of a stiff contact, which would look like a damper.
+        for index in range(2):
+            j = DELAY_PARAMETERS[index]
+            value = WIDE_STIFFNESS[0] if index == 0 else preload
+            spread = WIDE_STIFFNESS[1] if index == 0 else preload_spread
             old, new = 1.0 / max(self._variances[j], LEAST_VARIANCE), 1.0 / (spread * spread)
             information = new * value - old * self._prior_mean[j]
-            observe(mean, rows, place, place, information, new - old)
+            observe(mean, rows, index, index, information, new - old)
         excess = SURPLUS * max(self._squares / max(self._count, 1.0), 1.0)
-        other = list(mean)
-        other_rows = [list(row) for row in rows]
-        self._dissipate(other, other_rows, 2, 2, False)
+        lossy = list(mean)
+        lossy_rows = [list(row) for row in rows]
+        self._dissipate(lossy, lossy_rows, 2, 2, False)
         evidence = 0.0
-        for place in range(2, 2 + len(DISSIPATIVE)):
-            variance = max(rows[place][place], LEAST_VARIANCE)
-            ratio = max(self._variances[DELAY_PARAMETERS[place]], LEAST_VARIANCE) / variance
-            evidence += 0.5 * (log(ratio) - mean[place] * mean[place] / (variance * excess))
-            observe(mean, rows, place, place, 0.0, EXACT)
+        for index in range(2, 2 + len(DISSIPATIVE)):
+            variance = max(rows[index][index], LEAST_VARIANCE)
+            ratio = max(self._variances[DELAY_PARAMETERS[index]], LEAST_VARIANCE) / variance
+            evidence += 0.5 * (log(ratio) - mean[index] * mean[index] / (variance * excess))
+            observe(mean, rows, index, index, 0.0, EXACT)
         odds = exp(min(max(evidence, -50.0), 50.0))  # of elastic contact by the readings alone
         share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
-        apart = mean[-1] - other[-1]
-        delay = other[-1] + share * apart
+        difference = mean[-1] - lossy[-1]
+        delay = lossy[-1] + share * difference
         share = odds / (1.0 + odds)  # the variance does not rely on the prior odds
-        variance = other_rows[-1][-1] + share * (rows[-1][-1] - other_rows[-1][-1])
-        variance += share * (1.0 - share) * (apart * apart)
-        known = self._variances[DELAY]
-        if not 0.0 < variance < known:
-            return 0.0, known
-        weakened = 1.0 / (1.0 / known + (1.0 / variance - 1.0 / known) / (excess * excess))
+        variance = lossy_rows[-1][-1] + share * (rows[-1][-1] - lossy_rows[-1][-1])
+        variance += share * (1.0 - share) * (difference * difference)
+        prior_variance = self._variances[DELAY]
+        if not 0.0 < variance < prior_variance:
+            return 0.0, prior_variance
+        weakened = 1.0 / (1.0 / prior_variance + (1.0 / variance - 1.0 / prior_variance) / (excess * excess))
         return weakened * delay / variance / (excess * excess), weakened
 
     def _dissipate(
         self, mean: list[float], rows: list[list[float]], first_row: Count, first: Count, certain: bool
     ) -> None:
-        """Make dissipative parameters zero or positive in mean and rows of the covariance.
+        """Make dissipative parameters zero or positive, in place, in mean and rows of the covariance.
 
-        `first_row` and `first` are the first dissipative parameter's row and its index in mean and rows; the
-        others follow. If `certain`, their variances are left out.
+        The dissipative parameters begin at row `first_row` and index `first`. If `certain`, they count as
+        known afterwards.
         """
         for j in range(len(DISSIPATIVE)):
-            place, index = first_row + j, first + j
-            variance = max(rows[place][index], LEAST_VARIANCE)
+            row_index, index = first_row + j, first + j
+            variance = max(rows[row_index][index], LEAST_VARIANCE)
             expected, left = zero_or_positive(mean[index], variance, self._variances[DAMPING + j])
             old, new = 1.0 / variance, EXACT if certain else 1.0 / max(left, 1.0 / EXACT)
             information = new * expected - old * mean[index]
-            observe(mean, rows, place, index, information, new - old)
+            observe(mean, rows, row_index, index, information, new - old)
 
 
 def observe(
     mean: list[float],
     rows: list[list[float]],
-    place: Count,
+    row_index: Count,
     index: Count,
     information: float,
     precision: float,
 ) -> None:
-    """Update mean and rows of the covariance, in place, by more information on one parameter.
+    """Update mean and rows of the covariance, in place, by an observation of one parameter.
 
-    A value with a variance has the precision 1/variance and the information value/variance. Negative
-    ones take a prior back.
+    The parameter has the row `row_index` and the index `index` in mean and rows. An observed value with a
+    variance has the precision 1/variance and the information value/variance; negative ones remove a prior.
     """
-    row = list(rows[place])
-    known = 1.0 + precision * row[index]
-    if not known > 0.0:
+    row = list(rows[row_index])
+    total = 1.0 + precision * row[index]
+    if not total > 0.0:
         return
-    gain = (information - precision * mean[index]) / known
+    gain = (information - precision * mean[index]) / total
     mean[:] = [value + entry * gain for value, entry in zip(mean, row, strict=True)]
-    for other in rows:
-        weight = precision / known * other[index]
-        other[:] = [value - weight * entry for value, entry in zip(other, row, strict=True)]
+    for target in rows:
+        weight = precision / total * target[index]
+        target[:] = [value - weight * entry for value, entry in zip(target, row, strict=True)]
 
 
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
     """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
 
-    `mean` and `variance` are those of the posterior without this knowledge. The tail of the normal
-    distribution is Boyd's bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)).
+    `mean` and `variance` are those of the posterior without this constraint. Boyd's bound of Mills' ratio,
+    pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal distribution.
     """
     spread = sqrt(variance)
     ratio = mean / spread
@@ -255,6 +261,6 @@ def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> 
 def dot(left: Sequence[float], right: Sequence[float]) -> float:
     """Return the sum of products, added from the first to the last."""
     total = 0.0
-    for factor, other in zip(left, right, strict=True):
-        total += factor * other
+    for first, second in zip(left, right, strict=True):
+        total += first * second
     return total

@@ -1,1 +1,1 @@
-"""Onset of contact, found by a cumulative sum."""
+"""Onset detection by a cumulative sum."""

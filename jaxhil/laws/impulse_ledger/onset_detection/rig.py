@@ -1,25 +1,24 @@
-"""Onset of contact by a cumulative sum of force readings; bias and noise of the sensor in free flight.
+"""Onset detection by a cumulative sum of force readings, with bias and noise of the sensor in free flight.
 
     S = max(0, S + (y - bias)/sigma - DRIFT),    contact is detected at S > LEVEL
 
-y is the force towards which the surface pushes. Its bias and standard deviation sigma are those of the
-readings since the run began while S = 0. The last reading with S = 0 before a detection is the last one that
-is taken to be free: contact begins after it.
+y is the force in the direction in which the surface pushes. Its bias and standard deviation sigma are those
+of the readings of this run with S = 0. Contact begins after the last reading with S = 0 before the detection.
 
 Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).
 """
 
 from math import sqrt
 
-DRIFT = 2.0  # standard deviations by which a reading must exceed the bias to count for contact
+DRIFT = 2.0  # standard deviations; a reading increases S if it exceeds the bias by more
 LEVEL = 8.0  # sum at which contact is detected
-SETTLING = 0.004  # s; readings since a run began that only show the bias
-LONGEST_MEAN = 2000.0  # readings over which the bias is averaged at most
-FEW = 8.0  # differences of readings that show the noise
+SETTLING = 0.004  # s; until then after the start of a run, readings only serve the bias
+LONGEST_MEAN = 2000.0  # readings; longest time scale of the mean of the bias
+FEW = 8.0  # differences of readings; with more, they show the noise
 
 
 class OnsetDetector:
-    """Detector of contact, with bias and noise of the force.
+    """Detector of the onset of contact.
 
     Attributes:
         bias: mean of the readings in free flight [N].
@@ -35,7 +34,7 @@ class OnsetDetector:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a run: average the bias anew; keep the noise."""
+        """Begin a run: forget the readings of bias and noise; keep the specified noise."""
         self._count = 0.0
         self._differences = 0.0
         self._square = 0.0
@@ -45,13 +44,15 @@ class OnsetDetector:
 
     @property
     def variance(self) -> float:
-        """Variance of a force reading [N^2]: as specified, or as shown by readings in free flight."""
+        """Return the variance of a force reading [N^2]: as specified, or larger as seen in free flight."""
         variance = max(self._known, self._square) if self._differences > FEW else self._known
         return variance if variance > 0.0 else 0.0
 
     def watch(self, force: float, side: float, floor: float, settled: bool) -> None:
-        """Add one reading [N] to the cumulative sum; `side` is the sign of a pushing force, `floor` [N] is
-        added to the noise's standard deviation."""
+        """Add one reading of the force [N] to the cumulative sum, or set it to 0 unless `settled`.
+
+        `side` is the sign of a pushing force; `floor` [N] is added to the noise's standard deviation.
+        """
         if not settled:
             self.total = 0.0
             return
@@ -59,7 +60,7 @@ class OnsetDetector:
         self.total = total if total > 0.0 else 0.0
 
     def learn(self, force: float) -> None:
-        """Average bias and noise over one more reading [N] of free flight."""
+        """Update bias and noise with one reading [N] of free flight."""
         if self._count > 0.0:
             self._differences += 1.0
             step = force - self._before

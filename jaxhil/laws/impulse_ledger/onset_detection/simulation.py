@@ -1,4 +1,4 @@
-"""Onset of contact in JAX: the cumulative sum of `rig.py` beside it, for batches."""
+"""Onset detection in JAX: the batched cumulative sum of `rig.py` in this folder."""
 
 from typing import NamedTuple
 
@@ -11,29 +11,29 @@ from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, FEW, LONGEST_M
 class FreeFlight(NamedTuple):
     """Statistics of readings in free flight, and the cumulative sum."""
 
-    count: Float[Array, "*batch"]  # readings that the bias is averaged over
-    differences: Float[Array, "*batch"]  # differences that the noise is averaged over
-    square: Float[Array, "*batch"]  # mean of half their squares [N^2]
-    before: Float[Array, "*batch"]  # the reading before [N]
+    count: Float[Array, "*batch"]  # number of readings in the bias
+    differences: Float[Array, "*batch"]  # number of differences of readings in the noise
+    square: Float[Array, "*batch"]  # mean of half the squared differences [N^2]
+    before: Float[Array, "*batch"]  # last reading [N]
     bias: Float[Array, "*batch"]  # mean of the readings [N]
-    total: Float[Array, "*batch"]  # the cumulative sum S
+    total: Float[Array, "*batch"]  # cumulative sum S [1]
 
 
 def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
-    """Return the variance of a force reading [N^2]: as specified, or as shown in free flight."""
-    known = noise**2
-    shown = (flight.differences > FEW) & (flight.square > known)
-    return jnp.where(shown, flight.square, known)
+    """Return the variance of a force reading [N^2]: as specified, or larger as seen in free flight."""
+    specified = noise**2
+    is_larger = (flight.differences > FEW) & (flight.square > specified)
+    return jnp.where(is_larger, flight.square, specified)
 
 
 def watch(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the cumulative sum with one reading more; `deviation` is its pushing force over sigma."""
+    """Return the cumulative sum after a reading whose pushing force over sigma is `deviation`."""
     total = flight.total + deviation - DRIFT
     return jnp.where(settled & (total > 0), total, 0)
 
 
 def learn(flight: FreeFlight, force: Array, free: Bool[Array, "*batch"]) -> FreeFlight:
-    """Average bias and noise over one more reading [N], where it is `free`."""
+    """Update bias and noise with one reading [N], where it is `free`."""
     compared = free & (flight.count > 0)
     differences = flight.differences + jnp.where(compared, 1, 0)
     step = force - flight.before

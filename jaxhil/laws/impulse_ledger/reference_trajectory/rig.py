@@ -1,15 +1,15 @@
-"""Reference trajectory: the motion that the model should have had at the time of the force reading.
+"""Reference trajectory: the motion that the numerical model should have had at the time of the force reading.
 
     x_r'' = -F_r,    F_r = max(f(x_r, v_r) + y - f(X, V), min(0, y))
 
-f is the contact model, (X, V) the hardware's motion as old as the reading y. The trajectory runs once, from
-the onset on. When the estimate of the model's parameters changes by d theta, it is corrected by its
-sensitivities s = d x_r/d theta, which are integrated beside it:
+f is the contact model, (X, V) the hardware's motion, as old as the reading y. The trajectory is integrated
+once, from the onset on. When the estimate of the model's parameters changes by d theta, the sensitivities
+s = d x_r/d theta, which are integrated as well, correct it:
 
     x_r += s.d theta,   v_r += s'.d theta,   s'' = -[phi(x_r, v_r) - phi(X, V) + k s + b s']
 
-k and b are slope and damping of the model at x_r. `bridge` continues the trajectory to the present. All
-values are scaled as in `contact_model`.
+k and b are slope and damping of the contact model at x_r. `bridge` continues the trajectory to the present.
+All values are scaled as in `contact_model`.
 
 Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 """
@@ -33,16 +33,18 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
 )
 
 LOSSES = (DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION)
-STEPS = 12  # from the last reading to now
-FASTEST = 2.0  # speed; contact gives back no more than it took
-FARTHEST = 10.0  # s; depth of contact of 0.05 Hz, three times
+STEPS = 12  # of the integration from the last reading to the present
+FASTEST = 2.0  # largest speed [1]; contact returns no more energy than it took
+FARTHEST = 10.0  # s; largest depth, three times that of a contact of 0.05 Hz
 
 
 class ReferenceTrajectory:
     """State of the reference trajectory.
 
     Attributes:
-        depth, speed, force: of the trajectory at the time of the last reading [s, 1, 1/s].
+        depth: depth at the time of the last reading [s].
+        speed: speed at that time [1].
+        force: force at that time [1/s].
         deepest: largest depth so far [s].
         released: whether the trajectory has left the surface.
     """
@@ -53,7 +55,7 @@ class ReferenceTrajectory:
         self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
-        """Begin at the onset, at a depth [s] and the speed 1, with these parameters of the model."""
+        """Begin at the onset, at a depth [s] and the speed 1, with the parameters `theta`."""
         self.depth = depth
         self.speed = 1.0
         self.force = 0.0
@@ -62,10 +64,10 @@ class ReferenceTrajectory:
         self._theta = theta
         self._depths = [0.0] * PARAMETERS  # s
         self._speeds = [0.0] * PARAMETERS  # s'
-        self._losses = [0.0] * len(LOSSES)  # work of each dissipative feature
+        self._losses = [0.0] * len(LOSSES)  # mechanical work of each feature of `LOSSES`
 
     def correct(self, theta: Vector) -> None:
-        """Correct the trajectory for new parameters."""
+        """Correct the trajectory for new parameters `theta`."""
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
         if not self.released:
@@ -73,8 +75,7 @@ class ReferenceTrajectory:
         self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
 
     def advance(self, period: float, reading: float, measured: Vector) -> None:
-        """Advance by one control period [s] (velocity Verlet) to the time of a reading [1/s] whose features
-        are `measured`."""
+        """Advance by one control period [s] to the time of a reading [1/s] with the features `measured`."""
         theta = self._theta
         depth = self.depth + period * self.speed - 0.5 * (period * period) * self.force
         speed = self.speed - period * self.force
@@ -96,14 +97,14 @@ class ReferenceTrajectory:
     def spread(self, covariance: Matrix, delay_variance: float) -> float:
         """Return the standard deviation of the speed, sqrt(s' P s'), for a delay of this variance [s^2]."""
         columns = [dot(row, self._speeds) for row in covariance]
-        total, known = dot(self._speeds, columns), covariance[DELAY][DELAY]
-        if known > 0.0:
-            by_delay = columns[DELAY] / known
-            total += by_delay * by_delay * (delay_variance - known)
+        total, variance = dot(self._speeds, columns), covariance[DELAY][DELAY]
+        if variance > 0.0:
+            by_delay = columns[DELAY] / variance
+            total += by_delay * by_delay * (delay_variance - variance)
         return sqrt(total) if total > 0.0 else 0.0
 
     def imbalance(self) -> float:
-        """Return the energy that the trajectory lost and the model's dissipation does not explain [1]."""
+        """Return the energy lost by the trajectory that the model's dissipation does not explain [1]."""
         dissipated = 0.0
         for j, loss in zip(LOSSES, self._losses, strict=True):
             dissipated += self._theta[j] * loss
@@ -133,17 +134,17 @@ class ReferenceTrajectory:
         inside = depth > 0.0
         stiffness = slope(theta, depth)
         damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if inside else 0.0
-        # Stiffer contact is not followed at this period.
+        # The integration is stable only up to these values.
         stiffness = min(stiffness, 1.0 / (period * period))
         damping = min(damping, 1.0 / period)
         depths, speeds = self._depths, self._speeds
         for j in range(PARAMETERS):
-            here = depths[j] + period * speeds[j]
-            rate = undelayed[j] - measured[j] + stiffness * here + damping * speeds[j]
+            ahead = depths[j] + period * speeds[j]
+            rate = undelayed[j] - measured[j] + stiffness * ahead + damping * speeds[j]
             speeds[j] -= period * rate
             depths[j] += period * speeds[j]
 
 
 def within(value: float, limit: float) -> float:
-    """Return the value, limited to -limit and limit."""
+    """Return the value, limited to -limit to limit."""
     return limit if value > limit else (-limit if value < -limit else value)

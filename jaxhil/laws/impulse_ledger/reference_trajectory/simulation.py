@@ -1,7 +1,6 @@
-"""Reference trajectory in JAX: trajectory, sensitivities and bridge of
-`jaxhil.laws.impulse_ledger.reference_trajectory.rig`, for batches.
+"""Reference trajectory in JAX: batched trajectory, sensitivities and bridge of `rig.py` in this folder.
 
-The equations and their source stand there.
+`rig.py` states equations and source.
 """
 
 from typing import NamedTuple
@@ -23,8 +22,8 @@ class Reference(NamedTuple):
     force: Float[Array, "*batch"]  # F_r [1/s]
     deepest: Float[Array, "*batch"]  # largest depth so far [s]
     released: Bool[Array, "*batch"]  # whether it has left the surface
-    depths: Float[Array, "parameters *batch"]  # s
-    speeds: Float[Array, "parameters *batch"]  # s'
+    depths: Float[Array, "parameters *batch"]  # sensitivities s of the depth
+    speeds: Float[Array, "parameters *batch"]  # sensitivities s' of the speed
 
 
 def begin(depth: Array, like: Array) -> Reference:
@@ -34,15 +33,14 @@ def begin(depth: Array, like: Array) -> Reference:
 
 
 def correct(old: Reference, changes: Array) -> Reference:
-    """Return the trajectory corrected for parameters that have changed."""
+    """Return the trajectory corrected for these `changes` of the parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
     speed = _within(old.speed + dot(old.speeds, changes), FASTEST)
     return old._replace(depth=_within(old.depth + moved, FARTHEST), speed=speed)
 
 
 def advance(old: Reference, theta: Array, period: Array, reading: Array, measured: Array) -> Reference:
-    """Return the trajectory one control period [s] later (velocity Verlet), at the time of a reading [1/s]
-    whose features are `measured`."""
+    """Return the trajectory one control period [s] later, at a reading [1/s] with the features `measured`."""
     depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
     speed = old.speed - period * old.force
     deepest = jnp.where(depth > old.deepest, depth, old.deepest)
@@ -52,7 +50,7 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     push = dot(theta, undelayed) + (reading - dot(theta, measured))
     push = jnp.where(released, 0, jnp.where(push > least, push, least))
     damping = jnp.where(depth > 0, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
-    # Stiffer contact is not followed at this period.
+    # The integration is stable only up to these values.
     stiffness = jnp.minimum(slope(theta, depth), 1 / (period * period))
     damping = jnp.minimum(damping, 1 / period)
     tick, moves = period[None], (push != 0)[None]
@@ -78,11 +76,11 @@ def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tupl
         later = jnp.where(released | (later < 0), 0, later)
         return depth, speed - 0.5 * step * (push + later), later, deepest, released
 
-    # A loop, because it is compiled but once.
+    # A loop is compiled only once.
     _, speed, push, _, _ = lax.fori_loop(0, STEPS, advanced, now[:5])
     return push, speed
 
 
 def _within(value: Array, limit: float) -> Array:
-    """Return the value, limited to -limit and limit."""
+    """Return the value, limited to -limit to limit."""
     return jnp.where(value > limit, limit, jnp.where(value < -limit, -limit, value))

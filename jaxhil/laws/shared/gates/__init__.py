@@ -1,1 +1,1 @@
-"""Gates that open and close smoothly with the time of a crossing."""
+"""Gates that open and close smoothly when a threshold is crossed."""

@@ -1,12 +1,13 @@
-"""Gates that open and close smoothly with the time, between two ticks, at which a threshold is crossed."""
+"""Gates that open and close smoothly with the time between two ticks at which a threshold is crossed."""
 
 
 def share_beyond(excess: float, excess_before: float, moved: float) -> float:
-    """Share of the last period that a reading, straight between two ticks, spent beyond a threshold.
+    """Return the share of the last period that a reading, linear between ticks, was beyond a threshold.
 
-    `excess`: by how much the reading is beyond, 0 short of the threshold and of slope 1 beyond it
-    (negative beyond the lower one of two thresholds); `excess_before`: the tick before; `moved`:
-    the reading's change. All of one unit.
+    Args:
+        excess: how far the reading is beyond: 0 within, of slope 1 beyond, negative beyond a lower threshold.
+        excess_before: excess on the tick before.
+        moved: change of the reading since then, in the same unit.
     """
     if excess > 0.0:
         crossed = excess_before <= 0.0
@@ -20,10 +21,11 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 
 
 def gate(share: float, share_before: float) -> float:
-    """Time beyond a threshold, weighed with a triangle two periods wide: 0 to 1.
+    """Return the time beyond a threshold, weighted with a triangle two periods wide: 0 to 1.
 
-    From the shares of the last period and of the one before; exact if the threshold was crossed
-    once. Its sum over the ticks is the time beyond in periods, its mean delay one period.
+    The arguments are the shares of the last period and of the one before. The result is exact if the
+    threshold was crossed once. Its sum over the ticks is the time beyond in periods, its mean delay one
+    period.
     """
     return (share * share + share_before * share_before) / 2.0 + share * share_before * (
         2.0 - share - share_before

@@ -1,18 +1,22 @@
-"""Weighted recursive identification of contact stiffness k and damping b from F = k p + b p', p the depth."""
+"""Weighted recursive identification of contact stiffness k and damping b in F = k p + b p', p the depth."""
 
 
 class ContactIdentification:
     """Weighted recursive least squares with forgetting, in Bierman's factored form.
 
-    With regressor phi = (p, p') and a reading's weight w, K = w P phi/(lambda_w + w phi' P phi), theta += K
-    (F - phi' theta), P = (P - K phi' P)/lambda_w, lambda_w = 1 - w (1 - lambda). Here P = U D U', U =
-    [[1, u], [0, 1]], D = diag(d1, d2), which stays symmetric and positive whatever the rounding (Bierman,
-    "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their initial
-    values: held still, a contact tells nothing new of one of the two, whose variance forgetting alone would
-    let wind up.
+    With the regressor phi = (p, p') and a reading's weight w, K = w P phi/(lambda_w + w phi' P phi),
+    theta += K (F - phi' theta), P = (P - K phi' P)/lambda_w, lambda_w = 1 - w (1 - lambda). The factors of
+    P = U D U', U = [[1, u], [0, 1]], D = diag(d1, d2), keep P symmetric and positive whatever the rounding
+    (Bierman, "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their
+    initial values: a contact at rest has no information on the damping, and forgetting would increase its
+    variance without limit.
 
-    Initial stiffness in N/m and damping in N s/m, initial covariance 1/m^2 and s^2/m^2 (relative to the
-    force's variance), forgetting in (0, 1].
+    Args:
+        stiffness: initial stiffness [N/m].
+        damping: initial damping [N s/m].
+        stiffness_covariance: initial d1 [1/m^2], relative to the force's variance.
+        damping_covariance: initial d2 [s^2/m^2], relative to the force's variance.
+        forgetting: lambda, in (0, 1].
     """
 
     __slots__ = (
@@ -34,28 +38,28 @@ class ContactIdentification:
         self.reset()
 
     def reset(self) -> None:
-        """Forget parameters and covariance."""
+        """Return to the initial parameters and covariance."""
         self.stiffness, self.damping = self._initial_parameters
         self.restart_covariance()
 
     def restart_covariance(self) -> None:
-        """Keep the parameters, with their initial uncertainty."""
+        """Return to the initial covariance; keep the parameters."""
         self.coupling = 0.0  # u
         self.stiffness_variance, self.damping_variance = self._initial_covariance  # d1, d2
 
     def update(self, force: float, deflection: float, rate: float, weight: float) -> None:
-        """Take in one reading: force [N], signed deflection [m], its rate [m/s] and its weight."""
+        """Update by one reading: force [N], signed deflection [m], its rate [m/s] and weight, 0 to 1."""
         u = self.coupling
         d1 = self.stiffness_variance
         d2 = self.damping_variance
         stiffness = self.stiffness
         damping = self.damping
-        kept = 1.0 - weight * (1.0 - self._forgetting)
+        factor = 1.0 - weight * (1.0 - self._forgetting)
 
         f2 = u * deflection + rate
         g1 = weight * d1 * deflection
         g2 = weight * d2 * f2
-        a1 = kept + deflection * g1
+        a1 = factor + deflection * g1
         a2 = a1 + f2 * g2
         innovation = force - (stiffness * deflection + damping * rate)
 
@@ -63,7 +67,7 @@ class ContactIdentification:
         self.damping = damping + g2 / a2 * innovation
         self.coupling = u - g1 * f2 / a1
         d1 /= a1
-        d2 *= a1 / (a2 * kept)
+        d2 *= a1 / (a2 * factor)
         most1, most2 = self._initial_covariance
         self.stiffness_variance = d1 if d1 < most1 else most1
         self.damping_variance = d2 if d2 < most2 else most2

@@ -1,11 +1,10 @@
 """Real-time identification of contact stiffness and damping: weighted recursive least squares, forgetting.
 
-Model F = k d + b v; a reading counts by its weight, from 0 (outside contact) to 1. The covariance is kept as
-P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2) (Bierman 1977): it stays positive however large the
-initial covariance.
-Neither d grows beyond its initial value: held still, a contact tells nothing new of one of the two, whose
-variance forgetting alone would let wind up.
-With d_2 = 0 the damping stays at its initial value and the law identifies stiffness alone.
+The model is F = k d + b v; the weight of a reading is 0 (outside contact) to 1. The covariance is stored as
+P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2) (Bierman 1977), which remains positive however large the
+initial covariance is. d_1 and d_2 never exceed their initial values: a contact at rest has no information on
+the damping, and forgetting would increase its variance without limit. With d_2 = 0 the damping remains at its
+initial value, and only the stiffness is identified.
 """
 
 from typing import NamedTuple
@@ -33,23 +32,23 @@ def update(
     force: Array,
     weight: Array,
 ) -> Identified:
-    """One reading of weight w: K = w P phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta),
-    P = (P - K phi'P)/lambda_w, with phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda).
+    """Return the estimate after one reading: deflection [m], rate [m/s], force [N] and weight [1].
 
-    It minimises the sum of w (F - phi'theta)^2, past terms and the initial one times lambda_w with every
-    reading. A weight of 1 is the textbook's recursion, one of 0 changes nothing; between them it is smooth.
-    d_1 and d_2 are at most `initial_variances`.
+    With weight w, phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda) the recursion is
+    K = w P phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. It minimises
+    the sum of w (F - phi'theta)^2, in which every reading multiplies the earlier terms by lambda_w. A weight
+    of 1 gives the textbook's recursion, a weight of 0 no change. d_1 and d_2 are at most `initial_variances`.
     """
-    kept = 1 - weight * (1 - forgetting)
+    factor = 1 - weight * (1 - forgetting)
     f_1 = deflection
     f_2 = old.coupling * deflection + rate
     g_1 = weight * old.stiffness_variance * f_1
     g_2 = weight * old.damping_variance * f_2
-    alpha_1 = kept + f_1 * g_1
+    alpha_1 = factor + f_1 * g_1
     alpha_2 = alpha_1 + f_2 * g_2
     inverse_1, inverse_2 = 1 / alpha_1, 1 / alpha_2
     step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
-    variances = (old.stiffness_variance * inverse_1, old.damping_variance * alpha_1 * inverse_2 / kept)
+    variances = (old.stiffness_variance * inverse_1, old.damping_variance * alpha_1 * inverse_2 / factor)
     bounded = [jnp.where(d < most, d, most) for d, most in zip(variances, initial_variances, strict=True)]
     return Identified(
         stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,

@@ -1,1 +1,1 @@
-"""Base of the Smith predictor and its hybrid."""
+"""Base of the Smith predictor and of its hybrid with phase lead."""

@@ -1,4 +1,4 @@
-"""What `smith_predictor` and `smith_hybrid` share: a phase lead, and behind it a prediction of the force."""
+"""Base of `smith_predictor` and `smith_hybrid`: a phase lead, and behind it a prediction of the force."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple
@@ -18,7 +18,7 @@ from jaxhil.laws.shared.lead_filter import (
 )
 from jaxhil.laws.simulation_base import Compensator, Constants, Gain, Gains, rig_gain
 
-# An ideal simulator under commands held in jumps is half a period ahead: a lag below 0 is none to predict.
+# An ideal simulator with a zero-order hold is half a period ahead; such a negative lag is not predicted.
 LAG = rig_gain(
     "simulator_lag",
     lower=lambda mechanism: 0.0,
@@ -29,24 +29,24 @@ LAG = rig_gain(
 
 
 class Cascade(NamedTuple):
-    """Filters one behind the other, or their states."""
+    """Two filters in series, or their states."""
 
-    lead: Any  # 1 + T_l s, filtered as in phase lead
+    lead: Any  # 1 + T_l s, filtered as in `PhaseLead`
     predictor: Any  # (1 + (3/2) T_s s)/(1 + T_s s/2)
 
 
 class Smith(Compensator):
-    """F_c from the force led and the force led and predicted; both filters by Tustin's rule."""
+    """Base that computes F_c from the force behind the lead and behind lead and predictor."""
 
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, LAG)
-    # A/(T_s/2) of the law's own transfer function behind the lead, (1 + A s)/(1 + T_s s/2).
+    # A/(T_s/2) of the whole transfer function behind the lead, (1 + A s)/(1 + T_s s/2).
     excess: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
     def combined(self, led: Array, predicted: Array) -> Array:
-        """F_c [N]."""
+        """Return F_c [N]."""
 
     def prepare(self, gains, constants):
         period, lag = constants.control_period, gains["simulator_lag"]
@@ -68,13 +68,13 @@ class Smith(Compensator):
 
 
 def cascade_amplification(gains: Gains, constants: Constants, excess: float) -> Float[Array, "*batch"]:
-    """Standard deviation of white noise behind the lead and (1 + A s)/(1 + C s), C = T_s/2, A = excess C.
+    """Return the noise amplification of the lead and (1 + A s)/(1 + C s), C = T_s/2, A = excess C [1].
 
-    Tustin's rule maps the unit circle on the imaginary axis: the variance is T times the integral
-    (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, E = T/2, of the filter H before it was made discrete. With
-    numerator 1 + b_1 s + b_2 s^2 and denominator 1 + a_1 s + a_2 s^2 + a_3 s^3 that is (James, Nichols and
-    Phillips 1947, I_3) (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3)); in b_2^2/a_3 a factor C
-    cancels, and T_s = 0 leaves the lead alone.
+    Tustin's rule maps the unit circle to the imaginary axis: the variance of white noise behind the filter is
+    T times the integral (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, E = T/2, H being the continuous filter. With
+    numerator 1 + b_1 s + b_2 s^2 and denominator 1 + a_1 s + a_2 s^2 + a_3 s^3 the integral is
+    (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3)) (James, Nichols and Phillips 1947, I_3). In
+    b_2^2/a_3 a factor C cancels, so that T_s = 0 leaves the lead alone.
     """
     period, pole = constants.control_period, gains["lead_filter"]
     zero = pole + gains["phase_lead"]
