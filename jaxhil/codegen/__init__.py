@@ -1,8 +1,8 @@
-"""C99 generator: reads the rig's Python and prints C that computes the same bits.
+"""C99 generator: translates the rig's Python code to C that computes the same bits.
 
-`Program` lowers functions, methods and classes of Python (see `subset` for what it understands) and returns
-declarations and definitions in C. Everything outside the subset is refused with file, line and what to write
-instead.
+`Program` lowers functions, methods and classes of Python and returns declarations and definitions in C.
+`subset` describes the subset of Python. Constructs outside it raise `SubsetError` with file, line and what to
+write instead.
 """
 
 from .program import Output, Program

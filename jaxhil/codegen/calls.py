@@ -1,4 +1,4 @@
-"""Calls: functions of Python, `math`, methods, constructors; attributes of objects."""
+"""Lowering of calls (functions of Python and `math`, methods, constructors) and of attributes."""
 
 import ast
 import inspect
@@ -10,7 +10,7 @@ from .expressions import LARGEST_FACTOR, common
 from .lists import Lists
 from .subset import ATOM, BOOL, CHOICE, FLOAT, INT, SUM, UNARY, Keys, Type, Value, implies
 
-# Functions of math: what raises, by the operands `{0}`, `{1}` and the result `{r}`.
+# Functions of math, with the condition on operands `{0}`, `{1}` and result `{r}` under which Python raises.
 MATH = {
     "sqrt": "{0} < 0.0",
     "log": "{0} <= 0.0",
@@ -90,17 +90,17 @@ class Calls(Lists):
         return value._replace(text=f"fabs({value.text})", rank=ATOM, sign=sign, type=FLOAT, constant=None)
 
     def builtin_max(self, node: ast.Call, mark: str = ">") -> Value:
-        values = [self.simple(one, "value") for one in self.operands(node.args, self.number)]
-        found, signs = values[0], {one.sign for one in values}
-        if len(values) < 2 or len({one.type.kind for one in values}) > 1:
+        values = [self.simple(value, "value") for value in self.operands(node.args, self.number)]
+        extreme, signs = values[0], {value.sign for value in values}
+        if len(values) < 2 or len({value.type.kind for value in values}) > 1:
             raise self.refuse(node, f"{ast.unparse(node)}", "two or more numbers of one type")
-        for one in values[1:]:
-            # NaN goes the way that Python's comparison sends it.
-            found = self.simple(found, "extreme") if found.rank == CHOICE else found
-            text = f"{one.at(SUM)} {mark} {found.at(SUM)} ? {one.text} : {found.text}"
-            found = Value(text, found.type._replace(sign=""), CHOICE, found.reads | one.reads)
-        largest = next((one for one in ("> 0", ">= 0") if one in signs), "")
-        return found._replace(sign=largest if mark == ">" else common([one.sign for one in values]))
+        for value in values[1:]:
+            # The order of the operands treats NaN like Python.
+            extreme = self.simple(extreme, "extreme") if extreme.rank == CHOICE else extreme
+            text = f"{value.at(SUM)} {mark} {extreme.at(SUM)} ? {value.text} : {extreme.text}"
+            extreme = Value(text, extreme.type._replace(sign=""), CHOICE, extreme.reads | value.reads)
+        largest = next((sign for sign in ("> 0", ">= 0") if sign in signs), "")
+        return extreme._replace(sign=largest if mark == ">" else common([value.sign for value in values]))
 
     def builtin_min(self, node: ast.Call) -> Value:
         return self.builtin_max(node, "<")
@@ -119,10 +119,10 @@ class Calls(Lists):
         if value.type.kind != "list":
             raise self.refuse(node, f"len of a {value.type.kind}", "len of a list")
         length = value.type.length
-        return Value(value.length, INT, sign=">= 0") if length is None else self.program.known(length)
+        return Value(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
 
     def builtin_int(self, node: ast.Call, form: str = "{}") -> Value:
-        """Lower a conversion to int: it raises for what is not finite, here beyond 2^63 too."""
+        """Lower a conversion to int, which fails for values that are not finite or beyond 2^63."""
         value = self.number(node.args[0])
         if value.type.kind == "int" or len(node.args) > 1:
             return value if len(node.args) == 1 else self._no_call(node, "round to digits")
@@ -140,48 +140,45 @@ class Calls(Lists):
             return self.builtin_int(node, WHOLE[name])
         if (name not in MATH and name not in TESTS) or node.keywords:
             return self._no_call(node, name)
-        values = [self.as_float(one) for one in self.operands(node.args, self.number)]
-        reads: Keys = frozenset().union(*(one.reads for one in values))
+        values = [self.as_float(operand) for operand in self.operands(node.args, self.number)]
+        reads: Keys = frozenset().union(*(operand.reads for operand in values))
         if name in TESTS:
             return Value(f"{name}({values[0].text})", BOOL, reads=reads)
         test, sign = MATH[name], values[0].sign if name in ("sqrt", "log", "fabs") else ""
         if (name == "sqrt" and sign in ("> 0", ">= 0")) or (name == "log" and sign == "> 0"):
             test = ""
-        values = [self.simple(one, "operand") for one in values] if test else values
-        text = f"{name}({', '.join(one.text for one in values)})"
+        values = [self.simple(operand, "operand") for operand in values] if test else values
+        text = f"{name}({', '.join(operand.text for operand in values)})"
         positive = {"sqrt": "> 0" if sign == "> 0" else ">= 0", "fabs": ">= 0", "exp": ">= 0"}.get(name, "")
         value = Value(text, FLOAT, reads=reads, sign=positive)
         if test:
             value = self.temporary(value, f"{name}_value") if "{r}" in test else value
-            condition = test.format(*(one.text for one in values), r=value.text)
+            condition = test.format(*(operand.text for operand in values), r=value.text)
             self.fail_if(condition, node, f"{name} that may raise")
         return value
 
     def _arguments(self, function: Callable[..., Any], node: ast.Call) -> dict[str, Any]:
-        """Return the arguments of a call by parameter: syntax trees, or defaults."""
-        known = [one for one in inspect.signature(function).parameters.values() if one.name != "self"]
-        given: dict[str, Any] = {one.name: arg for one, arg in zip(known, node.args, strict=False)}
-        given |= {str(one.arg): one.value for one in node.keywords}
-        given |= {
-            one.name: one.default for one in known if one.name not in given and one.default is not one.empty
-        }
-        if len(node.args) > len(known) or {one.name for one in known} != {*given}:
+        """Return the arguments of a call by parameter, as syntax trees or default values."""
+        parameters = {k: p for k, p in inspect.signature(function).parameters.items() if k != "self"}
+        arguments: dict[str, Any] = dict(zip(parameters, node.args, strict=False))
+        arguments |= {str(keyword.arg): keyword.value for keyword in node.keywords}
+        defaults = {k: p.default for k, p in parameters.items() if p.default is not p.empty}
+        arguments |= {k: default for k, default in defaults.items() if k not in arguments}
+        if len(node.args) > len(parameters) or {*parameters} != {*arguments}:
             raise self.refuse(node, "these arguments", "one for each parameter")
-        return given
+        return arguments
 
-    def _lowered(self, given: dict[str, Any], node: ast.AST) -> dict[str, Value]:
-        nodes = [one for one in given.values() if isinstance(one, ast.expr)]
-        lowered = iter(self.operands(nodes))
-        return {
-            k: next(lowered) if isinstance(v, ast.expr) else self.program.known(v) for k, v in given.items()
-        }
+    def _lowered(self, arguments: dict[str, Any], node: ast.AST) -> dict[str, Value]:
+        nodes = [argument for argument in arguments.values() if isinstance(argument, ast.expr)]
+        lowered, literal = iter(self.operands(nodes)), self.program.literal
+        return {k: next(lowered) if isinstance(v, ast.expr) else literal(v) for k, v in arguments.items()}
 
     def invoke(self, function: Callable[..., Any], receiver: Value | None, node: ast.Call) -> Value:
         """Lower a call of a function or method that has a source."""
         owner = receiver.type.of if receiver else None
         types_ = self.program.parameters(function, owner)
-        given = self._arguments(function, node)
-        values = self._lowered({k: one for k, one in given.items() if types_[k].kind != "text"}, node)
+        arguments = self._arguments(function, node)
+        values = self._lowered({k: v for k, v in arguments.items() if types_[k].kind != "text"}, node)
         for name, value in values.items():
             types_[name] = self._argument(node, name, types_[name], value)
         called = self.program.function(function, owner, types_, self)
@@ -191,8 +188,8 @@ class Calls(Lists):
         self.note(writes)
         for name in called.changes:
             self.changed(values[name], True)
-        for name in called.keeps:
-            self.share(node, called.keeps[name], values[name])
+        for name in called.retained:
+            self.share(node, called.retained[name], values[name])
         returns, array = called.returns, ""
         if returns.kind == "list":
             array = self.fresh(self.hint_of(node))
@@ -229,13 +226,13 @@ class Calls(Lists):
         """Lower a NamedTuple into a local constant."""
         values, record = self._lowered(self._arguments(target, node), node), Type("record", target)
         wanted = {name: self.program.field_type(self, record, name, node) for name in target._fields}
-        texts = [self.program.stored(one, values[name]) for name, one in wanted.items() if one.kind != "text"]
+        texts = [self.program.stored(t, values[name]) for name, t in wanted.items() if t.kind != "text"]
         name = self.fresh("record")
         self.emit(f"const {self.program.c_type(record)} {name} = {{{', '.join(texts)}}};")
         return Value(name, record)
 
     def construct(self, target: Value, class_: type, node: ast.Call) -> None:
-        """Lower `self.name = Class(...)`: construct in place."""
+        """Lower `self.name = Class(...)` to a construction in place."""
         init = inspect.getattr_static(class_, "__init__", None)
         if inspect.isfunction(init):
             value = self.invoke(init, target._replace(samples=()), node)

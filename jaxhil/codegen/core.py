@@ -1,4 +1,4 @@
-"""Lowering of one function: output, error flag, order of evaluation, what is known of numbers."""
+"""Base of the lowering of one function: output, error flag, order of evaluation, facts about numbers."""
 
 import ast
 from collections.abc import Callable, Iterator, Sequence
@@ -12,16 +12,16 @@ from .subset import BOOL, EQUALITY, ORDER, TEXT, Keys, SubsetError, Value, impli
 if TYPE_CHECKING:
     from .program import Function, Program
 
-WHEN_TRUE = {ast.Gt: "> 0", ast.GtE: ">= 0", ast.Lt: "not 0", ast.NotEq: "not 0"}  # of x beside 0
+WHEN_TRUE = {ast.Gt: "> 0", ast.GtE: ">= 0", ast.Lt: "not 0", ast.NotEq: "not 0"}  # sign of x if x OP 0
 WHEN_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}
 
 
 class Fact(NamedTuple):
-    """Facts about a number that hold at a place in the code."""
+    """Fact about a number at one position in the code."""
 
     sign: str
-    reads: Keys = frozenset()  # what it depends on
-    span: tuple[Any, Any] | None = None  # it is a number, between these
+    reads: Keys = frozenset()  # on which it depends
+    span: tuple[Any, Any] | None = None  # least and largest value; the number is not NaN
 
 
 class Core:
@@ -32,11 +32,11 @@ class Core:
         self.names: dict[str, Value] = {}  # local names
         self.facts: dict[str, Fact] = {}  # by the C text of a number
         self.lines: list[str] = []
-        self.failures = 0  # tests so far that may leave the function
+        self.failures = 0  # number of tests so far that may leave the function
         self.effects: list[Keys] = []  # what calls have changed so far
 
     def refuse(self, node: ast.AST, found: str, expected: str) -> SubsetError:
-        """Return the error of a construct outside the subset."""
+        """Return the error for a construct outside the subset."""
         line = getattr(node, "lineno", self.function.node.lineno)
         return SubsetError(f"{self.function.file}:{line}: found {found}, expected {expected}")
 
@@ -46,7 +46,7 @@ class Core:
 
     @contextmanager
     def captured(self) -> Iterator[list[str]]:
-        """Collect what is emitted in a list of its own, and forget what is learnt."""
+        """Collect the lines emitted in the context in a new list; drop its facts afterwards."""
         before, facts, effects = self.lines, self.facts, len(self.effects)
         self.lines, self.facts = [], dict(facts)
         yield self.lines
@@ -54,37 +54,37 @@ class Core:
         self.lines, self.facts = before, {k: fact for k, fact in facts.items() if not fact.reads & written}
 
     def fresh(self, hint: str) -> str:
-        """Return a local name that nothing else has."""
+        """Return an unused local name."""
         numbers = (f"{hint}_{number}" for number in range(2, 10_000))
-        name = next(one for one in (hint, *numbers) if one not in self.function.taken)
+        name = next(candidate for candidate in (hint, *numbers) if candidate not in self.function.taken)
         self.function.taken.add(name)
         return name
 
     def temporary(self, value: Value, hint: str) -> Value:
-        """Hold a value in a local constant."""
+        """Store a value in a local constant."""
         name = self.fresh(hint)
         self.emit(f"const {self.program.c_type(value.type)} {name} = {value.text};")
         self.check(value)
         return Value(name, value.type, sign=value.sign)
 
     def simple(self, value: Value, hint: str) -> Value:
-        """Return a value that may be written twice."""
+        """Return a value whose text may be repeated."""
         is_simple = value.text.replace("->", "").replace(".", "").replace("_", "").isalnum()
         return value if is_simple and not value.writes else self.temporary(value, hint)
 
     def check(self, value: Value) -> None:
-        """Leave the function if the call that a value came from failed."""
+        """Leave the function if the call that gave a value failed."""
         if value.fails:
             self.fail_if("*error", None)
 
     def fail_if(self, condition: str, node: ast.AST | None, reason: str = "") -> None:
-        """Raise the error flag and leave the function on a condition."""
+        """Set the error flag and leave the function if a condition holds."""
         self.emit(f"if ({condition}) {{")
         self.fail(node, reason)
         self.emit("}")
 
     def fail(self, node: ast.AST | None, reason: str) -> None:
-        """Raise the error flag, unless it is already, and leave the function."""
+        """Leave the function; set the error flag, which is set already if `node` is None."""
         self.failures += 1
         self.function.fails = True
         nothing = {"float": " 0.0", "int": " 0", "bool": " false"}.get(self.function.returns.kind, "")
@@ -136,10 +136,10 @@ class Core:
             if is_held and len(nodes) > 1 and value.type.kind not in ("none", "list"):
                 value = self.temporary(value, self.hint_of(node))
             written = frozenset().union(*self.effects[before:])
-            for place, earlier in enumerate(values):
+            for index, earlier in enumerate(values):
                 if earlier.reads & written and earlier.is_number:
                     later, self.lines = self.lines[position:], self.lines[:position]
-                    values[place] = self.temporary(earlier, "earlier")
+                    values[index] = self.temporary(earlier, "earlier")
                     position = len(self.lines)
                     self.lines += later
             values.append(value)
@@ -152,7 +152,7 @@ class Core:
         return name.lstrip("_")
 
     def note(self, writes: Keys) -> None:
-        """Take note of what an assignment or a call changes."""
+        """Record what an assignment or a call changes."""
         if writes:
             self.effects.append(writes)
             self.function.writes |= writes
@@ -164,11 +164,11 @@ class Core:
             self.emit(f"/* {plain(text)} */")
 
     def facts_of(self, node: ast.expr, truth: bool) -> dict[str, Fact]:
-        """Return what a condition tells of numbers if it is true, or false."""
+        """Return the facts about numbers that follow if a condition is true, or false."""
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return self.facts_of(node.operand, not truth)
         if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And) == truth:
-            return {key: fact for one in node.values for key, fact in self.facts_of(one, truth).items()}
+            return {key: fact for part in node.values for key, fact in self.facts_of(part, truth).items()}
         if not isinstance(node, ast.Compare) or len(node.ops) != 1:
             return {}
         operator, left = type(node.ops[0]), node.left

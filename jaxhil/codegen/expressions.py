@@ -1,4 +1,4 @@
-"""Expressions: arithmetic, comparisons, conditions, names."""
+"""Lowering of expressions: arithmetic, comparisons, conditions, names."""
 
 import ast
 import operator
@@ -41,17 +41,17 @@ COMPARISONS = {
     ast.NotEq: ("!=", operator.ne),
 }
 HELPED = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
-LARGEST_FACTOR = 3037000499  # its square is the largest that an int64_t holds
+LARGEST_FACTOR = 3037000499  # largest int whose square is an int64_t
 
 
 class Expressions(Core):
-    """Lowering of expressions; what has to happen before them is emitted."""
+    """Lowering of expressions; statements that must precede them are emitted."""
 
     def lower_constant(self, node: ast.Constant) -> Value:
         return self.program.constant(node.value) or self.unknown(node, repr(node.value))
 
     def unknown(self, node: ast.AST, what: str) -> Value:
-        """Raise the error of a name or constant without a C."""
+        """Raise the error for a name or constant that has no equivalent in C."""
         raise self.refuse(node, what, "a number, a bool, a list of them, a class or a function with a source")
 
     def lower_name(self, node: ast.Name) -> Value:
@@ -91,16 +91,16 @@ class Expressions(Core):
             right = self._divisor(node, right)
         if op is ast.Mult and kind == "int" and not (left.span and right.span):
             left, right = self.simple(left, "factor"), self.simple(right, "factor")
-            for one in (left, right):
-                if one.constant is None:
-                    large = f"{one.text} > {LARGEST_FACTOR} || {one.text} < -{LARGEST_FACTOR}"
+            for factor in (left, right):
+                if factor.constant is None:
+                    large = f"{factor.text} > {LARGEST_FACTOR} || {factor.text} < -{LARGEST_FACTOR}"
                     self.fail_if(large, node, "a product of ints that may be beyond 2^63")
         constants, span, constant = (left.constant, right.constant), None, None
-        if op is not ast.Div and all(isinstance(one, (int, float)) for one in constants):
+        if op is not ast.Div and all(isinstance(constant, (int, float)) for constant in constants):
             constant = compute(*constants)
             span = (constant, constant)
         elif op is not ast.Div and left.span and right.span:
-            ends = [compute(one, other) for one in left.span for other in right.span]
+            ends = [compute(first, second) for first in left.span for second in right.span]
             span = (min(ends), max(ends))
         sign = sign_of(constant) or self._sign(node.op, left, right)
         text = f"{left.at(rank)} {mark} {right.at(rank + 1)}"
@@ -112,7 +112,7 @@ class Expressions(Core):
             return ">= 0" if isinstance(op, ast.Mult) and left.text == right.text else ""
         is_one_positive = "> 0" in (left.sign, right.sign)
         # A product of positive floats may underflow to 0, but not by a factor of 1 or more.
-        is_large = any(one.constant is not None and one.constant >= 1 for one in (left, right))
+        is_large = any(factor.constant is not None and factor.constant >= 1 for factor in (left, right))
         if isinstance(op, ast.Mult) and left.sign == right.sign == "> 0" and is_large:
             return "> 0"
         if isinstance(op, ast.Add):
@@ -120,7 +120,7 @@ class Expressions(Core):
         return ">= 0" if isinstance(op, (ast.Mult, ast.Div)) else ""
 
     def _divisor(self, node: ast.AST, value: Value) -> Value:
-        """Test a divisor, unless it cannot be 0."""
+        """Emit a test of a divisor unless it cannot be 0; return the divisor."""
         if value.sign and implies(value.sign, "not 0"):
             return value
         value = self.simple(value, "divisor")
@@ -130,7 +130,7 @@ class Expressions(Core):
         return value
 
     def _helped(self, node: ast.BinOp, left: Value, right: Value, kind: str) -> Value:
-        """Return a floor division, a remainder or a power."""
+        """Lower a floor division, a remainder or a power to a helper function."""
         name = HELPED[type(node.op)] + ("_int" if kind == "int" else "")
         if name != "power":
             right = self._divisor(node, right)
@@ -153,7 +153,7 @@ class Expressions(Core):
         if isinstance(node.op, ast.Not):
             value = self.truth(node.operand)
             if value.constant is not None:
-                return self.program.known(not value.constant)
+                return self.program.literal(not value.constant)
             if value.rank == EQUALITY and value.text.endswith(" != 0"):
                 return value._replace(text=value.text.removesuffix("!= 0") + "== 0")
             return value._replace(text=f"!{value.at(UNARY)}", rank=UNARY)
@@ -170,18 +170,19 @@ class Expressions(Core):
         return value._replace(text=text, rank=UNARY, sign=sign, span=span, constant=constant)
 
     def lower_compare(self, node: ast.Compare) -> Value:
-        op, other = type(node.ops[0]), node.comparators[0]
+        op, comparator = type(node.ops[0]), node.comparators[0]
         if len(node.ops) == 1 and op in (ast.Is, ast.IsNot):
-            return self._identity(node, op is ast.Is, other)
-        if len(node.ops) == 1 and op in (ast.In, ast.NotIn) and isinstance(other, (ast.Tuple, ast.List)):
+            return self._identity(node, op is ast.Is, comparator)
+        if len(node.ops) == 1 and op in (ast.In, ast.NotIn) and isinstance(comparator, (ast.Tuple, ast.List)):
             value = self.simple(self.number(node.left), "value")
             kind, joint = (ast.Eq, ast.Or) if op is ast.In else (ast.NotEq, ast.And)
             self.names["in"] = value
-            parts: list[ast.expr] = [ast.Compare(ast.Name("in"), [kind()], [one]) for one in other.elts]
+            name = ast.Name("in")
+            parts: list[ast.expr] = [ast.Compare(name, [kind()], [item]) for item in comparator.elts]
             return self.expression(ast.fix_missing_locations(ast.BoolOp(joint(), parts)))
         values = self.operands([node.left, *node.comparators])
         if len(values) > 2:
-            values[1:-1] = [self.simple(one, "middle") for one in values[1:-1]]
+            values[1:-1] = [self.simple(middle, "middle") for middle in values[1:-1]]
         parts_: list[Value] = []
         for mark, left, right in zip(node.ops, values, values[1:], strict=False):
             kinds = {left.type.kind, right.type.kind}
@@ -191,7 +192,7 @@ class Expressions(Core):
                 )
             text, compare = COMPARISONS[type(mark)]
             if left.constant is not None and right.constant is not None:
-                parts_.append(self.program.known(compare(left.constant, right.constant)))
+                parts_.append(self.program.literal(compare(left.constant, right.constant)))
                 continue
             if len(kinds) > 1:
                 left, right = self.as_float(left), self.as_float(right)
@@ -201,47 +202,47 @@ class Expressions(Core):
             parts_.append(Value(text, BOOL, rank, left.reads | right.reads, writes))
         return self._together(parts_, True)
 
-    def _identity(self, node: ast.Compare, is_same: bool, other: ast.expr) -> Value:
+    def _identity(self, node: ast.Compare, is_same: bool, comparator: ast.expr) -> Value:
         value = node.left
         if isinstance(value, ast.Call) and getattr(value.func, "id", "") == "type":
-            # Types are known here: `type(x) is float` spares Python a conversion that C does not need.
+            # `type(x) is float` saves Python a conversion. In C the type is known, so that it is a constant.
             kind = self.expression(value.args[0]).type.kind
-            return self.program.known((kind == getattr(other, "id", "")) == is_same)
-        found = self.names.get(getattr(value, "id", ""))
-        if found is None or found.length != "optional" or getattr(other, "value", 0) is not None:
+            return self.program.literal((kind == getattr(comparator, "id", "")) == is_same)
+        parameter = self.names.get(getattr(value, "id", ""))
+        if parameter is None or parameter.length != "optional" or getattr(comparator, "value", 0) is not None:
             raise self.refuse(node, "`is`", "`is None` of a parameter `float | None`")
-        return Value(f"{found.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
+        return Value(f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
 
     def _together(self, parts: list[Value], is_and: bool) -> Value:
         """Join conditions by `and` or `or`."""
-        if any(one.constant is not None and one.constant != is_and for one in parts):
-            place = next(
-                p for p, one in enumerate(parts) if one.constant is not None and one.constant != is_and
+        if any(part.constant is not None and part.constant != is_and for part in parts):
+            index = next(
+                i for i, part in enumerate(parts) if part.constant is not None and part.constant != is_and
             )
-            parts = parts[: place + 1] if any(one.writes for one in parts[:place]) else [parts[place]]
-        parts = [one for one in parts if one.constant is None or len(parts) == 1]
+            parts = parts[: index + 1] if any(part.writes for part in parts[:index]) else [parts[index]]
+        parts = [part for part in parts if part.constant is None or len(parts) == 1]
         if len(parts) < 2:
-            return parts[0] if parts else self.program.known(is_and)
+            return parts[0] if parts else self.program.literal(is_and)
         mark, rank = ("&&", AND) if is_and else ("||", OR)
-        text = f" {mark} ".join(one.at(rank if one.rank != AND else AND + 1 - is_and) for one in parts)
-        reads: Any = frozenset().union(*(one.reads for one in parts))
-        return Value(text, BOOL, rank, reads, frozenset().union(*(one.writes for one in parts)))
+        text = f" {mark} ".join(part.at(rank if part.rank != AND else AND + 1 - is_and) for part in parts)
+        reads: Any = frozenset().union(*(part.reads for part in parts))
+        return Value(text, BOOL, rank, reads, frozenset().union(*(part.writes for part in parts)))
 
     def lower_boolop(self, node: ast.BoolOp) -> Value:
-        is_and, parts, learnt = isinstance(node.op, ast.And), [], {}
-        for one in node.values:
+        is_and, parts, facts = isinstance(node.op, ast.And), [], {}
+        for operand in node.values:
             with self.captured() as lines:
-                self.facts |= learnt
-                value = self.truth(one)
+                self.facts |= facts
+                value = self.truth(operand)
             if lines and parts:
-                held = self.fresh("holds")
-                self.emit(f"bool {held} = {self._together(parts, is_and).text};")
-                self.emit(f"if ({held if is_and else f'!{held}'}) {{", *lines, f"{held} = {value.text};", "}")
-                parts = [Value(held, BOOL)]
+                flag = self.fresh("holds")
+                self.emit(f"bool {flag} = {self._together(parts, is_and).text};")
+                self.emit(f"if ({flag if is_and else f'!{flag}'}) {{", *lines, f"{flag} = {value.text};", "}")
+                parts = [Value(flag, BOOL)]
             else:
                 self.emit(*lines)
                 parts.append(value)
-            learnt |= self.facts_of(one, is_and)
+            facts |= self.facts_of(operand, is_and)
         return self._together(parts, is_and)
 
     def lower_ifexp(self, node: ast.IfExp) -> Value:
@@ -250,26 +251,26 @@ class Expressions(Core):
             return self.expression(node.body if test.constant else node.orelse)
         branches = []
         for branch, truth in ((node.body, True), (node.orelse, False)):
-            learnt = self.facts_of(node.test, truth)
+            facts = self.facts_of(node.test, truth)
             with self.captured() as lines:
-                self.facts |= learnt
+                self.facts |= facts
                 branches.append((self.expression(branch), lines))
-        (body, first), (other, second) = branches
+        (body, first), (orelse, second) = branches
         if body.type.kind == "text":
             return body
-        if {body.type.kind, other.type.kind} == {"int", "float"}:
-            body, other = self.as_float(body), self.as_float(other)
-        if body.type.kind != other.type.kind or body.type.kind not in ("int", "float", "bool"):
-            raise self.refuse(node, f"{body.type.kind} or {other.type.kind}", "two numbers of one type")
-        sign = common([body.sign, other.sign])
+        if {body.type.kind, orelse.type.kind} == {"int", "float"}:
+            body, orelse = self.as_float(body), self.as_float(orelse)
+        if body.type.kind != orelse.type.kind or body.type.kind not in ("int", "float", "bool"):
+            raise self.refuse(node, f"{body.type.kind} or {orelse.type.kind}", "two numbers of one type")
+        sign = common([body.sign, orelse.sign])
         type_ = body.type._replace(sign="", c_int="int64_t", is_index=False)
-        if not (first or second or body.fails or other.fails):
-            reads = test.reads | body.reads | other.reads
-            text = f"{test.at(OR)} ? {body.at(CHOICE + 1)} : {other.at(CHOICE)}"
-            return Value(text, type_, CHOICE, reads, test.writes | body.writes | other.writes, sign=sign)
+        if not (first or second or body.fails or orelse.fails):
+            reads = test.reads | body.reads | orelse.reads
+            text = f"{test.at(OR)} ? {body.at(CHOICE + 1)} : {orelse.at(CHOICE)}"
+            return Value(text, type_, CHOICE, reads, test.writes | body.writes | orelse.writes, sign=sign)
         name = self.fresh("choice")
         self.emit(f"{self.program.c_type(type_)} {name};", f"if ({test.text}) {{")
-        for value, lines, last in ((body, first, "} else {"), (other, second, "}")):
+        for value, lines, last in ((body, first, "} else {"), (orelse, second, "}")):
             self.emit(*lines, f"{name} = {value.text};")
             self.check(value)
             self.emit(last)

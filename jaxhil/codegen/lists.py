@@ -1,4 +1,4 @@
-"""Lists and loops: arrays of fixed length, views of them, samples of run-time length, indices."""
+"""Lowering of lists and loops: arrays of fixed length, views, samples of run-time length, indices."""
 
 import ast
 import re
@@ -12,19 +12,19 @@ from .subset import ATOM, FLOAT, INT, SUM, TEXT, Type, Value, implies
 
 
 class Loop(NamedTuple):
-    """Values that a loop goes through."""
+    """Iteration of a loop."""
 
-    start: str
-    stop: str
-    values: Callable[[str], list[Value]]  # of a pass, by its index
-    count: int | None = None  # passes, if the export knows them
+    start: str  # C text of the first index
+    stop: str  # C text of the index after the last
+    values: Callable[[str], list[Value]]  # values of an iteration, by its index
+    count: int | None = None  # number of iterations, if known at export
     step: int = 1
-    constants: tuple[Any, ...] = ()  # what it goes through, if the export knows it
+    constants: tuple[Any, ...] = ()  # values of all iterations, if known at export
 
 
 def is_text(values: tuple[Any, ...]) -> bool:
-    """Return whether constants are something else than numbers."""
-    return not all(isinstance(one, (int, float)) for one in values)
+    """Return whether some of the constants are not numbers."""
+    return not all(isinstance(value, (int, float)) for value in values)
 
 
 class Lists(Expressions):
@@ -43,37 +43,37 @@ class Lists(Expressions):
         return isinstance(node, (ast.List, ast.Tuple, ast.ListComp)) or is_product or called == "list"
 
     def array(self, node: ast.expr, target: Value | None, named: str = "") -> Value:
-        """Lower a list into an array, a new local one unless there is a target."""
+        """Lower a list to an array: the target, or a new local array if there is none."""
         if target is not None and target.type.length is None:
             self._fill(target.text, node, target.type)
             return target
-        name, known, failures = named or self.fresh("list"), self.function.reads, self.failures
+        name, reads_before, failures = named or self.fresh("list"), self.function.reads, self.failures
         self.function.reads = frozenset()
         with self.captured() as lines:
-            found = self._fill(name, node, target and target.type)
-        reads, self.function.reads = self.function.reads, self.function.reads | known
-        if target is not None and target.type.length != found.length:
-            raise self.refuse(node, f"{found.length} elements", f"a list of {target.type.length}")
+            type_ = self._fill(name, node, target and target.type)
+        reads, self.function.reads = self.function.reads, self.function.reads | reads_before
+        if target is not None and target.type.length != type_.length:
+            raise self.refuse(node, f"{type_.length} elements", f"a list of {target.type.length}")
         if target is not None and self.failures == failures and not target.reads & reads:
-            # Nothing reads the old list, or leaves a new one half done.
+            # The elements do not read the old list, and no failure leaves the new one incomplete.
             self.emit(*(re.sub(rf"\b{name}\b", target.text, line) for line in lines))
             self.function.taken.discard(name)
             return target
-        self.emit(f"{self.program.declaration(found, name)};", *lines)
-        made = Value(name, found, reads=frozenset({("local", name)}))
+        self.emit(f"{self.program.declaration(type_, name)};", *lines)
+        result = Value(name, type_, reads=frozenset({("local", name)}))
         if target is not None:
-            self.copy(target, made, node)
-        return made
+            self.copy(target, result, node)
+        return result
 
     def copy(self, target: Value, source: Value, node: ast.AST) -> None:
-        """Copy a list into another one."""
+        """Copy a list to another list."""
         length = source.type.length
         if length is None or target.type.length != length:
             raise self.refuse(
                 node, f"{length or 'any number of'} elements", f"a list of {target.type.length}"
             )
         with self._each(str(length)) as index:
-            left, right = (Value(f"{one.text}[{index}]", one.type.of) for one in (target, source))
+            left, right = (Value(f"{value.text}[{index}]", value.type.of) for value in (target, source))
             if left.type.kind == "list":
                 self.copy(left, right, node)
             else:
@@ -81,7 +81,7 @@ class Lists(Expressions):
 
     @contextmanager
     def _each(self, stop: str) -> Iterator[str]:
-        """Emit a loop about what is emitted in the context, and give its index."""
+        """Emit a loop around the lines that the context emits; yield its index."""
         index = self.fresh("i")
         self.emit(f"for (int64_t {index} = 0; {index} < {stop}; {index}++) {{")
         with self.captured() as lines:
@@ -94,13 +94,13 @@ class Lists(Expressions):
         """Fill the array `target` with the elements of a list; return its type."""
         if isinstance(node, (ast.List, ast.Tuple)):
             element, length = wanted and wanted.of, 0
-            for one in node.elts:
-                if isinstance(one, ast.Starred):
-                    part = self.expression(one.value)
-                    self.copy(Value(f"({target} + {length})", part.type), part, one)
+            for item in node.elts:
+                if isinstance(item, ast.Starred):
+                    part = self.expression(item.value)
+                    self.copy(Value(f"({target} + {length})", part.type), part, item)
                     element, length = part.type.of, length + (part.type.length or 0)
                 else:
-                    element, length = self._put(f"{target}[{length}]", one, element), length + 1
+                    element, length = self._put(f"{target}[{length}]", item, element), length + 1
             return Type("list", element or FLOAT, length)
         if isinstance(node, ast.ListComp):
             return self._comprehension(target, node, wanted)
@@ -129,18 +129,18 @@ class Lists(Expressions):
         return element
 
     def _comprehension(self, target: str, node: ast.ListComp, wanted: Type | None) -> Type:
-        one, loop = node.generators[0], self.loop(node.generators[0].iter)
-        if len(node.generators) > 1 or one.ifs or loop.count is None:
+        generator, loop = node.generators[0], self.loop(node.generators[0].iter)
+        if len(node.generators) > 1 or generator.ifs or loop.count is None:
             raise self.refuse(node, "this comprehension", "one `for` of known length without `if`")
         element, hidden = wanted and wanted.of, dict(self.names)
         if is_text(loop.constants):
-            for place, value in enumerate(loop.constants):
-                self.names[getattr(one.target, "id", "")] = self.program.known(value)
-                element = self._put(f"{target}[{place}]", node.elt, element)
+            for index, value in enumerate(loop.constants):
+                self.names[getattr(generator.target, "id", "")] = self.program.literal(value)
+                element = self._put(f"{target}[{index}]", node.elt, element)
         else:
             with self._each(str(loop.count)) as index:
                 values = loop.values(index if loop.start == "0" else f"{index} + {loop.start}")
-                self.names |= dict(zip(self.targets(one.target, len(values)), values, strict=True))
+                self.names |= dict(zip(self.targets(generator.target, len(values)), values, strict=True))
                 element = self._put(f"{target}[{index}]", node.elt, element)
         self.names = hidden
         return Type("list", element or FLOAT, loop.count)
@@ -148,29 +148,29 @@ class Lists(Expressions):
     def targets(self, node: ast.expr, count: int) -> list[str]:
         """Return the names that a loop binds."""
         targets = node.elts if isinstance(node, ast.Tuple) else [node]
-        if len(targets) != count or not all(isinstance(one, ast.Name) for one in targets):
+        if len(targets) != count or not all(isinstance(target, ast.Name) for target in targets):
             raise self.refuse(node, "this target", f"{count} names")
-        return [one.id for one in targets if isinstance(one, ast.Name)]
+        return [target.id for target in targets if isinstance(target, ast.Name)]
 
     def loop(self, node: ast.expr) -> Loop:
-        """Return what `for ... in` goes through."""
+        """Return the iteration of `for ... in` an expression."""
         called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
         if called == "range" and isinstance(node, ast.Call):
             return self._range(node)
         if called in ("zip", "enumerate") and isinstance(node, ast.Call):
-            loops = [self.loop(one) for one in node.args]
-            counts = {one.count for one in loops}
-            strict = any(one.arg == "strict" and getattr(one.value, "value", 0) for one in node.keywords)
+            loops = [self.loop(argument) for argument in node.args]
+            counts = {loop.count for loop in loops}
+            strict = any(k.arg == "strict" and getattr(k.value, "value", 0) for k in node.keywords)
             if None in counts or (strict and len(counts) > 1):
                 raise self.refuse(
                     node, f"{called} of lists of {counts} elements", "lists of one fixed length"
                 )
-            count = min(one for one in counts if one is not None)
-            parts = [one.values for one in loops]
+            count = min(number for number in counts if number is not None)
+            parts = [loop.values for loop in loops]
             if called == "enumerate":
                 parts.insert(0, lambda index: [Value(index, INT, sign=">= 0", span=(0, count - 1))])
             return Loop("0", str(count), lambda i: [value for part in parts for value in part(i)], count)
-        if isinstance(node, ast.Tuple) and all(isinstance(one, ast.Constant) for one in node.elts):
+        if isinstance(node, ast.Tuple) and all(isinstance(item, ast.Constant) for item in node.elts):
             value = Value("", TEXT, constant=ast.literal_eval(node))
         else:
             value = self.expression(node)
@@ -186,9 +186,9 @@ class Lists(Expressions):
 
     def _range(self, node: ast.Call) -> Loop:
         bounds = self.operands(node.args, self.number)
-        start = bounds[0] if len(bounds) > 1 else self.program.known(0)
+        start = bounds[0] if len(bounds) > 1 else self.program.literal(0)
         stop, step = bounds[min(1, len(bounds) - 1)], bounds[2].constant if len(bounds) > 2 else 1
-        if step not in (1, -1) or any(one.type.kind != "int" for one in bounds):
+        if step not in (1, -1) or any(bound.type.kind != "int" for bound in bounds):
             raise self.refuse(node, "this range", "a range of ints with the step 1 or -1")
         span, count = None, None
         if start.span and stop.span:
@@ -204,9 +204,9 @@ class Lists(Expressions):
         return Loop(start.text, stop.text, values, count, step)
 
     def at(self, value: Value, index: str) -> Value:
-        """Return the element of a list at an index that is in it."""
-        of, known = value.type.of, value.constant
-        span = (min(known), max(known)) if isinstance(known, tuple) and of.kind == "int" else None
+        """Return the element of a list at a valid index."""
+        of, constant = value.type.of, value.constant
+        span = (min(constant), max(constant)) if isinstance(constant, tuple) and of.kind == "int" else None
         sign = ">= 0" if span and span[0] >= 0 else of.sign
         return Value(f"{value.text}[{index}]", of, reads=value.reads, sign=sign, span=span)
 
@@ -218,7 +218,7 @@ class Lists(Expressions):
             return self._slice(node, value, node.slice)
         index = self.number(node.slice)
         if isinstance(value.constant, tuple) and index.constant is not None:
-            return self.program.known(value.constant[index.constant])
+            return self.program.literal(value.constant[index.constant])
         if value.type.kind != "list" or index.type.kind != "int":
             raise self.refuse(node, f"[...] of a {value.type.kind}", "an int index into a list")
         return self.at(value, self._index(node, value, index))
@@ -241,7 +241,7 @@ class Lists(Expressions):
         return index.text if is_above else f"{index.text} < 0 ? {index.text} + {length} : {index.text}"
 
     def _field(self, node: ast.Subscript, value: Value) -> Value:
-        texts = {name: one.constant for name, one in self.names.items() if one.type.kind == "text"}
+        texts = {name: value.constant for name, value in self.names.items() if value.type.kind == "text"}
         try:
             code = compile(ast.Expression(node.slice), self.function.file, "eval")
             key = eval(code, {"__builtins__": {}}, texts)
@@ -252,7 +252,7 @@ class Lists(Expressions):
 
     def _slice(self, node: ast.Subscript, value: Value, part: ast.Slice) -> Value:
         length, ends = value.type.length, (part.lower, part.upper)
-        bounds = [None if one is None else self.number(one).constant for one in ends]
+        bounds = [None if end is None else self.number(end).constant for end in ends]
         is_known = all(end is None or bound is not None for end, bound in zip(ends, bounds, strict=True))
         if length is None or part.step is not None or not is_known:
             raise self.refuse(node, "this slice", "constant bounds, of a list of fixed length")

@@ -1,4 +1,4 @@
-"""Layout of the C text: comments, indentation, long lines, and helpers that stand for Python's operators."""
+"""Layout of the C text (comments, indentation, long lines), and helpers for Python's operators."""
 
 import inspect
 import re
@@ -6,9 +6,9 @@ import textwrap
 from collections.abc import Iterable
 
 WIDTH = 116
-# Each is printed only if something needs it, with the prefix for @.
+# Functions that are printed only if used; @ stands for the prefix.
 HELPERS = {
-    # Without volatile a compiler makes other products of constant exponents.
+    # Without volatile, compilers replace powers with constant exponents by products that round differently.
     "power": """double @power(double base, double exponent) {
 const volatile double exact = exponent;
 return pow(base, exact);
@@ -40,12 +40,12 @@ return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
 
 
 def plain(text: str) -> str:
-    """Return a text that may stand in a comment: ASCII, without the marks of comments."""
+    """Return a text for a C comment: ASCII, without comment marks."""
     return text.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
 
 
 def comment(text: str | None) -> str:
-    """Return a docstring as a comment in C, "" if there is none."""
+    """Return a docstring as a C comment, "" if there is none."""
     lines = plain(inspect.cleandoc(text or "")).splitlines()
     if len(lines) < 2:
         return f"/* {lines[0]} */\n" if lines else ""
@@ -53,33 +53,33 @@ def comment(text: str | None) -> str:
 
 
 def indented(lines: Iterable[str]) -> str:
-    """Return lines indented by their braces, and broken where they are too long."""
-    depth, found = 0, []
+    """Return the lines as text, indented by their braces and broken where too long."""
+    depth, result = 0, []
     for line in lines:
         depth -= line.startswith("}")
-        found.append(_broken("    " * depth + line))
+        result.append(_broken("    " * depth + line))
         depth += line.endswith("{")
-    return "\n".join(found) + "\n"
+    return "\n".join(result) + "\n"
 
 
 def _broken(line: str) -> str:
-    """Break a long line behind a comma or before an operator, where the fewest parentheses are open."""
+    """Break a long line after a comma or before an operator, where the fewest parentheses are open."""
     indent = " " * (len(line) - len(line.lstrip()))
     if len(line) <= WIDTH:
         return line
     if line.lstrip().startswith("/*"):
         return "\n".join(textwrap.wrap(line, WIDTH, initial_indent="", subsequent_indent=f"{indent} * "))
-    places, depth = [], 0
-    for place, character in enumerate(line[:WIDTH]):
+    breaks, depth = [], 0
+    for index, character in enumerate(line[:WIDTH]):
         depth += {"(": 1, ")": -1}.get(character, 0)
-        is_place = line[place - 1 : place + 1] == ", " or re.match(r" (&&|\|\||[-+*/?:]) ", line[place:])
-        if is_place and place > len(indent) + 12:
-            places.append((-depth, place))
-    if not places:
+        is_break = line[index - 1 : index + 1] == ", " or re.match(r" (&&|\|\||[-+*/?:]) ", line[index:])
+        if is_break and index > len(indent) + 12:
+            breaks.append((-depth, index))
+    if not breaks:
         return line
-    place = max(places)[1]
+    index = max(breaks)[1]
     return (
-        line[:place].rstrip()
+        line[:index].rstrip()
         + "\n"
-        + _broken(indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[place:].lstrip())
+        + _broken(indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip())
     )

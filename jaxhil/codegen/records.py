@@ -1,4 +1,4 @@
-"""Classes as structs: names, attributes and their types, lists of run-time length."""
+"""Lowering of classes to structs: names, attributes and their types, lists of run-time length."""
 
 import ast
 import inspect
@@ -16,17 +16,15 @@ if TYPE_CHECKING:
 
 
 class Records:
-    """Structs of a program."""
+    """Structs of a C program."""
 
-    known: Callable[[Any], Value]
+    literal: Callable[[Any], Value]
 
     def __init__(self, prefix: str, names: Mapping[type, str], bindings: Mapping[type, type]) -> None:
         self.prefix, self.names, self.bindings = prefix, names, bindings
         self.fields: dict[type, dict[str, Type]] = {}
         self.samples: dict[type, list[str]] = {}  # lists of run-time length
-        self.owned: dict[
-            type, dict[str, str]
-        ] = {}  # samples that a class keeps for its parts, and their keys
+        self.owned: dict[type, dict[str, str]] = {}  # arrays of samples for parts of a class, and their keys
         self.changed_in_place: frozenset[Any] = frozenset()
         self.shared: list[tuple[frozenset[Any], SubsetError]] = []  # lists that two attributes share
         self.enumerators: Mapping[str, int] = {}
@@ -54,11 +52,11 @@ class Records:
         return f"{name}_" if name in RESERVED else name
 
     def class_of(self, function: Any, node: ast.expr) -> type | None:
-        """Return the class that a call constructs in place, None if it constructs none."""
+        """Return the class that a call constructs in place, None if there is none."""
         called = node.func if isinstance(node, ast.Call) else None
-        found = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
-        is_own = inspect.isclass(found) and not issubclass(found, tuple) and found.__module__ != "builtins"
-        return found if is_own else None
+        value = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
+        is_class = inspect.isclass(value) and not issubclass(value, tuple) and value.__module__ != "builtins"
+        return value if is_class else None
 
     def field(self, body: "Core", value: Value, name: str, node: ast.AST) -> Value:
         """Return an attribute of an object."""
@@ -73,7 +71,7 @@ class Records:
             return constant
         type_ = type_ or self.field_type(body, value.type, name, node)
         parts = self.samples_in(type_.of) if type_.kind == "object" else ()
-        samples = tuple(self._access(value, f"{plain}_{one}") for one in parts)
+        samples = tuple(self._access(value, f"{plain}_{part}") for part in parts)
         text = self._access(value, self._field_name(class_, name))
         return Value(text, type_, reads=value.reads | keys, sign=type_.sign, samples=samples)
 
@@ -82,61 +80,61 @@ class Records:
 
     def _field_name(self, class_: type, name: str) -> str:
         plain = name.lstrip("_")
-        others = {*self.fields.get(class_, {}), *getattr(class_, "__slots__", ())}
-        return self.local(plain if plain == name or plain not in others else f"{plain}_")
+        taken = {*self.fields.get(class_, {}), *getattr(class_, "__slots__", ())}
+        return self.local(plain if plain == name or plain not in taken else f"{plain}_")
 
     def _class_constant(self, class_: type, name: str) -> Value | None:
-        """Return an attribute that only the class has."""
+        """Return a constant attribute of the class, None if there is none or methods assign it."""
         static = inspect.getattr_static(class_, name, None)
         if not isinstance(static, (bool, int, float)):
             return None
-        owners = [one for one in class_.__mro__ if one.__module__ not in ("builtins", "typing")]
-        methods = [one for owner in owners for one in vars(owner).values() if inspect.isfunction(one)]
-        nodes = (node for one in methods for node in ast.walk(definition_of(one)[0]))
+        owners = [owner for owner in class_.__mro__ if owner.__module__ not in ("builtins", "typing")]
+        methods = [value for owner in owners for value in vars(owner).values() if inspect.isfunction(value)]
+        nodes = (node for method in methods for node in ast.walk(definition_of(method)[0]))
         if any(
-            isinstance(one, ast.Attribute) and one.attr == name and isinstance(one.ctx, ast.Store)
-            for one in nodes
+            isinstance(node, ast.Attribute) and node.attr == name and isinstance(node.ctx, ast.Store)
+            for node in nodes
         ):
             return None
         try:
-            source = inspect.getsource(next(one for one in owners if name in vars(one)))
+            source = inspect.getsource(next(owner for owner in owners if name in vars(owner)))
         except (OSError, TypeError):
             source = ""
         named = re.search(rf"^    {name}\b.*= ([A-Z_]+)$", source, re.MULTILINE)
         if named and self.enumerators.get(named[1]) == static:
             return Value(f"{self.prefix}{named[1]}".upper(), INT, constant=static)
-        return self.known(static)
+        return self.literal(static)
 
     def field_type(self, body: "Core", type_: Type, name: str, node: ast.AST) -> Type:
         """Return the annotated type of an attribute. Raise SubsetError if there is none."""
-        found = type_of_hint(self._hints(type_.of).get(name, ...), self.bindings)
-        if found is None:
+        hinted = type_of_hint(self._hints(type_.of).get(name, ...), self.bindings)
+        if hinted is None:
             what = f"{name} of {type_.of.__name__}, whose type is not known here"
             raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
-        return self.fields.setdefault(type_.of, {}).setdefault(name, found)
+        return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
 
     def _hints(self, class_: type) -> dict[str, Any]:
         return typing.get_type_hints(class_, include_extras=True)
 
     def known_field(self, body: "Core", owner: Value, target: ast.Attribute) -> Value | None:
-        """Return an attribute whose type is known already."""
+        """Return an attribute, None if its type is not known yet."""
         class_, name = owner.type.of, target.attr
         if owner.type.kind != "object":
             raise body.refuse(target, f"an attribute of a {owner.type.kind}", "an object")
-        known = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *self._hints(class_)}
-        return self.field(body, owner, name, target) if name in known else None
+        fields = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *self._hints(class_)}
+        return self.field(body, owner, name, target) if name in fields else None
 
     def new_field(self, body: "Core", owner: Value, target: ast.Attribute, type_: Type) -> Value:
-        """Return an attribute, which has this type if no annotation says more."""
-        known = self.known_field(body, owner, target)
-        if known is not None:
-            return known
+        """Return an attribute; its type is this one unless it is known already."""
+        field = self.known_field(body, owner, target)
+        if field is not None:
+            return field
         plain = type_._replace(sign="", is_index=False, c_int="int64_t")
         self.fields.setdefault(owner.type.of, {})[target.attr] = plain
         return self.field(body, owner, target.attr, target)
 
     def new_samples(self, body: "Core", owner: Value, target: ast.Attribute, count: Value) -> None:
-        """Take note of a list whose length only run time knows; test that it fits."""
+        """Record a list of run-time length; emit a test that it fits its capacity."""
         class_, name, plain = owner.type.of, target.attr, target.attr.lstrip("_")
         if body.function.node.name != "__init__" or owner.text != "self":
             raise body.refuse(target, "a list of a computed length", "one in `__init__`, or of fixed length")
@@ -159,8 +157,8 @@ class Records:
         return tuple(name.lstrip("_") for name in self.samples.get(class_, ()))
 
     def capacities(self, body: "Core", class_: type, target: Value, node: ast.Call) -> list[str]:
-        """Return a constructor's arguments for its lists: the array that the owner keeps, its capacity."""
-        first, key, found = node.args[0] if node.args else None, target.type.key, []
+        """Return a constructor's arguments for its lists: arrays of the owner and their capacities."""
+        first, key, arguments = node.args[0] if node.args else None, target.type.key, []
         if isinstance(first, ast.Subscript) and isinstance(first.slice, ast.Constant) and not key:
             key = str(first.slice.value)
         for name in self.samples_in(class_):
@@ -168,13 +166,13 @@ class Records:
                 raise body.refuse(
                     node, "a line of unknown length", "`Annotated[DelayLine, 'name of the gain']`"
                 )
-            kept = f"{target.text}_{name}"
-            self.owned.setdefault(body.function.owner, {})[kept.removeprefix("self->")] = key
-            found += [kept, f"{self.prefix}{key}_samples".upper()]
-        return found
+            array = f"{target.text}_{name}"
+            self.owned.setdefault(body.function.owner, {})[array.removeprefix("self->")] = key
+            arguments += [array, f"{self.prefix}{key}_samples".upper()]
+        return arguments
 
     def structs(self, owners: list[type]) -> str:
-        """Return the structs of all classes, each after those that it contains."""
+        """Return the structs of all classes, each one after the structs that it contains."""
         texts: dict[type, str] = {}
 
         def visit(class_: type) -> None:

@@ -1,4 +1,4 @@
-"""Sources of Python functions: syntax trees, comments, annotations, places of local names."""
+"""Sources of Python functions: syntax trees, comments, annotations, lines of local names."""
 
 import ast
 import inspect
@@ -29,15 +29,15 @@ def definition_of(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]:
     except (OSError, SyntaxError, ValueError):
         node = None
     if not isinstance(node, ast.FunctionDef):
-        place = f"{code.co_filename}:{code.co_firstlineno}"
+        location = f"{code.co_filename}:{code.co_firstlineno}"
         raise SubsetError(
-            f"{place}: found no source of {function.__qualname__}, expected a function in a file"
+            f"{location}: found no source of {function.__qualname__}, expected a function in a file"
         )
     return node, code.co_filename
 
 
 def hints_of(function: Callable[..., Any], protocol: type | None) -> dict[str, Any]:
-    """Return the annotations of a function; what a protocol says of its methods comes first."""
+    """Return the annotations of a function; those of the protocol's method take precedence."""
     method = vars(protocol).get(function.__name__) if protocol is not None else None
     method = method.fget if isinstance(method, property) else method
     more = typing.get_type_hints(method, include_extras=True) if inspect.isfunction(method) else {}
@@ -45,34 +45,34 @@ def hints_of(function: Callable[..., Any], protocol: type | None) -> dict[str, A
 
 
 def comment_before(file: str, statement: ast.stmt) -> str:
-    """Return the comment right above a statement, without its marks."""
-    found, line = "", statement.lineno - 1
+    """Return the comment directly above a statement, without its marks."""
+    comment, line = "", statement.lineno - 1
     while (text := linecache.getline(file, line).strip()).startswith("#"):
-        found, line = f"{text.lstrip('# ')} {found}", line - 1
-    return found.strip()
+        comment, line = f"{text.lstrip('# ')} {comment}", line - 1
+    return comment.strip()
 
 
 def constant_comment(name: str, namespace: dict[str, Any]) -> str:
-    """Return the comment behind the assignment of a module's constant, "" if there is none."""
+    """Return the comment after the assignment of a module's constant, "" if there is none."""
     file = getattr(sys.modules.get(namespace["__name__"]), "__file__", None)
     for node in tree_of(file).body if file else []:
-        if isinstance(node, ast.ImportFrom) and any(one.name == name for one in node.names):
+        if isinstance(node, ast.ImportFrom) and any(alias.name == name for alias in node.names):
             package = namespace["__name__"].rsplit(".", node.level)[0] + "." if node.level else ""
             module = sys.modules.get(f"{package}{node.module}")
             return constant_comment(name, vars(module)) if module else ""
-        if isinstance(node, ast.Assign) and name in (getattr(one, "id", "") for one in node.targets):
+        if isinstance(node, ast.Assign) and name in (getattr(target, "id", "") for target in node.targets):
             line = linecache.getline(file or "", node.end_lineno or 0)
             return line[node.end_col_offset or 0 :].partition("#")[2].strip()
     return ""
 
 
 def places_of(function: ast.FunctionDef) -> dict[str, list[tuple[int, bool]]]:
-    """Return the lines where each local name occurs, and whether the line assigns it."""
-    bound = [one.target for one in ast.walk(function) if isinstance(one, (ast.For, ast.comprehension))]
-    loops = {id(name) for target in bound for name in ast.walk(target)}
-    found: dict[str, list[tuple[int, bool]]] = {}
+    """Return the lines in which each local name occurs, and whether they assign it."""
+    targets = [loop.target for loop in ast.walk(function) if isinstance(loop, (ast.For, ast.comprehension))]
+    loops = {id(name) for target in targets for name in ast.walk(target)}
+    result: dict[str, list[tuple[int, bool]]] = {}
     for node in ast.walk(function):
         if isinstance(node, ast.Name):
             is_store = isinstance(node.ctx, ast.Store) and id(node) not in loops
-            found.setdefault(node.id, []).append((node.lineno, is_store))
-    return {name: sorted(places) for name, places in found.items() if any(store for _, store in places)}
+            result.setdefault(node.id, []).append((node.lineno, is_store))
+    return {name: sorted(places) for name, places in result.items() if any(store for _, store in places)}

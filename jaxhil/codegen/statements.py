@@ -1,4 +1,4 @@
-"""Statements: assignments, branches, loops, exceptions."""
+"""Lowering of statements: assignments, branches, loops, exceptions."""
 
 import ast
 from typing import TYPE_CHECKING
@@ -76,11 +76,11 @@ class Body(Calls):
 
     def _unpack(self, node: ast.Assign, target: ast.Tuple) -> None:
         if isinstance(node.value, ast.Tuple):
-            values = [self.expression(one) for one in node.value.elts]
-            stored = {getattr(one, "id", getattr(one, "attr", "")) for one in target.elts}
-            used = {getattr(one, "id", getattr(one, "attr", "")) for one in ast.walk(node.value)}
-            if stored & used or any(one.writes for one in values):
-                values = [self.temporary(one, "value") if one.is_number else one for one in values]
+            values = [self.expression(element) for element in node.value.elts]
+            stored = {getattr(target, "id", getattr(target, "attr", "")) for target in target.elts}
+            used = {getattr(node, "id", getattr(node, "attr", "")) for node in ast.walk(node.value)}
+            if stored & used or any(value.writes for value in values):
+                values = [self.temporary(value, "value") if value.is_number else value for value in values]
         else:
             value = self.expression(node.value)
             if value.type.kind != "list" or value.type.length is None:
@@ -88,11 +88,11 @@ class Body(Calls):
             values = [self.at(value, str(index)) for index in range(value.type.length)]
         if len(values) != len(target.elts):
             raise self.refuse(node, f"{len(target.elts)} targets for {len(values)} values", "as many")
-        for one, value in zip(target.elts, values, strict=True):
-            if value.type.kind in ("object", "list") and isinstance(one, ast.Name):
-                self._alias(node, one, value)
+        for element, value in zip(target.elts, values, strict=True):
+            if value.type.kind in ("object", "list") and isinstance(element, ast.Name):
+                self._alias(node, element, value)
             else:
-                self._store(node, one, value)
+                self._store(node, element, value)
 
     def _assign(self, node: ast.stmt, target: ast.expr, source: ast.expr, wanted: Type | None = None) -> None:
         class_ = self.program.class_of(self.function, source)
@@ -140,8 +140,8 @@ class Body(Calls):
             field = self.program.known_field(self, owner, target)
             if field is None:
                 with self.captured():
-                    found = self.array(source, None).type
-                field = self.program.new_field(self, owner, target, found)
+                    type_ = self.array(source, None).type
+                field = self.program.new_field(self, owner, target, type_)
         if field is None or field.type.kind != "list":
             raise self.refuse(node, "a list for an element", "a number")
         self.array(source, field)
@@ -156,8 +156,8 @@ class Body(Calls):
             value = self.temporary(value, self.hint_of(target))
         if isinstance(target, ast.Attribute):
             owner = self.expression(target.value)
-            known = self.program.known_field(self, owner, target)
-            field = known or self.program.new_field(self, owner, target, value.type)
+            existing = self.program.known_field(self, owner, target)
+            field = existing or self.program.new_field(self, owner, target, value.type)
         elif isinstance(target, ast.Subscript):
             field = self.expression(target)
         else:
@@ -172,11 +172,11 @@ class Body(Calls):
             self.facts[field.text] = Fact(value.sign, field.reads)
 
     def _emit_store(self, node: ast.stmt, field: Value, value: Value) -> None:
-        wanted, found = field.type, value.type
-        if (wanted.kind, wanted.of) != (found.kind, found.of) and not (
+        wanted, source = field.type, value.type
+        if (wanted.kind, wanted.of) != (source.kind, source.of) and not (
             wanted.kind == "float" and value.is_number
         ):
-            raise self.refuse(node, f"a {found.kind} for a {wanted.kind}", "one type for each name")
+            raise self.refuse(node, f"a {source.kind} for a {wanted.kind}", "one type for each name")
         if wanted.sign and not (value.sign and implies(value.sign, wanted.sign)):
             raise self.refuse(node, "a number of unknown sign", f"one that is {wanted.sign}")
         text = self.program.stored(wanted, value)
@@ -189,8 +189,8 @@ class Body(Calls):
             self.emit(f"{field.text} = {text};")
 
     def _store_name(self, node: ast.stmt, name: str, value: Value, wanted: Type | None) -> None:
-        text, known = self.program.local(name), self.names.get(name)
-        if known is None:
+        text, existing = self.program.local(name), self.names.get(name)
+        if existing is None:
             places = self.function.places[name]
             type_ = wanted or value.type._replace(c_int="int64_t", sign="")
             declared = f"{self.program.c_type(type_)} {text}"
@@ -207,14 +207,14 @@ class Body(Calls):
                 self.emit(f"{text} = {self.program.stored(type_, value)};")
             self.names[name] = Value(text, type_, sign=type_.sign, span=value.span if is_once else None)
         else:
-            self._emit_store(node, known._replace(text=text), value)
+            self._emit_store(node, existing._replace(text=text), value)
         self.check(value)
         self.facts.pop(text, None)
         if value.sign:
             self.facts[text] = Fact(value.sign)
 
     def changed(self, field: Value, in_place: bool) -> None:
-        """Take note of an assignment to an attribute or an element."""
+        """Record an assignment to an attribute or an element."""
         self.note(field.reads)
         self.function.changes |= {name for kind, name in field.reads if kind == "parameter"}
         if in_place:
@@ -223,11 +223,11 @@ class Body(Calls):
                 raise self.function.shared[key]
 
     def share(self, node: ast.AST, target: Keys, value: Value) -> None:
-        """Take note of a list that an attribute shares with another name: none may change it in place."""
+        """Record a list that an attribute shares with another name; it must not change in place."""
         error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
         for key in value.reads:
             if key[0] == "parameter":
-                self.function.keeps[key[1]] = target
+                self.function.retained[key[1]] = target
             elif key[0] == "local":
                 self.function.shared[key] = error
             else:
@@ -315,7 +315,7 @@ class Body(Calls):
             self.names[name] = value
         self.block(node.body)
         self.emit("}")
-        self.names = {k: one for k, one in self.names.items() if k not in names} | {
+        self.names = {k: value for k, value in self.names.items() if k not in names} | {
             name: hidden[name] for name in names if name in hidden
         }
         self.facts = {}
@@ -339,13 +339,13 @@ class Body(Calls):
         return True
 
     def do_try(self, node: ast.Try) -> bool:
-        """Lower one call whose exceptions are caught."""
+        """Lower a call whose exceptions are caught."""
         statement = node.body[0]
         if len(node.body + node.handlers) != 2 or node.orelse or node.finalbody:
             raise self.refuse(node, "this try", "one call in it and one `except Exception`")
         if not isinstance(statement, (ast.Assign, ast.Return)) or not isinstance(statement.value, ast.Call):
             raise self.refuse(node, "this try", "`name = call(...)` or `return call(...)` in it")
-        function, failures, place = self.function, self.failures, len(self.lines)
+        function, failures, position = self.function, self.failures, len(self.lines)
         before = function.error, function.fails, function.reason
         flag = self.fresh("failed")
         function.error = f"&{flag}"
@@ -355,7 +355,7 @@ class Body(Calls):
         function.error, function.fails, function.reason = before
         fails, value = value.fails, value._replace(fails=False)
         if fails:
-            self.lines.insert(place, f"bool {flag} = false;")
+            self.lines.insert(position, f"bool {flag} = false;")
             if isinstance(statement, ast.Return):
                 value = self.temporary(value, "value")
         if isinstance(statement, ast.Assign):

@@ -1,7 +1,7 @@
-"""Types of the subset of Python, values of expressions, refusals.
+"""Types of the subset of Python, values of expressions, and the error for other constructs.
 
 A float is a `double`, an int an `int64_t`; a list has a fixed length, or a capacity that its owner states; a
-class is a struct. Text (`str`) is for readers of Python: what has that type does not exist in C. Annotations:
+class is a struct. Values of type `str` have no equivalent in C and are omitted. Annotations:
 
     Annotated[float, ">= 0"]            never below 0, checked wherever it is assigned (also "> 0")
     Annotated[int, "index"]             trusted as an index: not tested against the length of the list
@@ -10,8 +10,8 @@ class is a struct. Text (`str`) is for readers of Python: what has that type doe
     Annotated[DelayLine, "lag"]         its samples have the capacity JAXHIL_LAG_SAMPLES
 
 Exceptions of Python become an error flag: a function that may raise tests the operands (divisors, square
-roots, indices, conversions to int) and returns at once. Sums of ints are not tested: counting does not reach
-2^63.
+roots, indices, conversions to int) and returns at once. Sums of ints are not tested, because counts do not
+reach 2^63.
 """
 
 import types
@@ -29,7 +29,7 @@ RESERVED = frozenset(
 
 
 class SubsetError(ValueError):
-    """A construct that has no C: one line with file, line, what was found and what to write instead."""
+    """Error for a construct outside the subset: one line with file, line, what was found and expected."""
 
 
 class Type(NamedTuple):
@@ -37,8 +37,8 @@ class Type(NamedTuple):
 
     kind: str  # float, int, bool, text, none, list, object, record, struct (of gains or limits), optional
     of: Any = None  # element type of a list, class of an object or record, name of a struct
-    length: int | None = None  # of a list; None if only run time knows it
-    sign: str = ""  # of a number: "> 0", ">= 0", "not 0" (what is not a number has every sign), or unknown
+    length: int | None = None  # of a list; None if known only at run time
+    sign: str = ""  # of a number: "> 0", ">= 0", "not 0" (NaN has every sign), or unknown
     c_int: str = "int64_t"  # type of an int in C
     key: str = ""  # of an object with samples: the gain or limit that sizes them
     is_index: bool = False  # of an int: trusted as an index
@@ -49,43 +49,43 @@ Keys = frozenset[tuple[Any, str]]  # attributes, local lists and parameters: own
 
 
 class Value(NamedTuple):
-    """An expression in C."""
+    """Expression in C."""
 
-    text: str
+    text: str  # C text
     type: Type
     rank: int = ATOM  # precedence of its operator in C
     reads: Keys = frozenset()
-    writes: Keys = frozenset()  # what evaluating it changes
-    fails: bool = False  # whether the error flag has to be looked at afterwards
+    writes: Keys = frozenset()  # what its evaluation changes
+    fails: bool = False  # whether the error flag must be tested afterwards
     sign: str = ""
-    span: tuple[Any, Any] | None = None  # least and largest value, if the export knows them
-    below: str = ""  # C text of the length that a loop's index stays below
-    constant: Any = None  # the value, if the export knows it
+    span: tuple[Any, Any] | None = None  # least and largest value, if known at export
+    below: str = ""  # C text of a length above a loop's index
+    constant: Any = None  # value, if known at export
     is_pointer: bool = False  # of an object: the text is a pointer
     samples: tuple[str, ...] = ()  # of an object: C texts of its lists of run-time length
-    length: str = ""  # of a list of run-time length: C text of it
+    length: str = ""  # of a list of run-time length: C text of the length
 
     def at(self, rank: int) -> str:
-        """Return the text, in parentheses if its operator binds less than `rank`."""
+        """Return the text, in parentheses if its operator has a lower precedence than `rank`."""
         return self.text if self.rank >= rank else f"({self.text})"
 
     @property
     def is_number(self) -> bool:
-        """Return whether it is a float or an int."""
+        """Return whether the value is a float or an int."""
         return self.type.kind in ("float", "int")
 
 
 def type_of_hint(hint: Any, bindings: Mapping[Any, Any]) -> Type | None:
-    """Return the type of an annotation, None if it has no meaning in C."""
+    """Return the type of an annotation, None if it has no equivalent in C."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        found = type_of_hint(arguments[0], bindings)
-        return found and _noted(found, arguments[1:])
+        type_ = type_of_hint(arguments[0], bindings)
+        return type_ and _noted(type_, arguments[1:])
     hint = bindings.get(hint, hint) if isinstance(hint, type) else hint
     simple = {float: FLOAT, int: INT, bool: BOOL, str: TEXT, None: NONE, type(None): NONE}
     if hint is None or (isinstance(hint, type) and hint in simple):
         return simple[hint]
-    if origin is tuple and arguments and all(one is float for one in arguments):
+    if origin is tuple and arguments and all(argument is float for argument in arguments):
         return Type("list", FLOAT, len(arguments))
     if origin in (list, Sequence):
         element = type_of_hint(arguments[0], bindings)
@@ -99,19 +99,19 @@ def type_of_hint(hint: Any, bindings: Mapping[Any, Any]) -> Type | None:
     return None
 
 
-def _noted(found: Type, notes: Sequence[Any]) -> Type:
-    for place, note in enumerate(notes):
+def _noted(type_: Type, notes: Sequence[Any]) -> Type:
+    for index, note in enumerate(notes):
         if isinstance(note, int):
-            inner = found.of if place + 1 == len(notes) else _noted(found.of, notes[place + 1 :])
-            return found._replace(length=note, of=inner)
+            inner = type_.of if index + 1 == len(notes) else _noted(type_.of, notes[index + 1 :])
+            return type_._replace(length=note, of=inner)
         if note in (">= 0", "> 0"):
-            found = found._replace(sign=note)
+            type_ = type_._replace(sign=note)
         elif note == "index":
-            found = found._replace(is_index=True)
+            type_ = type_._replace(is_index=True)
         else:
-            name = {"int": "c_int", "object": "key", "struct": "of"}[found.kind]
-            found = found._replace(**{name: note})
-    return found
+            name = {"int": "c_int", "object": "key", "struct": "of"}[type_.kind]
+            type_ = type_._replace(**{name: note})
+    return type_
 
 
 def sign_of(value: Any) -> str:
@@ -122,10 +122,10 @@ def sign_of(value: Any) -> str:
 
 
 def implies(sign: str, wanted: str) -> bool:
-    """Return whether a number of one sign has the other one too."""
+    """Return whether every number of one sign also has the wanted sign."""
     return wanted in ("", sign) or sign == "> 0"
 
 
 def common_sign(signs: Sequence[str]) -> str:
-    """Return the sign that follows from each of these."""
-    return next((s for s in ("> 0", ">= 0", "not 0") if all(one and implies(one, s) for one in signs)), "")
+    """Return the strongest sign that all these signs imply, "" if there is none."""
+    return next((s for s in ("> 0", ">= 0", "not 0") if all(sign and implies(sign, s) for sign in signs)), "")
