@@ -1,4 +1,4 @@
-"""`jaxhil.simulate` of a mechanism of one axis or of six."""
+"""`jaxhil.simulate` for mechanisms of one axis or of six axes."""
 
 import os
 from collections.abc import Mapping
@@ -33,15 +33,21 @@ def simulate(
     *,
     seed: int = 0,
 ) -> Any:
-    """Run the contacts of a mechanism once, as it is nominally; of six axes its episodes.
+    """Run the contacts of a nominal mechanism once; with six axes, its episodes.
 
-    `mechanism` is what `jaxhil.load` returns, the name of a built-in one, or a path. `compensator` is a law's
-    name; in six axes "none", "phase_lead" or "phase_lead_per_axis". `gains` is None (what the literature's
-    rules say), a dict of some of them (the others are the literature's), the name of one of the law's
-    settings, or the path of a gain file; with a file, "none" stands for its law. `seed` is that of the
-    sensors' noise.
+    Args:
+        mechanism: Result of `jaxhil.load`, name of a built-in mechanism, or path.
+        compensator: Name of a compensator; with six axes "none", "phase_lead" or "phase_lead_per_axis".
+        gains: None for the literature's gains, a dict of some gains (the others are the literature's), the
+            name of one of the compensator's settings, or the path of a gain file; with a file, the
+            compensator "none" means that of the file.
+        seed: Seed of the sensors' noise.
 
-    Raises `InputError`, one line, for whatever is wrong with them.
+    Returns:
+        A `Run`, or a `SixAxisRun` for six axes.
+
+    Raises:
+        InputError: An argument is invalid.
     """
     checked = as_any_mechanism(mechanism)
     if isinstance(checked, SixAxisMechanism):

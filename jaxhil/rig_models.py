@@ -1,4 +1,4 @@
-"""Choice of the rig model that a mechanism needs: along one axis or in six."""
+"""Choice of the rig model for a mechanism: along one axis or in six."""
 
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
@@ -7,7 +7,7 @@ from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 def rig_model(mechanism: AnyMechanism) -> RigModel:
-    """Return the model of a mechanism's rig; imports six axes only where they are needed.
+    """Return the rig model for a mechanism; six-axis code is imported only if needed.
 
     Example:
         >>> import jaxhil

@@ -16,7 +16,7 @@ from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.contact_plot import STYLES, contact_plot, save
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.motion import Curve, Piece, _in_space
+from jaxhil.simulation.motion import Curve, Piece, _ideal_curves
 from jaxhil.simulation.outcome import Outcome, parameters_by_slot
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.pareto import Front, Point
@@ -200,7 +200,7 @@ def test_motion_in_space_is_the_reference(name):
     scenarios = build_scenarios(mechanism, {"approach.phase": np.full(1, 0.5)})
     velocity = 0.007
     until = Curve(velocity, np.array([0.4]), np.zeros(1), np.zeros(1), None, None)
-    (curve,) = _in_space(mechanism, scenarios, [until])
+    (curve,) = _ideal_curves(mechanism, scenarios, [until])
     contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
     like = jax.numpy.full(scenarios.phase.shape, velocity)
     of_law = jax.jit(LAWS[mechanism.contact.law].reference, compiler_options=QUICK)

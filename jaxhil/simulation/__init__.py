@@ -1,1 +1,1 @@
-"""The simulated loop: scenarios, one tick of the rig, whole runs, and what is said of each contact."""
+"""Simulation of the rig: scenarios, ticks, runs, and the metrics of each contact."""

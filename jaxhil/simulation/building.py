@@ -1,7 +1,7 @@
-"""From a mechanism and a compensator's name to the static `Loop` that serves a batch of scenarios.
+"""Construction of the static `Loop` of a mechanism and a compensator for a batch of scenarios.
 
-Only what shapes the program is decided here; delay lines are sized in powers of two, so that mechanisms with
-like delays share one compiled program.
+A `Loop` contains only what determines the compiled program. Delay lines have lengths that are powers of two,
+so that mechanisms with similar delays share one program.
 """
 
 import jax
@@ -14,11 +14,12 @@ from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_ce
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario
 
-SHORTEST_RING = 16
-# Greatest pole and contact frequency [rad per control period] at which samples say enough of what is between
-# them: peak force to 2e-3 and, where a lag or a dent lets the loop feel it, the restitution to 1e-5.
+SHORTEST_RING = 16  # samples; least length of a delay line
+# Greatest pole and contact frequency [rad per control period] for which samples suffice.
+# SLOW: the peak force is accurate to 2e-3.
+# SLOW_BETWEEN, for force sensors with a lag and laws with memory: the restitution is accurate to 1e-5.
 SLOW, SLOW_BETWEEN = (1.0, 0.1), (0.15, 0.05)
-DAMPED = 2.0  # a damper's rate b/M counts as so many times a frequency: its force jumps at the touch
+DAMPED = 2.0  # weight of a damper's rate b/M against a frequency, as its force jumps at the touch
 
 
 def build_loop(
@@ -29,11 +30,11 @@ def build_loop(
     chatter: bool = False,
     exact: bool = False,
 ) -> Loop:
-    """The loop of `mechanism` under the compensator called `compensator`, for all `scenarios` at once.
+    """Return the loop of `mechanism` with the compensator named `compensator`, for all `scenarios`.
 
-    `energies` asks for the works of the real force, `chatter` for the command's excess variation, `exact` for
-    restitution, peak force, duration and works to 1e-6 by the motion between samples, where others take what
-    samples say as long as that is enough, in a small part of the time.
+    `energies` records the mechanical work of the real force, `chatter` the command's excess variation.
+    `exact` computes restitution, peak force, duration and work to 1e-6 from the motion between samples.
+    Without it, the samples alone are used where they are accurate enough, which is several times faster.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator
@@ -42,7 +43,7 @@ def build_loop(
     aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
 
     def samples(delay) -> int:
-        """Read are samples up to the delay back, plus the interval under way and its start."""
+        """Return the length of a delay line that reaches `delay` [s] back, current interval included."""
         periods = float(np.max(delay / scenarios.control_period))
         return max(SHORTEST_RING, 1 << int(np.ceil(np.log2(periods + 4))))
 
@@ -78,8 +79,10 @@ def build_loop(
 
 
 def _cells(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts:
-    """Cells for the fastest pole and the shortest lag of any lane, at the longest period; none where what
-    samples say is enough."""
+    """Return the number of cells, or `NO_CELLS` if samples are accurate enough and `exact` is not set.
+
+    Cells are counted for the fastest pole and the shortest lag of any lane, at the longest control period.
+    """
     period = float(np.max(scenarios.control_period))
     fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
     lags = np.asarray(scenarios.force_sensor.time_constant) / period
@@ -92,12 +95,15 @@ def _cells(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts
 
 
 def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
-    """The largest frequency sqrt(F'/M) [rad/s] of a contact at its deepest, or rate F_d/(2 M) of its damping,
-    F_d the slope of the force against the rate at the touch; of any lane, entered at its first speed."""
-    # Whatever arrays the scenarios are of: slots and lanes meet here.
+    """Return the largest contact frequency [rad/s] of any lane, entered at the first approach's velocity.
+
+    This is sqrt(F'/M) at the greatest penetration, or 2 F_d/M if larger, where F_d is the slope of the force
+    against the penetration rate at the onset.
+    """
+    # NumPy broadcasts slots and lanes; JAX, of which the scenarios may be, would refuse it.
     law, contact = contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
-    if contact.stiffness.ndim > contact.damping.ndim:  # segments between slots and lanes
+    if contact.stiffness.ndim > contact.damping.ndim:  # (slots, segments, lanes): the stiffest segment
         contact = contact._replace(stiffness=np.max(contact.stiffness, axis=1))
     with np.errstate(all="ignore"):
         slope, damping = law.tangent_stiffness(contact, mass, velocity), law.onset_damping(contact)
@@ -106,6 +112,9 @@ def _fastest_contact(mechanism: Mechanism, scenarios: Scenario) -> float:
 
 
 def _first_break(numerator, hold: str) -> int:
-    """The relative degree of the motion simulator, and one more where the command itself has no jumps."""
+    """Return the order of the lowest derivative of the position that jumps at the ticks, at most 3.
+
+    It is the relative degree of the motion simulator, plus 1 if the command itself does not jump.
+    """
     proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
     return min((proper[0] if proper else 0) + (hold == "linear"), 3)

@@ -1,10 +1,10 @@
-"""Cells: short parts of a sampling interval, on each of which the mechanism's exact motion is a power series.
+"""Cells: short parts of a sampling interval, in each of which the motion is computed as a power series.
 
-A sampling interval has two parts: up to the instant at which the force is sampled, and the rest. Each part is
-cut into cells of at most one radian of the motion simulator's fastest pole, on which a Taylor series of the
-exact response is exact to rounding. A force sensor that lags by much less than a
-control period forgets all but a short window before its sample: that window has cells of its own, each at
-most one time constant long. How many cells there are is static; where they lie depends on the lane.
+A sampling interval has two parts: before and after the instant at which the force is sampled. Each part is
+divided into cells of at most one radian of the motion simulator's fastest pole. In a cell a Taylor series of
+the exact response is exact to rounding. A force sensor whose lag is much shorter than a control period
+depends only on a short window before its sample. This window has its own cells, each at most one time
+constant long. The number of cells is static; their positions depend on the lane.
 """
 
 import math
@@ -18,26 +18,24 @@ from jaxtyping import Array, Float
 
 from jaxhil.simulation.motion_simulator import State, exponential, generator_rows
 
-FASTEST_POLE = 64.0  # rad per control period, of the motion simulator: so far its exponential is exact
-# Powers of a series by the longest cell [rad of the fastest pole]: what is left out is below 1e-13.
+FASTEST_POLE = 64.0  # rad per control period; up to it the motion simulator's matrix exponential is exact
+# Degree of the series by the longest cell [rad of the fastest pole]; the error is below 1e-13.
 DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
-SLACK = 1e-3  # by which a cell may be longer than stated
+SLACK = 1e-3  # relative excess of a cell over its greatest length
 WINDOW = 40.0  # time constants; exp(-40) is below rounding
-
-
-INSTANT = 1e-12  # control periods; a lag that is shorter is none
+INSTANT = 1e-12  # control periods; a shorter lag counts as no lag
 
 
 class CellCounts(NamedTuple):
-    """How many cells each of the two parts of a sampling interval has; static."""
+    """Number of cells in each of the two parts of a sampling interval; static."""
 
-    plain: int  # in the part, or in what is left of it before the window of a lagging force sensor
+    plain: int  # in the part, or in its rest before the window of a lagging force sensor
     window: int  # in the window of a lagging force sensor; 0 without one
-    degree: int  # of the series of the motion in a cell
+    degree: int  # degree of the power series of the motion in a cell
 
     @property
     def part(self) -> int:
-        """Number of cells of a part."""
+        """Return the number of cells of a part."""
         return self.plain + self.window
 
 
@@ -45,21 +43,20 @@ NO_CELLS = CellCounts(0, 0, 0)
 
 
 class Cells(NamedTuple):
-    """Tables of a lane's cells, those of the first part before those of the second."""
+    """Tables of a lane's cells; those of the first part come before those of the second."""
 
     begin: Float[Array, "cells *batch"]  # start of a cell in the sampling interval [periods]
-    length: Float[Array, "cells *batch"]  # of a cell [periods]
+    length: Float[Array, "cells *batch"]  # length of a cell [periods]
     rest: Float[Array, "cells *batch"]  # from a cell's end to the end of its part [periods]
-    states: Float[
-        Array, "order cells columns *batch"
-    ]  # rows of the motion simulator's state at a cell's start
-    # rows of the coefficients of tau^j, tau the time since the cell's start [periods], for (state, command,
-    # growth of the command in a period)
+    # rows that give the motion simulator's state at a cell's start
+    states: Float[Array, "order cells columns *batch"]
+    # rows that give the coefficients of tau^j, with tau the time since the cell's start [periods], from
+    # (state, command, growth of the command in a period)
     series: Float[Array, "powers columns *batch"]
 
 
 class Course(NamedTuple):
-    """What the motion within a sampling interval follows from."""
+    """Inputs that determine the motion within a sampling interval."""
 
     state: State  # of the motion simulator at the interval's start
     start: Float[Array, "*batch"]  # command at the interval's start [m]
@@ -68,8 +65,12 @@ class Course(NamedTuple):
 
 
 def count_cells(fastest: float, lags: Any) -> CellCounts:
-    """Return the number of cells for poles up to `fastest` [rad per period] and force sensors' time constants
-    `lags` [periods]. Counts are powers of two, so that mechanisms share compiled programs."""
+    """Return the number of cells; counts are powers of two, so that mechanisms share compiled programs.
+
+    Args:
+        fastest: Fastest pole [rad per period].
+        lags: Time constants of the force sensors [periods].
+    """
     lags = np.asarray(lags)
     plain, window = _power_of_two(fastest), 0
     if np.any(lags > 0):
@@ -87,14 +88,14 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
 
 
 def join_counts(counts: Sequence[CellCounts]) -> CellCounts:
-    """Return the number of cells that serves mechanisms with these."""
-    every = [one for one in counts if one.part]
-    if not every:
+    """Return the number of cells that suffices for all mechanisms with these counts."""
+    used = [count for count in counts if count.part]
+    if not used:
         return NO_CELLS
-    plain, window, degree = (max(numbers) for numbers in zip(*every, strict=True))
-    if window and any(one.plain or not one.window for one in counts):
-        # Lanes whose window is the whole part have one beside it now, and the others need theirs.
-        plain = max(one.plain or one.window for one in every)
+    plain, window, degree = (max(numbers) for numbers in zip(*used, strict=True))
+    if window and any(count.plain or not count.window for count in counts):
+        # Lanes whose window was the whole part now have plain cells too; the others keep their window.
+        plain = max(count.plain or count.window for count in used)
         window = max(window, _power_of_two(WINDOW))
     return CellCounts(plain, window, degree)
 
@@ -112,7 +113,7 @@ def fastest_pole(denominator: Any) -> np.ndarray:
         half, constant = lower[0] / 2, lower[1]
         real = np.abs(half) + np.sqrt(np.maximum(half**2 - constant, 0))
         return np.where(half**2 < constant, np.sqrt(np.abs(constant)), real)
-    # In units of the poles' mean magnitude, in which coefficients are of like size.
+    # Dividing by the poles' mean magnitude gives coefficients of similar size.
     unit = np.abs(lower[-1]) ** (1 / order)
     scaled = lower / unit ** np.arange(1, order + 1)[:, None]
     companion = np.zeros((scaled.shape[1], order, order))
@@ -130,8 +131,7 @@ def build_cells(
     fraction: Float[Array, "*batch"],
     time_constant: Float[Array, "*batch"],
 ) -> Cells:
-    """Compute the tables of all cells; `fraction` [periods] is that of the interval at which the force is
-    sampled."""
+    """Compute the tables of all cells; the force is sampled at `fraction` [periods] of the interval."""
     lag = not_instant(time_constant, control_period) / control_period
     first, second = _edges(counts, fraction, lag), _edges(counts, 1 - fraction, lag)
     begin = jnp.concatenate([fraction - first.before[:-1], 1 - second.before[:-1]])
@@ -140,8 +140,8 @@ def build_cells(
     order = denominator.shape[0] - 1
     if order == 0:
         states = jnp.zeros((0, len(begin), 2, *control_period.shape), control_period.dtype)
-        one, zero = jnp.ones_like(control_period), jnp.zeros_like(control_period)
-        lines = [jnp.stack([one, zero]), jnp.stack([zero, one])]
+        ones, zeros = jnp.ones_like(control_period), jnp.zeros_like(control_period)
+        lines = [jnp.stack([ones, zeros]), jnp.stack([zeros, ones])]
         lines += [jnp.zeros_like(lines[0])] * (counts.degree - 1)
         return Cells(begin, length, rest, states, jnp.stack(lines))
     generator, output = generator_rows(numerator, denominator, control_period)
@@ -154,8 +154,10 @@ def build_cells(
 
 @jax.numpy_rank_promotion("allow")
 def power_series(cells: Cells, course: Course) -> Float[Array, "powers cells *batch"]:
-    """Coefficients of the position [m], from the surface, in powers of the time since a cell's start
-    [periods]."""
+    """Return the coefficients of the position [m], relative to the surface.
+
+    They belong to powers of the time since a cell's start [periods].
+    """
     growth = course.end - course.start
     state = [
         sum(
@@ -172,29 +174,34 @@ def power_series(cells: Cells, course: Course) -> Float[Array, "powers cells *ba
 
 
 def not_instant(time_constant: Array, control_period: Array) -> Array:
-    """Return a time constant [s], or `INSTANT` of the control period where it is shorter."""
+    """Return a time constant [s], or `INSTANT` control periods if it is shorter."""
     least = INSTANT * control_period
     return jnp.where(time_constant > least, time_constant, least)
 
 
 class _Edges(NamedTuple):
+    """Edges of a part's cells."""
+
     before: Float[Array, "edges *batch"]  # from a cell's edges to the end of its part [periods]
-    length: Float[Array, "cells *batch"]  # of the cells [periods]
+    length: Float[Array, "cells *batch"]  # length of the cells [periods]
 
 
 def _edges(counts, whole, lag):
-    """Edges of a part's cells, which is `whole` periods long."""
+    """Return the edges of the cells of a part that is `whole` periods long."""
     window = jnp.minimum(whole, WINDOW * lag) if counts.plain else whole
     window = window if counts.window else jnp.zeros_like(whole)
     left = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
     inside = [window * (i / max(counts.window, 1)) for i in range(counts.window, -1, -1)]
-    before = jnp.stack([window + one for one in left] + inside)
+    before = jnp.stack([window + before_window for before_window in left] + inside)
     lengths = [(whole - window) / max(counts.plain, 1)] * counts.plain
     return _Edges(before, jnp.stack(lengths + [window / max(counts.window, 1)] * counts.window))
 
 
 def _series(generator, output, degree):
-    """Rows of y^(j)/j! for y = output w, w' = generator w, w = (state, command, growth)."""
+    """Return the rows of y^(j)/j!, (degree + 1, columns, *batch), for y = output w and w' = generator w.
+
+    The vector w is (state, command, growth of the command in a period).
+    """
     order, columns = generator.shape[:2]
     zero = jnp.zeros_like(output[0])
     row = [*output, zero, zero]
@@ -210,5 +217,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """The least power of two that is not below a number, to `SLACK`."""
+    """Return the least power of two that is not below a number, up to a relative excess of `SLACK`."""
     return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + SLACK))))

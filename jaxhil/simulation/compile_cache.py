@@ -1,9 +1,9 @@
-"""What the compiler made, kept between calls in sealed files.
+"""Cache of compiled programs in checksummed files.
 
-jax keeps compiled programs by itself, but reads what it finds: with zstandard installed nothing checks the
-content, and a flipped bit is run as machine code. What is bad stays, since it replaces no entry, and warns
-every time. Programs in our folder are therefore read and written here. jax has no public place for that:
-where the one used is not there, no compiled programs are kept, which costs time alone.
+JAX has its own cache but does not verify the content of its files if zstandard is installed: a flipped bit is
+executed as machine code. It also never replaces a damaged file, and warns about it every time. Therefore this
+module reads and writes the programs in our folder. JAX has no public interface for this. If the private one
+is missing, programs are not cached, which costs only time.
 """
 
 import os
@@ -14,42 +14,47 @@ from typing import Any
 
 from jaxhil.files import read_sealed, remove_stale, write_sealed
 
-ENDING = ".executable"  # of the files' names
+ENDING = ".executable"  # suffix of the file names
 
 _folders: set[str] = set()
-_this_thread = threading.local()  # its `key`: that of the program last found or put into a folder
+_this_thread = threading.local()  # its `key` is that of the program last read from or written to a folder
 
 
 def keep_sealed(folder: str | os.PathLike[str]) -> bool:
-    """From here on, what jax keeps in the folder is sealed; False where this jax cannot do that."""
+    """Make JAX use checksummed files in the folder from now on; return False if this JAX cannot."""
     try:
         from jax._src import compilation_cache
         from jax._src.compilation_cache_interface import CacheInterface
 
-        of_jax = compilation_cache.get_file_cache
+        original = compilation_cache.get_file_cache
     except (ImportError, AttributeError):
         return False
 
     class SealedCache(CacheInterface):
+        """JAX cache whose files have a checksum."""
+
         def __init__(self, path: str) -> None:
             self._path = Path(path)
             with suppress(OSError):
                 remove_stale(self._path)
 
         def get(self, key: str) -> bytes | None:
-            found = read_sealed(self._path / f"{key}{ENDING}")
-            if found is not None:
+            """Return the program with this key, or None if it is missing or damaged."""
+            content = read_sealed(self._path / f"{key}{ENDING}")
+            if content is not None:
                 _this_thread.key = key
-            return found
+            return content
 
         def put(self, key: str, value: bytes) -> None:
-            # A folder that has become full or read-only costs only the next call's time.
+            """Write a program; errors of the file system are ignored."""
+            # With a full or read-only folder only the next call takes longer.
             with suppress(OSError):
                 write_sealed(self._path / f"{key}{ENDING}", value, lasting=False)
                 _this_thread.key = key
 
     def get_file_cache(path: str):
-        return (SealedCache(path), path) if path in _folders else of_jax(path)
+        """Return our cache for our folders, JAX's cache for others."""
+        return (SealedCache(path), path) if path in _folders else original(path)
 
     if not _folders:
         compilation_cache.get_file_cache = get_file_cache
@@ -58,6 +63,6 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
 
 
 def compiled(lowered: Any) -> tuple[Any, str | None]:
-    """A lowered program compiled, and its key in our folder; None if it is not kept there."""
+    """Compile a lowered program; return it with its key in our folder, or None if it is not cached there."""
     _this_thread.key = None
     return lowered.compile(), _this_thread.key

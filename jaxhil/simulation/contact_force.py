@@ -1,11 +1,10 @@
-"""The real contact, one sampling interval after the other: its force, peak and work, and what a lagging force
-sensor makes of it.
+"""Force, peak force and mechanical work of the real contact in one sampling interval, and a sensor's lag.
 
 The motion simulator moves smoothly within a sampling interval (`jaxhil.simulation.motion_simulator`); its
-corners are the interval's ends. The force is read where the sensor will sample it, once per interval. In a
-loop of slow motion, what depends on the force in between follows it along the cubic through the exact
-position and velocity at the ends of each smooth stretch; in others, along the exact motion
-(`jaxhil.simulation.contact_in_cells`).
+motion has corners only at the interval's ends. The force is evaluated once per interval, where the sensor
+samples it. Whatever depends on the force in between follows, in loops with slow motion, the cubic (Hermite)
+through the exact positions and velocities at the ends of each smooth section. Other loops follow the exact
+motion (`jaxhil.simulation.contact_in_cells`).
 """
 
 from typing import Any, NamedTuple
@@ -19,13 +18,13 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters, deflection, two_s
 from jaxhil.simulation.cells import Course
 from jaxhil.simulation.sensors import lag, lag_decay
 
-ROOT_STEPS = 3  # of Newton's method, from a straight line's root
-ARCS = 2  # parabolas that stand for the force of one stretch, for the sensor's lag
+ROOT_STEPS = 3  # steps of Newton's method, which starts at the root of the chord
+ARCS = 2  # parabolas that approximate the force along one section, for the sensor's lag
 GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # node, weight
 
 
 class Motion(NamedTuple):
-    """Position [m] and velocity [m/s] somewhere in a sampling interval."""
+    """Position [m] and velocity [m/s] at an instant of a sampling interval."""
 
     position: Float[Array, "*batch"]
     velocity: Float[Array, "*batch"]
@@ -35,53 +34,55 @@ class SamplingInterval(NamedTuple):
     """Motion of the real mechanism from one tick to the next."""
 
     sample: Motion  # where the force is sampled
-    start: Any  # at the interval's start, from within; None for loops that do not look between the samples
-    end: Any  # at its end, likewise
-    course: Course | None  # what the motion in between follows from; None for loops that do not follow it
+    start: Any  # right limit at the interval's start; None for loops that use the samples alone
+    end: Any  # left limit at its end; None likewise
+    course: Course | None  # input of the exact motion in between; None for loops that do not use it
 
 
 class PlantSignals(NamedTuple):
-    """The contact in a sampling interval, as it is without the sensors."""
+    """Contact in a sampling interval, without the effects of the sensors."""
 
-    force: Float[Array, "*batch"]  # of the contact, where it is sampled [N]
-    # done on the mechanism and returned by it [J]; None unless energies are followed
+    force: Float[Array, "*batch"]  # contact force at the sampling instant [N]
+    # work done on the mechanism and work returned by it [J]; None unless energies are recorded
     works: tuple[Array, Array] | None
-    # of the force in the interval [N]; None unless the force has corners between samples
+    # peak force in the interval [N]; None unless the force has corners between samples
     peak: Float[Array, "*batch"] | None
-    # time with a force since the sample before [periods]; None where touching samples are counted
+    # time with a force since the previous sample [periods]; None if touching samples are counted instead
     touched: Float[Array, "*batch"] | None
 
 
 class Contact(NamedTuple):
-    """What the contact of a sampling interval leaves."""
+    """Result of the contact in a sampling interval."""
 
-    plant_signals: PlantSignals  # of the contact, without the sensors
-    # of a lagging force sensor, where it samples [N]; None without lag
+    plant_signals: PlantSignals  # contact without the effects of the sensors
+    # reading of a lagging force sensor at its sampling instant [N]; None without lag
     reading: Float[Array, "*batch"] | None
-    lagged: Array  # its reading at the interval's end [N]
+    lagged: Array  # reading of a lagging force sensor at the interval's end [N]
     last: "ContactSample"  # the sample of the contact
-    # time with a force after the sample [periods]; None where touching samples are counted
+    # time with a force after the sample [periods]; None if touching samples are counted instead
     touched: Float[Array, "*batch"] | None
     law: tuple[Array, ...]  # state of the contact law at the interval's end
 
 
 class Surfaces(NamedTuple):
-    """A contact law at one surface or two."""
+    """Contact law at one surface or two."""
 
     law: ContactLaw  # the contact law
     parameters: ContactParameters  # its parameters
     state: tuple[Any, ...]  # its state
-    clearance: Array | None  # between two surfaces [m]; None for one
+    clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
     def force(self, motion: Motion) -> tuple[Array, tuple[Any, ...]]:
-        """Signed force [N] and the law's next state."""
+        """Return the signed force [N] and the law's next state."""
         return two_sided(
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
 
     def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
-        """The same at the fraction s of a smooth stretch of motion of a `duration` [s], at whose start these
-        are."""
+        """Return the surfaces with the law's state at the fraction `s` of a smooth section of motion.
+
+        `self` has the state at the section's start; the section takes `duration` [s].
+        """
         if not self.law.remembers:
             return self
         side, surface = self.side(start, end)
@@ -93,7 +94,7 @@ class Surfaces(NamedTuple):
         return self._replace(state=state)
 
     def side(self, start: Motion, end: Motion) -> tuple[Array, Array]:
-        """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch touches."""
+        """Return side (1, -1, or 0 for none) and position [m] of the surface that a section touches."""
         signed = deflection(start.position, self.clearance)
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
         return side, jnp.zeros_like(side) if self.clearance is None else jnp.where(
@@ -101,7 +102,7 @@ class Surfaces(NamedTuple):
         )
 
     def sample(self, motion: Motion, force: Array) -> "ContactSample":
-        """A sample of the contact, whose force is known."""
+        """Return a sample of the contact, with known force [N]."""
         if self.clearance is None:
             edge = self.law.edge(self.parameters, motion.velocity)
             return ContactSample(motion.position, force, edge, jnp.ones_like(edge))
@@ -113,31 +114,33 @@ class Surfaces(NamedTuple):
 
 
 class ContactSample(NamedTuple):
-    """A sample of the contact."""
+    """Sample of the contact."""
 
-    distance: Float[Array, "*batch"]  # into the nearer surface [m], negative outside
+    distance: Float[Array, "*batch"]  # penetration of the nearer surface [m], negative outside
     force: Float[Array, "*batch"]  # [N]
-    edge: Float[Array, "*batch"]  # limit of the force at that surface [N]
-    side: Float[Array, "*batch"]  # of that surface, 1 or -1
+    edge: Float[Array, "*batch"]  # limit of the force at that surface, from inside [N]
+    side: Float[Array, "*batch"]  # side of that surface, 1 or -1
 
     def position(self, clearance: Array | None) -> Array:
-        """Position of the mechanism [m]."""
+        """Return the position of the mechanism [m]."""
         if clearance is None:
             return self.distance
-        # Before the first sample it is far from either surface.
+        # The initial sample is far from both surfaces.
         distance = jnp.maximum(self.distance, -clearance / 2)
         return jnp.where(self.side > 0, distance, -clearance - distance)
 
 
 def no_contact(like: Array) -> ContactSample:
-    """Far from any surface."""
+    """Return a sample far from any surface."""
     zeros = jnp.zeros_like(like)
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
 
 def works_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
-    """Work [J] done on the mechanism and returned by it from one sample to the next, exact for a force
-    straight in the penetration."""
+    """Return the work [J] done on the mechanism and returned by it between two samples.
+
+    It is exact if the force is linear in the penetration.
+    """
     depth_0 = jnp.where(before.distance > 0, before.distance, 0)
     depth_1 = jnp.where(now.distance > 0, now.distance, 0)
     force_0 = jnp.where(before.distance > 0, before.force, now.edge)
@@ -148,9 +151,9 @@ def works_between(before: ContactSample, now: ContactSample) -> tuple[Array, Arr
 
 
 def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> tuple[Array, Array]:
-    """Work [J] done on the mechanism and returned by it along a smooth stretch of motion.
+    """Return the work [J] done on the mechanism and returned by it along a smooth section of motion.
 
-    A pulling force acts while the penetration recedes: it takes from the work returned.
+    Work of a pulling force while the penetration decreases is subtracted from the work returned.
     """
     contact = _touching(surfaces, start, end, duration)
 
@@ -171,8 +174,10 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
 
 
 def largest_force(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
-    """Largest |force| [N] within a sampling interval: at an end, or near the vertex of the parabola through
-    both ends and the middle."""
+    """Return the largest |force| [N] within a sampling interval.
+
+    It is the force at an end, or near the vertex of the parabola through both ends and the middle.
+    """
 
     def magnitude(motion, s):
         return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
@@ -194,8 +199,16 @@ def sensed_lag(
     duration: Array,
     time_constant: Array,
 ) -> tuple[Array, Array]:
-    """Readings [N] of a lagging sensor at an interval's sample, `until` [s] after its start, and at its end,
-    after `duration` [s]; `reading` was that at its start."""
+    """Return the readings [N] of a lagging sensor at an interval's sample and at its end.
+
+    Args:
+        surfaces: Contact law at the interval's start.
+        reading: Reading at the interval's start [N].
+        interval: Motion of the mechanism.
+        until: Time of the sample after the interval's start [s].
+        duration: Duration of the interval [s].
+        time_constant: Time constant of the sensor [s].
+    """
 
     def follow(reading, interval):
         sample = _lag_along(surfaces, reading, interval.start, interval.sample, until, time_constant)
@@ -204,7 +217,7 @@ def sensed_lag(
         return sample, _lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
 
     def fade(reading, interval):
-        # In the same steps as `follow`: to the bit, no lane depends on whether others are in contact.
+        # The same operations as in `follow`: a lane's bits must not depend on the contacts of other lanes.
         sample = reading * lag_decay(until, time_constant)
         return sample, sample * lag_decay(duration - until, time_constant)
 
@@ -215,7 +228,7 @@ def sensed_lag(
 
 
 def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
-    """Position and velocity at the fraction s of a stretch, by its cubic (Hermite)."""
+    """Return position and velocity at the fraction `s` of a section, from its cubic (Hermite)."""
     v_0, v_1 = start.velocity * duration, end.velocity * duration
     moved = end.position - start.position
     bend, twist = 3 * moved - 2 * v_0 - v_1, v_0 + v_1 - 2 * moved
@@ -226,10 +239,10 @@ def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
 
 
 def _turn(start, end, duration, side):
-    """The fraction of a stretch at which it turns round on its way in; 1 where it does not."""
+    """Return the fraction of a section at which an inward motion reverses; 1 if it does not."""
     first, last = side * start.velocity, side * end.velocity
     turns = (first > 0) & (last < 0)
-    # The velocity first + slope s + bend s^2 of the stretch's cubic, times the duration.
+    # first + slope s + bend s^2 is the velocity of the section's cubic, times the duration.
     moved = side * (end.position - start.position)
     first, last = first * duration, last * duration
     slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
@@ -238,24 +251,28 @@ def _turn(start, end, duration, side):
 
 
 def _force_along(surfaces, start, end, duration, s):
-    """Motion at the fraction s of a stretch, and the force there [N]; `surfaces` are those at its start."""
+    """Return motion and force [N] at the fraction `s` of a section, at whose start `surfaces` hold."""
     motion = along(start, end, duration, s)
     force, _ = surfaces.after(start, end, duration, s).force(motion)
     return motion, force
 
 
 class _Touching(NamedTuple):
-    """Contact during a stretch of motion."""
+    """Contact during a section of motion."""
 
-    touches: Array  # whether there is any
-    side: Array  # of the surface, 1 or -1
-    first: Array  # fraction of the stretch at which it begins
-    last: Array  # fraction of the stretch at which it ends
+    touches: Array  # whether there is contact
+    side: Array  # side of the surface, 1 or -1
+    first: Array  # fraction of the section at which it begins
+    last: Array  # fraction of the section at which it ends
     at_surface: tuple[Array, Array]  # whether it begins, and whether it ends, at the surface
 
 
 def _touching(surfaces, start, end, duration):
-    """Both instants are roots on the stretch's cubic: of the depth, or of the force that lets go before."""
+    """Return the contact during a section.
+
+    Both of its instants are roots on the section's cubic: of the penetration, or of the law's `hold`, which
+    changes sign where the force vanishes before the penetration does.
+    """
     side, surface = surfaces.side(start, end)
 
     def depth(s):
@@ -283,7 +300,7 @@ def _touching(surfaces, start, end, duration):
 
 
 def _crossing(function, like):
-    """From which s in [0, 1] and until which a function of s is positive, if it changes its sign once."""
+    """Return the bounds in [0, 1] between which a function is positive, if it changes sign at most once."""
     zeros, ones = jnp.zeros_like(like), jnp.ones_like(like)
     at_0, at_1 = function(zeros), function(ones)
     rises, falls = (at_0 <= 0) & (at_1 > 0), (at_0 > 0) & (at_1 <= 0)
@@ -291,7 +308,7 @@ def _crossing(function, like):
     root = jnp.where(rises | falls, -at_0 / chord, 0)
     for _ in range(ROOT_STEPS):
         value, slope = jax.jvp(function, (root,), (ones,))
-        # Towards the other end, at any rate.
+        # A slope of the wrong sign would lead away from the root.
         slope = jnp.where(slope * chord > 0, slope, chord)
         root = jnp.clip(root - value / slope, 0, 1)
     never = (at_0 <= 0) & (at_1 <= 0)
@@ -299,8 +316,10 @@ def _crossing(function, like):
 
 
 def _lag_along(surfaces, reading, start, end, duration, time_constant):
-    """The lagging reading after a smooth stretch of motion: the force is taken along parabolas, whose lag is
-    exact, from where contact begins to where it ends."""
+    """Return the lagging reading [N] after a smooth section of motion.
+
+    Between the begin and the end of contact, the force is approximated by parabolas, whose lag is exact.
+    """
     contact = _touching(surfaces, start, end, duration)
     span = contact.last - contact.first
     forces = []
@@ -308,7 +327,7 @@ def _lag_along(surfaces, reading, start, end, duration, time_constant):
         s = contact.first + span * (i / (2 * ARCS))
         motion, force = _force_along(surfaces, start, end, duration, s)
         if i in (0, 2 * ARCS):
-            # At the surface the force has a limit from inside.
+            # At the surface, the force is its limit from inside.
             edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)
             force = jnp.where(contact.at_surface[i > 0], contact.side * edge, force)
         forces.append(jnp.where(contact.touches, force, 0))

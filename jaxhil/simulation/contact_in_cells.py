@@ -1,9 +1,9 @@
-"""The real contact along the exact motion of a sampling interval: lagging reading, work, peak, time in touch.
+"""Real contact along the exact motion of a sampling interval: lagged reading, work, peak force, duration.
 
-Each cell (`jaxhil.simulation.cells`) is cut where the motion turns, into pieces on which it goes one way; a
-piece is cut at the surface, where the law's slope changes, and where the surfaces let go of each other. On
-each span that is left the force is one smooth formula, integrated by Gauss's rule. All cells are computed
-side by side; only a law's memory goes from one to the next.
+Each cell (`jaxhil.simulation.cells`) is divided where the motion reverses, into pieces of monotone motion. A
+piece is divided at the surface, where the law's slope changes, and where the force vanishes. On each
+resulting span the force is one smooth formula, which Gauss-Legendre quadrature integrates. All cells are
+computed in parallel; only the state of a law with memory passes from one cell to the next.
 """
 
 import functools
@@ -30,35 +30,39 @@ from jaxhil.simulation.roots import crossing, positive_part
 
 
 class Rule(NamedTuple):
-    """Gauss's rule on (0, 1)."""
+    """Gauss-Legendre quadrature on (0, 1)."""
 
     nodes: np.ndarray
     weights: np.ndarray
 
     def places(self, dtype: Any) -> np.ndarray:
-        """Return the nodes, and before and behind them the ends, where a limit from inside is read."""
+        """Return the nodes, between two points close to the ends.
+
+        At these two points the force has its limit from inside.
+        """
         inside = np.finfo(dtype).eps ** 0.5
         return np.concatenate([[inside], self.nodes, [1 - inside]]).astype(dtype)
 
 
 def _rule(number: int) -> Rule:
+    """Return a rule of `number` nodes for integrands with a power of the penetration at an end."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
-    # p -> 3 p^2 - 2 p^3 is flat at both ends: a power of the depth is smooth there.
+    # The substitution p -> 3 p^2 - 2 p^3 is flat at both ends, so that powers of the penetration are smooth.
     return Rule(unit**2 * (3 - 2 * unit), weights * 3 * unit * (1 - unit))
 
 
-RULES = {True: _rule(12), False: _rule(16)}  # for short cells, and for others
-_NUMBERS = 7  # of a contact, see `_in_one`
-_ALL = (0, 1, 2, 3)  # nodes, levels, pieces, cells
+RULES = {True: _rule(12), False: _rule(16)}  # True: for short cells
+_NUMBERS = 7  # number of results of a contact, see `_in_one`
+_ALL = (0, 1, 2, 3)  # axes: nodes, levels, pieces, cells
 
 
 class CellContact(NamedTuple):
-    """The contact in a sampling interval."""
+    """Contact in a sampling interval."""
 
-    reading: Float[Array, "*batch"]  # of a lagging force sensor at the sample [N]
-    lagged: Float[Array, "*batch"]  # its reading at the interval's end [N]
-    works: tuple[Array, Array]  # done on the mechanism and returned by it [J]
+    reading: Float[Array, "*batch"]  # reading of a lagging force sensor at the sample [N]
+    lagged: Float[Array, "*batch"]  # reading of a lagging force sensor at the interval's end [N]
+    works: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
     peak: Float[Array, "*batch"]  # largest |force| [N]
     touched: tuple[Array, Array]  # time with a force, up to the sample and after it [periods]
     at_sample: tuple[Any, ...]  # state of the contact law where the force is sampled
@@ -66,14 +70,14 @@ class CellContact(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A contact law at one surface or two."""
+    """Contact law at one surface or two."""
 
     law: ContactLaw
     parameters: ContactParameters
-    clearance: Array | None  # between two surfaces [m]; None for one
+    clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
 
-# Numbers of a lane meet those of its cells, places and spans.
+# Arrays per lane are broadcast against those per cell, node and span.
 @jax.numpy_rank_promotion("allow")
 def contact_in_cells(
     touch: Touch,
@@ -97,20 +101,21 @@ def contact_in_cells(
     """
     rates = _sensor_rates(cells, period, time_constant)
 
-    # Each branch returns arrays of its own: where one array is several of its results, the compiler without
-    # optimisation mixes them up.
+    # Each branch returns distinct arrays: without optimisation, the compiler confuses results that share one.
     def touches(state):
+        """Return the contact's results and the law's states at the sample and at the end."""
         pieces = cut_at_turns(path_of(series, cells.length))
         states, at_sample, at_end = _memory(touch, state, pieces, period)
         parts = [_along_side(touch, states, pieces, side, period, rates) for side in _sides(touch)]
         return _in_one(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
+        """Return the same without contact."""
         fresh = touch.law.init(jnp.zeros_like(lagged))
         numbers = jnp.zeros((_NUMBERS, *lagged.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
 
-    # Most of the time no lane touches.
+    # In most intervals no lane touches.
     numbers, states = lax.cond(_may_touch(touch, cells, series), touches, free, state)
     *readings, done, returned, before, after, peak = numbers
     sample, end = _fade(lagged, rates, readings)
@@ -122,38 +127,42 @@ def contact_in_cells(
 def work_of_jump(
     touch: Touch, state: tuple[Any, ...], before: Float[Array, "*batch"], now: Float[Array, "*batch"]
 ) -> tuple[Array, Array]:
-    """Return the work [J] of a jump from one position to another: done on the mechanism, returned by it."""
-    one = jnp.ones_like(before)
-    path = path_of(jnp.stack([before, now - before])[:, None], one[None])
-    pieces = pieces_between(path, jnp.stack([0 * one, one])[:, None])
+    """Return the work [J] done on the mechanism and returned by it in a jump between two positions."""
+    ones = jnp.ones_like(before)
+    path = path_of(jnp.stack([before, now - before])[:, None], ones[None])
+    pieces = pieces_between(path, jnp.stack([0 * ones, ones])[:, None])
     states = jax.tree.map(lambda leaf: leaf[None, None], state)
-    parts = [_along_side(touch, states, pieces, side, one, None, still=True) for side in _sides(touch)]
-    done, returned = (sum((part.works[i] for part in parts), 0 * one) for i in (0, 1))
+    parts = [_along_side(touch, states, pieces, side, ones, None, still=True) for side in _sides(touch)]
+    done, returned = (sum((part.works[i] for part in parts), 0 * ones) for i in (0, 1))
     return done, returned
 
 
 class _Part(NamedTuple):
-    """What the contact at one surface adds, each summed over the cells but for the readings."""
+    """Contribution of the contact at one surface; all but the readings are summed over the cells."""
 
-    readings: tuple[Array, Array]  # what the force leaves in a lagging reading at either part's end [N]
-    works: tuple[Array, Array]
-    peak: Array
-    touched: tuple[Array, Array]
+    readings: tuple[Array, Array]  # contribution to a lagging reading at the end of either part [N]
+    works: tuple[Array, Array]  # [J]
+    peak: Array  # [N]
+    touched: tuple[Array, Array]  # [periods]
 
 
 def _in_one(parts: list[_Part]) -> Array:
-    """Numbers of the contact at either surface together, (numbers, *batch); the peak comes last."""
-    each = [jnp.stack([*part.readings, *part.works, *part.touched]) for part in parts]
+    """Return the contact's results over all surfaces, (numbers, *batch); the peak force is the last."""
+    sums = [jnp.stack([*part.readings, *part.works, *part.touched]) for part in parts]
     peak = functools.reduce(jnp.maximum, [part.peak for part in parts])
-    return jnp.concatenate([functools.reduce(jnp.add, each), peak[None]])
+    return jnp.concatenate([functools.reduce(jnp.add, sums), peak[None]])
 
 
 def _sides(touch):
+    """Return the sides of the surfaces."""
     return (1,) if touch.clearance is None else (1, -1)
 
 
 def _memory(touch, state, pieces, period):
-    """State of the law at the start of each piece, (3, cells, *batch), at the sample and at the end."""
+    """Return the law's state at the start of each piece, at the sample and at the end.
+
+    States at the pieces' starts are (pieces of a cell, cells, *batch).
+    """
     cells = pieces.path.length.shape[0]
     if not touch.law.remembers:
         return state, state, state
@@ -173,14 +182,15 @@ def _memory(touch, state, pieces, period):
 
 
 class _Rates(NamedTuple):
-    """A lagging sensor in a lane's cells."""
+    """Lagging sensor in a lane's cells."""
 
     fades: tuple[Array, Array]  # duration of either part [time constants]
     rate: Array  # time constants per period
-    rest: Array  # from a cell's end to that of its part [periods]
+    rest: Array  # time from a cell's end to the end of its part [periods]
 
 
 def _sensor_rates(cells, period, time_constant) -> _Rates | None:
+    """Return the lagging sensor in the cells, or None without lag."""
     if time_constant is None:
         return None
     rate = period / not_instant(time_constant, period)
@@ -191,7 +201,7 @@ def _sensor_rates(cells, period, time_constant) -> _Rates | None:
 
 
 def _fade(lagged, rates, readings):
-    """The reading at the sample and at the interval's end [N]."""
+    """Return the lagging reading at the sample and at the interval's end [N]."""
     if rates is None:
         return lagged, lagged
     sample = lagged * jnp.exp(-rates.fades[0]) + readings[0]
@@ -199,7 +209,7 @@ def _fade(lagged, rates, readings):
 
 
 def _may_touch(touch, cells, series):
-    """Whether any lane may touch: by a bound on the series."""
+    """Return whether any lane may touch, according to a bound on the series."""
     reach = horner(jnp.abs(series.at[0].set(0)), cells.length)
     may = series[0] + reach > 0
     if touch.clearance is not None:
@@ -208,7 +218,7 @@ def _may_touch(touch, cells, series):
 
 
 def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Part:
-    """The contact at the surface of one side; a motion that is `still` has no velocity to the law."""
+    """Return the contact at one side's surface; a `still` motion has zero velocity for the law."""
     law, parameters, path = touch.law, touch.parameters, pieces.path
     inward = side * pieces.way
     surface = 0.0 if side > 0 else touch.clearance
@@ -222,7 +232,7 @@ def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Par
         speed = side * rate_at(path, s) / period
         if not law.jumps:
             return speed
-        # By its sign a law tells the ways apart: at a turn rounding would decide.
+        # The law depends on the sign of the velocity, which is uncertain by rounding at a reversal.
         return jnp.where(speed * inward > 0, speed, inward * jnp.finfo(speed.dtype).tiny)
 
     def height(data, s):
@@ -235,9 +245,9 @@ def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Par
     def force(s):
         return law.step(parameters, states, depth(path, s), rate(path, s))[0]
 
-    corners = [jnp.broadcast_to(one, pieces.low.shape) for one in law.corners(parameters, states)]
+    corners = [jnp.broadcast_to(corner, pieces.low.shape) for corner in law.corners(parameters, states)]
     levels = jnp.sort(jnp.stack([jnp.zeros_like(pieces.low), *corners]), axis=0)
-    low, high = (jnp.broadcast_to(one, levels.shape) for one in (pieces.low, pieces.high))
+    low, high = (jnp.broadcast_to(edge, levels.shape) for edge in (pieces.low, pieces.high))
     inner, outer = jnp.where(inward > 0, low, high), jnp.where(inward > 0, high, low)
     at_level = crossing(height, (path, levels), low, high, inner, outer)
     beyond = jnp.concatenate([at_level[1:], outer[:1]])
@@ -266,7 +276,7 @@ def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Par
 
 
 def _lag_of(rates, path, impulses, places):
-    """What impulses [N periods] leave in a lagging reading at the end of either part [N]."""
+    """Return the contributions [N] of impulses [N periods] to a lagging reading at the end of either part."""
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
         return zeros, zeros
@@ -276,13 +286,13 @@ def _lag_of(rates, path, impulses, places):
 
 
 def _by_part(values):
-    """Sums over the cells of either part."""
+    """Return the sums over the cells of either part."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 
 
 def _largest(force, places, begin, width, magnitudes):
-    """Largest |force| [N] of a span: of those at the nodes, and at the vertex through the three largest."""
+    """Return the largest |force| [N] of a span: at a node, or at the vertex through three nodes."""
     middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(places) - 2)[None]
 
     def at(offset):

@@ -1,7 +1,7 @@
-"""The picture of a run: force and position over time, contact by contact, beside the same contacts in space.
+"""Plot of a run: force and position over time for each contact, beside the ideal contacts.
 
-Figures are made without pyplot and whatever the caller's settings of matplotlib: nothing is shown, nothing
-stays open, and equal data gives equal files.
+The plots do not use pyplot or the caller's settings of matplotlib: nothing is shown, no figure stays open,
+and equal data gives equal files.
 """
 
 import os
@@ -22,7 +22,7 @@ from jaxhil.errors import one_line
 from jaxhil.files import write_whole
 from jaxhil.simulation.motion import Curve, Piece
 
-# Okabe and Ito's colours, which every kind of sight distinguishes; line styles distinguish them in print.
+# Colours of Okabe and Ito, distinct for colour-blind readers; line styles distinguish curves in print.
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
 STYLES = {
     "in space": (BLACK, "-", 3.0),
@@ -38,22 +38,22 @@ LABELS = {
     "tuned": "tuned",
     "rig": "on the rig",
 }
-MOST_PANELS = 4  # contacts drawn side by side
+MOST_PANELS = 4  # greatest number of contacts side by side
 
 
 @matplotlib.style.context("default")
 def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
-    """Force and position over time, contact by contact, beside the same contact in space.
+    """Draw force and position over time for each contact, beside the ideal contact.
 
-    `sensors` names the curve whose measured force and position are drawn too.
+    `sensors` is the name of the curve whose measured force and position are drawn too.
     """
     shown = list(pieces[:MOST_PANELS])
     if len(pieces) > len(shown):
         title += f" (the first {len(shown)} of {len(pieces)} contacts)"
-    # Two lines of title above the axes; the legend below.
+    # There are two lines of title above the axes, and the legend below them.
     width = max(7.0, 3.6 * len(shown) + 1)
     figure = new_figure((width, 6.4), title, above=1.0, below=0.95)
-    figure.subplots_adjust(left=1.1 / width)  # the position's name takes two lines
+    figure.subplots_adjust(left=1.1 / width)  # The label of the position takes two lines.
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
     for column, piece in enumerate(shown):
         force, position = grid[0, column], grid[1, column]
@@ -89,21 +89,23 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
 def new_figure(
     size: tuple[float | int, float | int], title: str, above: float = 0.55, below: float = 0.6
 ) -> Figure:
-    """A figure with room [inches] above and below its axes, of labels and titles of known sizes: an automatic
-    layout draws everything twice."""
+    """Create a figure with margins [inches] above and below its axes.
+
+    Sizes of labels and titles are known; an automatic layout would draw everything twice.
+    """
     width, height = size
     figure = Figure(figsize=size)
     figure.subplots_adjust(
         left=0.9 / width, right=1 - 0.25 / width, bottom=below / height, top=1 - above / height,
         wspace=0.24, hspace=0.12,
     )  # fmt: skip
-    # A name is text, not a formula.
+    # The title is not a formula.
     figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
     return figure
 
 
 def finish(axes: Axes, legend: Any) -> None:
-    """Grid, spines and legend (its place, None for none) of axes that are drawn."""
+    """Set grid, spines and legend of drawn axes; `legend` is the legend's location, or None for no legend."""
     axes.grid(True, color="0.88", linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -116,8 +118,10 @@ def finish(axes: Axes, legend: Any) -> None:
 
 @matplotlib.style.context("default")
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure, whole or not at all, folders on the way included. Raises OSError when that is not
-    possible, or what is there is no plain file."""
+    """Write a figure atomically and create the parent folders.
+
+    Raise OSError if this is impossible or if the path exists and is not a regular file.
+    """
     target, content = Path(path), BytesIO()
     target.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
@@ -126,14 +130,14 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
     fields = {"Software": None} if target.suffix.lower() == ".png" else fields
     with rc_context({"svg.hashsalt": "jaxhil"}), warnings.catch_warnings():
-        # A name may have letters that the font lacks; they are drawn as boxes.
+        # Letters of the title that the font lacks are drawn as boxes.
         warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)
         figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
     write_whole(target, content.getvalue())
 
 
 def _entered(piece: Piece) -> str:
-    """The contact and the speed it was entered at; another speed where a curve has one of its own."""
+    """Return the contact's name and approach speed, with those curves' speeds that differ."""
     speed = piece.curves["in space"].velocity
     text = f"{piece.name}, entered at {1e3 * speed:.3g} mm/s"
     for name, curve in piece.curves.items():
@@ -143,19 +147,19 @@ def _entered(piece: Piece) -> str:
 
 
 def _end(curve: Curve) -> float:
-    """When the last force is over [s]."""
+    """Return the time [s] at which the last force ends."""
     pushed = np.flatnonzero(np.abs(curve.force) > 1e-3 * np.max(np.abs(curve.force), initial=0.0))
     return float(curve.time[pushed[-1]]) if len(pushed) else float(curve.time[-1])
 
 
 def _limit_position(axes: Axes, piece: Piece, end: float) -> None:
-    """Show what lies within the time shown."""
+    """Set the position axis to the values within the displayed time."""
     values = []
     for curve in piece.curves.values():
         within = curve.time <= end + 0.02
         values.append(1e3 * curve.position[within])
-    every = np.concatenate(values)
-    every = every[np.isfinite(every)]
-    if len(every):
-        margin = 0.05 * (np.max(every) - np.min(every)) or 1.0
-        axes.set_ylim(np.min(every) - margin, np.max(every) + margin)
+    positions = np.concatenate(values)
+    positions = positions[np.isfinite(positions)]
+    if len(positions):
+        margin = 0.05 * (np.max(positions) - np.min(positions)) or 1.0
+        axes.set_ylim(np.min(positions) - margin, np.max(positions) + margin)

@@ -1,8 +1,8 @@
-"""The settings of jax: devices, quick compilation, precision, and where compiled programs are kept.
+"""Settings of JAX: devices, fast compilation, precision, and the folder of compiled programs.
 
-A command has its process to itself: it calls `prepare` before anything that imports jax. A function called
-from Python is a guest in its caller's process: it computes within `computing`, after which jax's settings and
-the environment are the caller's again.
+A command has its own process: it calls `prepare` before importing anything that imports JAX. A function
+called from Python runs in its caller's process: it computes within `computing`, which restores the settings
+of JAX and the environment afterwards.
 """
 
 import gc
@@ -20,38 +20,37 @@ from jaxhil.simulation import startup
 from jaxhil.simulation.compile_cache import keep_sealed
 
 CACHE = "JAXHIL_CACHE"
-# From which level on the compiler writes to standard error. That it takes long is an error to it;
-# what goes wrong in it comes as an exception anyway.
+# Least level of the compiler's messages on standard error. It reports slow compilation as an error; real
+# errors are raised as exceptions anyway.
 LOG, FATAL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICES = "--xla_force_host_platform_device_count"
 SOME_DEVICES = re.compile(rf"{DEVICES}=[1-9]\d{{,2}}")
-FEWEST_DEVICES = (
-    2  # for one alone, the compiler orders sums otherwise: the last bits differ from those of more
-)
-# Tracing makes objects by the million, few of them in cycles: looking for those takes a tenth of the time of
-# a short command.
+# For one device the compiler orders sums differently: the last bits differ from those of two or more.
+FEWEST_DEVICES = 2
+# Thresholds of garbage collection. Tracing creates millions of objects, few of them in cycles: the default
+# thresholds cost 10 % of the time of a short command.
 RARELY = 100_000, 50, 50
-# What compiled programs are kept under: all that takes longer to compile than to read.
+# Programs are cached if they take longer to compile than to read.
 KEEPING = {"jax_persistent_cache_min_compile_time_secs": 0.05, "jax_persistent_cache_min_entry_size_bytes": 0}
-# Options of programs that run ticks, by this compiler's names: vectors as wide as the processor has, and
-# fewer copies of what one tick hands to the next.
+# Compiler options of programs that run ticks: the processor's widest vectors, and fewer copies of the state
+# between ticks.
 TICKS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_region_analysis": True}
-# For a batch without derivatives each array is computed on its own, besides: twice as fast together. A
-# Jacobian would take three times as long like that.
+# Options of batches without derivatives: each array is also computed separately. Together this is twice as
+# fast, but a Jacobian would take three times as long.
 ROLLOUT = {**TICKS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
-# In six axes, of hundreds of arrays, by the older of the compiler's two ways to make loops: a tenth quicker.
+# Options for six axes, with hundreds of arrays: the older of two loop emitters is 10 % faster.
 SIX_AXES = {**ROLLOUT, "xla_cpu_use_fusion_emitters": False}
-# Of what runs once and is soon done: compiled in half the time.
+# Options of short programs that run once: they compile in half the time.
 ONCE = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_use_fusion_emitters": False,
 }
-# An option of LLVM's own, to unroll loops as a whole or not at all, and the compiler's versions that it was
-# tried with: an option that LLVM does not know ends the process.
+# An option of LLVM, to unroll loops completely or not at all, and the tested versions of the compiler: an
+# option that LLVM does not have ends the process.
 WHOLE, TRIED = "-unroll-allow-partial=false", ("0.10.",)
-# Modes for debugging, whatever JAX_... variables say: to them NaN would be a mistake, a program that is
-# compiled before it runs is not there, and every transfer has to be explicit.
+# Debugging modes are off, whatever JAX_... variables say: they treat NaN as an error, prevent compilation
+# ahead of time, or require explicit transfers.
 NO_DEBUGGING = {
     "jax_debug_nans": False,
     "jax_debug_infs": False,
@@ -59,15 +58,15 @@ NO_DEBUGGING = {
     "jax_no_tracing": False,
     "jax_transfer_guard": "allow",
 }
-_started_with: list[str] = []  # XLA_FLAGS that jax was started with, once `start` did it
+_started_with: list[str] = []  # XLA_FLAGS with which `start` started JAX
 
 
 def prepare() -> None:
-    """For the rest of the process: float64, one device per usable core and two at least, quick compilation,
-    compiled programs kept between calls.
+    """Set up JAX for the rest of the process.
 
-    What the user says in XLA_FLAGS stands. Flags have no effect once jax runs, and are left alone then. Raise
-    `InputError` if jax cannot be imported under the user's environment variables.
+    This means float64, one device per usable core but at least two, fast compilation, and compiled programs
+    cached between calls. Flags in the user's XLA_FLAGS have priority. Flags have no effect once JAX runs, and
+    are not changed then. Raise `InputError` if JAX cannot be imported with the user's environment variables.
     """
     if "jax" not in sys.modules:
         os.environ.update(_checked_settings())
@@ -90,22 +89,24 @@ def prepare() -> None:
 
 @contextmanager
 def computing() -> Iterator[None]:
-    """Float64 and compiled programs kept, for the calls within and this thread; jax started, if it does not
-    run yet, as for a command. Afterwards the caller's settings hold again."""
+    """Use float64 and cached programs within this context and thread.
+
+    Start JAX as for a command, unless it runs already. The caller's settings are restored afterwards.
+    """
     start()
-    collected = gc.get_threshold()
+    thresholds = gc.get_threshold()
     try:
         gc.set_threshold(*RARELY)
         with float64(), _programs_kept():
             yield
     finally:
-        gc.set_threshold(*collected)
+        gc.set_threshold(*thresholds)
 
 
 def start() -> None:
-    """Start jax as for a command, unless it runs already; the environment is then as it was.
+    """Start JAX as for a command, unless it runs already; restore the environment variables afterwards.
 
-    Raise `InputError` if jax cannot start.
+    Raise `InputError` if JAX cannot start.
     """
     startup.check_process()
     ours = _checked_settings()
@@ -114,11 +115,11 @@ def start() -> None:
     try:
         import jax
 
-        # The flags are read when the first device is asked for. Nothing happens if that was before, and then
-        # there are as many devices as there were.
-        count, named = jax.device_count(), ours["XLA_FLAGS"]
-        if not _started_with and f"{DEVICES}={count}" in named.split():
-            _started_with.append(named)
+        # JAX reads the flags at the first use of a device. If that was earlier, they have no effect and the
+        # number of devices may be another one.
+        count, flags_text = jax.device_count(), ours["XLA_FLAGS"]
+        if not _started_with and f"{DEVICES}={count}" in flags_text.split():
+            _started_with.append(flags_text)
     except (AssertionError, RuntimeError, ValueError) as error:
         raise startup.as_input_error(error) from None
     finally:
@@ -131,7 +132,7 @@ def start() -> None:
 
 @contextmanager
 def float64() -> Iterator[None]:
-    """Float64 in this thread, and none of jax's debugging modes."""
+    """Use float64 in this thread, without JAX's debugging modes."""
     import jax
 
     with ExitStack() as stack:
@@ -145,7 +146,7 @@ def float64() -> Iterator[None]:
 
 @contextmanager
 def _programs_kept() -> Iterator[None]:
-    """Compiled programs are kept in our folder, unless the caller keeps his somewhere."""
+    """Cache compiled programs in our folder, unless the caller has a folder for them."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -162,80 +163,85 @@ def _programs_kept() -> Iterator[None]:
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
-        # It would go on keeping the caller's programs otherwise.
+        # Otherwise JAX would continue to cache the caller's programs in our folder.
         compilation_cache.reset_cache()
 
 
 def program_folder() -> str | None:
-    """Where compiled programs are kept, and what is kept beside them; None before `prepare`."""
+    """Return the folder of compiled programs and related files; None before `prepare`."""
     import jax
 
     return getattr(jax.config, "jax_compilation_cache_dir", None)
 
 
 def settings(given: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables that jax reads when it starts, made of those `given`.
+    """Return the environment variables that JAX reads at its start, made from the variables `given`.
 
-    XLA's devices share one pool of threads. One that cuts up a large piece of work waits for another thread
-    to be free, and with no thread to spare all of them wait for ever.
+    XLA's devices share one pool of threads. A thread that splits a large task waits for another one to be
+    free; without spare threads all of them would wait forever.
     """
     threads = given.get("NPROC", str(4 * usable_cores()))
     return {"XLA_FLAGS": flags(given.get("XLA_FLAGS", "")), "NPROC": threads, LOG: given.get(LOG, FATAL)}
 
 
 def _checked_settings() -> dict[str, str]:
-    """`settings` of this process. Raise `InputError` for XLA_FLAGS over which XLA would end the process."""
+    """Return `settings` of this process; raise `InputError` for XLA_FLAGS with which XLA would end it."""
     ours = settings(os.environ)
-    harmless = flags("").split()
-    tried = [
+    default_flags = flags("").split()
+    unusual = [
         flag
         for flag in ours["XLA_FLAGS"].split()
-        if flag not in harmless and not SOME_DEVICES.fullmatch(flag)
+        if flag not in default_flags and not SOME_DEVICES.fullmatch(flag)
     ]
-    if tried:
-        startup.check_flags(" ".join(tried))
+    if unusual:
+        startup.check_flags(" ".join(unusual))
     return ours
 
 
 def xla_flags() -> str:
-    """The flags that programs are compiled with here, as far as is known."""
+    """Return the flags with which programs are compiled here, as far as known."""
     return _started_with[0] if _started_with else os.environ.get("XLA_FLAGS", "")
 
 
 def rounding_flags(flags: str) -> str:
-    """What of XLA_FLAGS may change the last bits of a result: all but how many devices, from two on."""
+    """Return those XLA_FLAGS that may change the last bits of a result.
+
+    These are all flags except a number of devices of two or more.
+    """
     alone = f"{DEVICES}=1"
     return " ".join(sorted(flag for flag in flags.split() if DEVICES not in flag or flag == alone))
 
 
 def flags(given: str) -> str:
-    """XLA_FLAGS: what the user gave, perhaps in a file, and what of ours it does not settle."""
+    """Return XLA_FLAGS: the user's flags, which may be in a file, and our flags that the user did not set."""
     if given and not given.startswith("-"):
         given = startup.flags_of_file(given)
     ours = {
         DEVICES: max(FEWEST_DEVICES, usable_cores()),
-        # A third of the compile time, for programs that run as fast.
+        # Compilation takes a third of the time; the programs are as fast.
         "--xla_backend_optimization_level": 1,
-        # The tick's loop as one function, its arrays computed several at a time, instead of some 60 calls a
-        # tick: half the time per tick, a third of that of a gradient, and half the compile time.
+        # The tick's loop becomes one function that computes several arrays at a time, instead of about 60
+        # calls a tick: half the time per tick, a third of a gradient's time, and half the compile time.
         "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1000000000,"
         "xla_cpu_use_multi_output_fusion",
     }
     if find_spec("jax_plugins") and os.environ.get("JAX_PLATFORMS") != "cpu":
-        # A graphics card's programs would be optimised less, too; the other flags they do not know.
+        # This flag, unlike the others, would also reduce the optimisation of a graphics card's programs.
         del ours["--xla_backend_optimization_level"]
     elif version("jaxlib").startswith(TRIED):
-        # After every loop that LLVM unrolls in part it forgets what it knows of all others around: with a law
-        # of a thousand loops that is a third of the compile time, for programs that run as fast.
+        # LLVM discards its analysis of the surrounding loops after each loop that it unrolls partially. With
+        # a law of a thousand loops this is a third of the compile time; the programs are not faster.
         ours["--xla_backend_extra_options"] += f",{WHOLE}"
-    named = {flag.split("=")[0] for flag in given.split()}
-    added = [f"{name}={value}" for name, value in ours.items() if name not in named]
+    user_names = {flag.split("=")[0] for flag in given.split()}
+    added = [f"{name}={value}" for name, value in ours.items() if name not in user_names]
     return " ".join([*given.split(), *added])
 
 
 def known_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
-    """Those of a program's `compiler_options` that this version of the compiler has; for processors, all of
-    them. It starts jax."""
+    """Return those of a program's `compiler_options` that this version of the compiler has.
+
+    On graphics cards there are none. This starts JAX.
+    """
     import jax
 
     if jax.default_backend() != "cpu":
@@ -245,6 +251,7 @@ def known_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
 
 @cache
 def _is_known(name: str, value: int | str) -> bool:
+    """Return whether the compiler accepts an option."""
     import jax
 
     try:
@@ -255,7 +262,7 @@ def _is_known(name: str, value: int | str) -> bool:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return os.cpu_count() or 1
@@ -263,29 +270,30 @@ def usable_cores() -> int:
 
 @contextmanager
 def on_half_the_cores(half: int) -> Iterator[None]:
-    """This thread runs on one half of the usable cores meanwhile, 0 or 1, where the system can be told so.
+    """Restrict this thread to half of the usable cores (0 or 1), if the system allows it.
 
-    The system leaves a thread on the core where it was. Work beside a program of all devices delays the same
-    device again and again then, for which the others wait; in turns on both halves it delays all alike.
+    The system leaves a thread on its core. Work beside a program of all devices would therefore delay the
+    same device repeatedly, for which the others wait. Alternating between both halves delays all devices
+    equally.
     """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
-    own = sorted(usable)[half::2]
+    cores = sorted(usable)[half::2]
     try:
-        _run_on(own)
+        _run_on(cores)
         yield
     finally:
-        _run_on(usable if own else ())
+        _run_on(usable if cores else ())
 
 
 def _run_on(cores: Collection[int]) -> None:
-    """This thread runs on these cores, if there are any and the system allows it."""
+    """Restrict this thread to these cores, if there are any and the system allows it."""
     with suppress(OSError):
         if cores:
             os.sched_setaffinity(0, cores)
 
 
 def cache_folder() -> Path | None:
-    """$JAXHIL_CACHE or ~/.cache/jaxhil, made if need be; None where it cannot be written."""
+    """Return $JAXHIL_CACHE or ~/.cache/jaxhil, created if necessary; None if it cannot be written."""
     try:
         folder = Path(os.environ.get(CACHE) or Path.home() / ".cache" / "jaxhil")
         folder.mkdir(parents=True, exist_ok=True)

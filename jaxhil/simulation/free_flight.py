@@ -1,7 +1,7 @@
-"""Free flight: where a run begins, and how much of a flight is skipped.
+"""Free flight: start of a run, and the number of periods that are skipped.
 
-Nothing happens in uniform flight but that everything moves on: the state some periods later is known.
-Forward-mode derivatives pass through; the number of periods skipped is constant to them.
+In uniform flight only the positions change, so the state after several periods is known. Forward-mode
+derivatives pass through; the number of skipped periods counts as a constant.
 """
 
 import jax.numpy as jnp
@@ -14,9 +14,9 @@ from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import read, steady_state
 from jaxhil.simulation.watch import Watch
 
-APPROACH = 0.02  # s of free approach before a contact, besides its phase
-SETTLED = 1e-6  # of the distance flown in a period: the motion simulator follows uniformly
-STILL = 1e-12  # of the speed, per period: nothing pushes the numerical model any more
+APPROACH = 0.02  # s; free approach before a contact, in addition to its phase
+SETTLED = 1e-6  # of the distance per period; deviation of the motion simulator from its steady state
+STILL = 1e-12  # of the speed; change per period below which the numerical model counts as free
 
 
 def begin_approach(
@@ -29,8 +29,11 @@ def begin_approach(
     tick: Array,
     skip_flight: bool,
 ) -> tuple[LoopState, Int[Array, "*batch"]]:
-    """A run of the schedule from its start, x_d(0) = min(plane, 0) - v (0.02 s + phi T), and 0; or, where
-    nothing happens before, from two periods before the hardware touches, and the periods skipped."""
+    """Return the state at the start of a run, and the number of skipped periods.
+
+    The run starts at x_d(0) = min(surface, 0) - v (0.02 s + phi T). If nothing happens before the touch, it
+    starts two periods before the hardware touches.
+    """
     nearer = jnp.minimum(rig.scenario.contact_plane, 0)
     position = nearer - velocity * (APPROACH + phase * rig.constants.control_period)
     entered = enter(loop, rig, gains, state, position, velocity, tick)
@@ -48,8 +51,11 @@ def begin_approach(
 def arrival(
     loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, command: Array, tick: Array
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
-    """Between two surfaces: the state whole periods later, shortly before the other one, and on which lanes
-    there is settled free flight until then; |F_c| is `command` [N]."""
+    """Return the state shortly before the other of two surfaces, and the lanes that fly freely until then.
+
+    The state is a whole number of periods later. A lane flies freely if its motion simulator has settled and
+    no force acts; `command` is |F_c| [N].
+    """
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position
     stride = period * velocity
@@ -58,20 +64,20 @@ def arrival(
     strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
     arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)
-    here = enter(loop, rig, gains, state, position, velocity, tick)
+    uniform = enter(loop, rig, gains, state, position, velocity, tick)
     follows = (watch.elapsed == 0) & (watch.quiet > loop.first_tick)
-    for component, steady in zip(state.plant.state, here.plant.state, strict=True):
-        # Components of the state are in periods, hence of like size.
+    for component, steady in zip(state.plant.state, uniform.plant.state, strict=True):
+        # Time is in periods, so the components of the state are of similar size.
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)
         follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
-    # A force that still moves the model, noise for one, makes the flight an event.
+    # Flight is not uniform while a force, such as noise, moves the model.
     push = command * period / scenario.equivalent_mass
     still = push <= STILL * jnp.abs(velocity)
     return arrived, follows & still & (periods >= 1)
 
 
 def _newest_sample(loop, rig, entered, stride):
-    """Position of the mechanism [m] when its force was sampled last, in the interval before the run."""
+    """Return the position [m] at the newest force sample before the run."""
     drive = entered.plant.commands[-1]
     start = drive - stride if loop.hold == "linear" else drive
     before = steady_state(rig.propagation, start, stride)

@@ -1,4 +1,4 @@
-"""The gains that a caller asks for: the literature's, a setting's, some of his own, or a gain file's."""
+"""Choice of a compensator's gains: from the literature, a setting, a dict, or a gain file."""
 
 import math
 import os
@@ -15,14 +15,15 @@ from jaxhil.simulation.gain_file import LoadedGains, bounds_of, load_gain_file, 
 
 
 def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) -> tuple[str, dict[str, float]]:
-    """The compensator's name and its gains [SI units] for a mechanism.
+    """Return the compensator's name and its gains [SI units] for a mechanism.
 
-    `gains` is None (the literature's), the name of a setting of the compensator, a dict of some gains (the
-    others are the literature's), or a gain file's path. With a file, "none" stands for its compensator. A
-    text that is no setting's name is a path if it has a separator or an ending, or if there is such a file.
+    `gains` is None (from the literature), the name of a setting of the compensator, a dict of some gains (the
+    others are from the literature), or a gain file's path. With a file, the compensator "none" means the
+    file's compensator. Text that is not a setting's name is a path if it has a separator or a suffix, or if
+    the file exists.
 
-    Raises `InputError` for an unknown compensator, setting or gain, for a value out of its bounds, and for a
-    gain file that cannot be used or does not fit compensator, control period or bounds.
+    Raise `InputError` for an unknown compensator, setting or gain, for a value outside its bounds, and for a
+    gain file that is invalid or does not fit the compensator, the control period or the bounds.
     """
     law = look_up(compensator, "")
     if gains is None:
@@ -40,8 +41,10 @@ def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) ->
 
 
 def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
-    """The gains of a file fit a mechanism: they act per control period, and a bound of theirs may be the
-    length of a delay line. Raises `InputError`."""
+    """Raise `InputError` if the gains of a file do not fit a mechanism.
+
+    Gains act per control period, and the upper bound of a gain may be the length of a delay line.
+    """
     period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
     if period != tuned:
         raise InputError(f"{label}: control_period: found {tuned:g} s, allowed {period:g} s of the mechanism")
@@ -56,6 +59,7 @@ def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
 
 
 def _is_path(text: str) -> bool:
+    """Return whether a text has a separator or a suffix, or names an existing file."""
     if os.sep in text or os.path.splitext(text)[1]:
         return True
     try:
@@ -64,25 +68,26 @@ def _is_path(text: str) -> bool:
         return True
 
 
-def _partial(mechanism: AnyMechanism, law: Compensator, given: Mapping[Any, Any]) -> dict[str, float]:
+def _partial(mechanism: AnyMechanism, law: Compensator, choice: Mapping[Any, Any]) -> dict[str, float]:
+    """Return the gains of a dict, completed with those from the literature."""
     gains = literature_gains(mechanism, law.name)
-    known = {gain.name: gain for gain in law.gains}
-    for name, value in given.items():
-        if name not in known:
-            hint = close_match(name, known) if isinstance(name, str) else ""
-            allowed = (", ".join(known) or f"none: {law.name} has no gains") + hint
+    specifications = {gain.name: gain for gain in law.gains}
+    for name, value in choice.items():
+        if name not in specifications:
+            hint = close_match(name, specifications) if isinstance(name, str) else ""
+            allowed = (", ".join(specifications) or f"none: {law.name} has no gains") + hint
             raise InputError(f"gains: found {shown(name)}, allowed {allowed}")
-        lower, upper, margin = bounds_of(known[name], mechanism)
+        lower, upper, margin = bounds_of(specifications[name], mechanism)
         number = _number(value)
         if not lower - margin <= number <= upper + margin:
-            allowed = f"{lower:.6g} to {upper:.6g} {known[name].unit} for this mechanism"
+            allowed = f"{lower:.6g} to {upper:.6g} {specifications[name].unit} for this mechanism"
             raise InputError(f"gains.{name}: found {shown(value)}, allowed {allowed}")
         gains[name] = min(max(number, lower), upper)
     return gains
 
 
 def _number(value: Any) -> float:
-    """A number of Python, NumPy or jax; NaN for anything else."""
+    """Return a number of Python, NumPy or JAX as a float; NaN for anything else."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return math.nan
@@ -95,6 +100,7 @@ def _number(value: Any) -> float:
 def _from_file(
     mechanism: AnyMechanism, law: Compensator, path: str | os.PathLike[str]
 ) -> tuple[str, dict[str, float]]:
+    """Return the compensator and the gains of a file; raise `InputError` if they do not fit."""
     label = one_line(os.fsdecode(path)) or "''"
     loaded = load_gain_file(os.fsdecode(path), any_axes=True)
     if isinstance(loaded.mechanism, Mechanism) != isinstance(mechanism, Mechanism):
@@ -108,4 +114,5 @@ def _from_file(
 
 
 def _axes(mechanism: AnyMechanism) -> str:
+    """Return the mechanism's number of axes in words."""
     return "one axis" if isinstance(mechanism, Mechanism) else "six axes"

@@ -1,7 +1,7 @@
-"""Reading a gain file: the gains of a compensator, with the mechanism and the rig that they were tuned for.
+"""Reading of gain files: a compensator's gains, and the mechanism and rig for which they were tuned.
 
-First the checks that the rig makes too (`jaxhil.rig.gain_file`), then those that need the mechanism and
-the registry of compensators. A file is refused as a whole, in one line that says what is wrong.
+The first checks are those that the rig also makes (`jaxhil.rig.gain_file`). Further checks need the mechanism
+and the registry of compensators. An invalid file is rejected as a whole, with a one-line message.
 """
 
 import os
@@ -20,22 +20,23 @@ from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
 
-ROUNDING = 1e-9  # by which a bound worked out elsewhere may differ
+ROUNDING = 1e-9  # relative tolerance of bounds computed on another machine
 
 
 class LoadedGains(NamedTuple):
-    """A checked gain file."""
+    """Checked gain file."""
 
-    document: dict[str, Any]  # its whole content
-    compensator: str
+    document: dict[str, Any]  # whole content of the file
+    compensator: str  # name
     gains: dict[str, float]  # by name, in SI units
-    mechanism: Any  # that the gains were tuned for, a `Mechanism`; a `SixAxisMechanism` where that may be
+    mechanism: Any  # for which the gains were tuned; a `Mechanism`, or a `SixAxisMechanism` if allowed
 
 
 def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:
-    """The gain file at `path`, checked as a whole; of one axis, unless `any_axes` will do.
+    """Read and check the gain file at `path`; it must be of one axis unless `any_axes` is set.
 
-    Raises `InputError`, one line, for whatever is wrong."""
+    Raise `InputError` if anything is wrong.
+    """
     source = one_line(os.fspath(path))
     try:
         document = read_gain_document(path)
@@ -47,8 +48,10 @@ def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> Load
 def check_document(
     document: dict[str, Any], source: str = "gain document", any_axes: bool = False
 ) -> LoadedGains:
-    """The content of a gain file, checked as a whole; errors call it `source`; of one axis, unless `any_axes`
-    will do. Raises `InputError`."""
+    """Check the content of a gain file; it must be of one axis unless `any_axes` is set.
+
+    Raise `InputError`, which calls the document `source`.
+    """
     try:
         on_the_rig = check_gain_document(document, source, _simulated_only(), (1, 6) if any_axes else (1,))
     except GainFileError as error:
@@ -68,7 +71,7 @@ def check_document(
 
 
 def look_up(compensator: object, source: str) -> Compensator:
-    """The compensator of that name, built in or registered. Raises `InputError` that begins with `source`."""
+    """Return the compensator with that name, or raise `InputError` that begins with `source`."""
     if not isinstance(compensator, str) or compensator not in {**COMPENSATORS, **SIX_AXES}:
         hint = close_match(compensator, COMPENSATORS) if isinstance(compensator, str) else ""
         allowed = f"one of {', '.join(COMPENSATORS)}{hint}"
@@ -77,7 +80,7 @@ def look_up(compensator: object, source: str) -> Compensator:
 
 
 def check_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
-    """`gains` are those of the law, all of them and no other. Raises `InputError`."""
+    """Raise `InputError` unless `gains` are exactly the gains of the law."""
     names = [gain.name for gain in law]
     if set(gains) != set(names):
         wrong = sorted(set(gains) ^ set(names))[0]
@@ -86,13 +89,13 @@ def check_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) ->
 
 
 def bounds_of(gain: Gain, mechanism: Any) -> tuple[float, float, float]:
-    """Lower and upper bound of a gain for a mechanism, and by how much rounding may miss them."""
+    """Return a gain's lower and upper bound for a mechanism, and their tolerance for rounding."""
     lower, upper = float(gain.lower(mechanism)), float(gain.upper(mechanism))
     return lower, upper, ROUNDING * max(abs(lower), abs(upper))
 
 
 def _simulated_only() -> dict[str, dict[str, GainSpecification]]:
-    """The gains of compensators that were registered without a runtime class, or are of six axes alone."""
+    """Return the gains of compensators without a runtime class or for six axes alone, by compensator."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
         for name, law in {**COMPENSATORS, **SIX_AXES}.items()
@@ -101,6 +104,7 @@ def _simulated_only() -> dict[str, dict[str, GainSpecification]]:
 
 
 def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, source: str) -> None:
+    """Raise `InputError` if a gain's unit or bounds in the file differ from the law's."""
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
         raise _refusal(source, f"{key}.unit", shown(entry["unit"]), f"'{gain.unit}'")
@@ -112,11 +116,13 @@ def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, 
 
 
 def _refusal(source: str, key: str, found: str, allowed: str) -> InputError:
+    """Return the error for a key."""
     where = f"{source}: {key}" if source else key
     return InputError(f"{where}: found {found}, allowed {allowed}")
 
 
 def _is_date(value: object) -> bool:
+    """Return whether a value is an ISO date and time with time zone."""
     try:
         return isinstance(value, str) and datetime.fromisoformat(value).tzinfo is not None
     except ValueError:
@@ -124,20 +130,23 @@ def _is_date(value: object) -> bool:
 
 
 def _is_envelope(value: object) -> bool:
+    """Return whether a value is an object of {low, high, unit} objects."""
     return isinstance(value, Mapping) and all(
         isinstance(span, Mapping) and {"low", "high", "unit"} <= span.keys() for span in value.values()
     )
 
 
 def _is_object(value: object) -> bool:
+    """Return whether a value is an object."""
     return isinstance(value, Mapping)
 
 
 def _is_table_of_texts(value: object) -> bool:
+    """Return whether a value is an object of texts."""
     return isinstance(value, Mapping) and all(isinstance(text, str) for text in value.values())
 
 
-# Of each further key of a gain file: whether its value will do, and what is allowed.
+# For each further key of a gain file: the check of its value, and a description of the allowed values.
 _REQUIRED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "mechanism_sha256": (
         lambda value: isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None,

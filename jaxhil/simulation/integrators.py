@@ -1,8 +1,8 @@
-"""One control period of the numerical model M x'' = -F_c, for the three integrators in use on rigs.
+"""Integrators of the numerical model M x'' = -F_c over one control period, as used on rigs.
 
-Their own delay (notebooks/guide/model.md section 6, item 7): semi-implicit Euler none, exact zero-order hold
-T/2, explicit Euler T. All arrays broadcast, plain floats stay such; position [m], velocity [m/s],
-acceleration [m/s^2], control period T [s].
+Their own delays are (notebooks/guide/model.md, section 6, item 7): semi-implicit Euler 0, exact zero-order
+hold T/2, explicit Euler T. All functions accept arrays that broadcast, or floats: position [m], velocity
+[m/s], acceleration [m/s^2], control period T [s]. They return the next position and velocity.
 """
 
 from typing import TypeVar
@@ -13,19 +13,19 @@ Number = TypeVar("Number", Array, float)
 
 
 def semi_implicit_euler(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """v += T a, x += T v."""
+    """Compute v += T a, then x += T v."""
     velocity = velocity + control_period * acceleration
     return position + control_period * velocity, velocity
 
 
 def zero_order_hold(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """x += T v + T^2 a / 2, v += T a: exact for a force held over the period."""
+    """Compute x += T v + T^2 a / 2 and v += T a, exact for a constant force in the period."""
     increment = control_period * acceleration
     return position + control_period * (velocity + increment / 2), velocity + increment
 
 
 def explicit_euler(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """x += T v, v += T a."""
+    """Compute x += T v, then v += T a."""
     return position + control_period * velocity, velocity + control_period * acceleration
 
 

@@ -1,7 +1,7 @@
-"""Derivatives of what a run gives, by the numbers of its mechanism and by the gains.
+"""Derivatives of a run's results with respect to the mechanism's numbers and the gains.
 
-Forward mode, through every tick of the run: each number asked for has a lane of its own in one batch of equal
-runs, and in that lane alone it moves.
+Forward-mode differentiation passes through all ticks of the run. Each number has its own lane in a batch of
+equal runs, and varies in that lane only.
 """
 
 import os
@@ -34,21 +34,21 @@ from jaxhil.simulation.run import ContactResult, check_seed
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 GAINS = "gains."
-# Counted in ticks, found between two of them, or no number: without a derivative.
+# These results have no derivative: they are counted in ticks, or are not numbers.
 WITHOUT = ("duration", "duration_ratio", "status")
 FIGURES = tuple(name for name in ContactResult._fields if name not in WITHOUT)
 _ROUNDING = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
-# At 0 the part of the rig that the key describes is not there: what follows has a corner.
+# At 0 the rig lacks the part that the key describes, and the results have a corner.
 _CORNERS_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
-_NUDGE = 1e-9  # parts of the loop that a key switches on are then there
+_NUDGE = 1e-9  # added to the keys' values, so that the loop contains the parts that they switch on
 
 
 class _Key(NamedTuple):
-    """A number to differentiate by: a gain's name, or a key of the mechanism, of a list one entry or all."""
+    """Number to differentiate with respect to: a gain, or a mechanism's key, for lists one entry or all."""
 
-    gain: str | None
-    path: str
-    entry: tuple[int, ...]
+    gain: str | None  # gain's name; None for a key of the mechanism
+    path: str  # dotted key
+    entry: tuple[int, ...]  # indices of the entry in a list; empty for all entries
 
 
 def jacobian(
@@ -60,19 +60,27 @@ def jacobian(
     by: str | Sequence[str],
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """d(of)/d(by) of every contact of the nominal run: by each entry of `by` an array of shape (contacts,).
+    """Return d(of)/d(by) for each contact of the nominal run.
 
-    `of` is a number of `ContactResult`, such as "restitution", "error" or "peak_force"; `by` holds dotted
-    paths of real numbers of the mechanism, such as "rig.force_sensor.delay", and "gains.NAME". The entries of
-    a list move together, by the same amount; "contact.stiffness[1]" is one entry. The unit is that of `of`
-    over that of the key. A contact that did not end well has NaN; the others count what all contacts before
-    them pass on. Mechanism, compensator, gains and seed are those of `simulate`.
+    The result has an array of shape (contacts,) for each entry of `by`, in the unit of `of` over that of the
+    key. A contact that did not end normally has NaN; the derivatives of later contacts include the effect of
+    all earlier ones. Mechanism, compensator, gains and seed are those of `simulate`.
 
-    Derivatives are those of the program: a damped contact begins with a jump of the force, and by when the
-    sensor sees that jump, from one tick to the next, is not in them.
+    Derivatives are those of the program. A damped contact begins with a jump of the force; the change of the
+    tick at which the sensor reads this jump is not included.
 
-    Raises `InputError`, one line, for an unknown `of` or key, a key that is no real number or has no finite
-    value, and for what the run is not differentiable by: quantisation, and delays or dead zones that are 0.
+    Args:
+        mechanism: Mechanism, name of a built-in one, or path.
+        compensator: Name of the compensator.
+        gains: Gains, as for `simulate`.
+        of: A number of `ContactResult`, such as "restitution", "error" or "peak_force".
+        by: Dotted paths of real numbers of the mechanism, such as "rig.force_sensor.delay", and "gains.NAME".
+            All entries of a list vary by the same amount; "contact.stiffness[1]" is one entry.
+        seed: Seed of the sensors' noise.
+
+    Raises:
+        InputError: `of` or a key is unknown, a key is not a real number or not finite, or the run is not
+            differentiable with respect to it: quantisation, and delays or dead zones that are 0.
     """
     checked = as_mechanism(mechanism)
     number = check_seed(seed)
@@ -96,13 +104,15 @@ def jacobian(
 
 
 def _check_figure(of: object, law: Compensator) -> None:
-    known = [name for name in FIGURES if name != "force_delay" or law.estimates_delay]
-    if not isinstance(of, str) or of not in known:
-        hint = close_match(of, known) if isinstance(of, str) else ""
-        raise InputError(f"of: found {shown(of)}, allowed one of {', '.join(known)}{hint}")
+    """Raise `InputError` unless `of` is a result with a derivative."""
+    names = [name for name in FIGURES if name != "force_delay" or law.estimates_delay]
+    if not isinstance(of, str) or of not in names:
+        hint = close_match(of, names) if isinstance(of, str) else ""
+        raise InputError(f"of: found {shown(of)}, allowed one of {', '.join(names)}{hint}")
 
 
 def _check_rounding(mechanism: Mechanism) -> None:
+    """Raise `InputError` if a sensor quantises its readings."""
     for path in _ROUNDING:
         if value_at(mechanism, path) != 0.0:
             allowed = "0: what is rounded has no derivative"
@@ -110,12 +120,12 @@ def _check_rounding(mechanism: Mechanism) -> None:
 
 
 def _key(mechanism: Mechanism, law: Compensator, path: object) -> _Key:
-    """The number that an entry of `by` names. Raises `InputError`."""
+    """Return the number that an entry of `by` names, or raise `InputError`."""
     if isinstance(path, str) and path.startswith(GAINS):
-        gain, known = path.removeprefix(GAINS), [gain.name for gain in law.gains]
-        if gain not in known:
-            allowed = ", ".join(GAINS + one for one in known) or f"no gain: {law.name} has none"
-            raise InputError(f"by: found {shown(path)}, allowed {allowed}{close_match(gain, known)}")
+        gain, names = path.removeprefix(GAINS), [gain.name for gain in law.gains]
+        if gain not in names:
+            allowed = ", ".join(GAINS + name for name in names) or f"no gain: {law.name} has none"
+            raise InputError(f"by: found {shown(path)}, allowed {allowed}{close_match(gain, names)}")
         return _Key(gain, "", ())
     try:
         parts = parse_key(path)
@@ -126,8 +136,8 @@ def _key(mechanism: Mechanism, law: Compensator, path: object) -> _Key:
     entry = tuple(part for part in parts if isinstance(part, int))
     key = dotted(parts[: len(parts) - len(entry)])
     if key not in numeric_keys() or key in _ROUNDING:
-        known = [one for one in numeric_keys() if not one.startswith("uncertainty") and one not in _ROUNDING]
-        raise _refusal(path, "no key to differentiate by", f"a real number{close_match(key, [*known])}")
+        names = [k for k in numeric_keys() if not k.startswith("uncertainty") and k not in _ROUNDING]
+        raise _refusal(path, "no key to differentiate by", f"a real number{close_match(key, [*names])}")
     value = value_at(mechanism, key)
     if value is None or value == [] or (isinstance(value, float) and not np.isfinite(value)):
         raise _refusal(path, f"{shown(value)} as its value", "a key with a finite value")
@@ -140,18 +150,19 @@ def _key(mechanism: Mechanism, law: Compensator, path: object) -> _Key:
 
 
 def _refusal(path: object, found: str, allowed: str) -> InputError:
+    """Return the error for an entry of `by`."""
     return InputError(f"by {path}: found {found}, allowed {allowed}")
 
 
 def _loop(mechanism: Mechanism, compensator: str, keys: list[_Key], seed: int) -> Loop:
-    """The loop with all that its numbers switch on when they move."""
+    """Return the loop with all parts that the keys switch on when they are not 0."""
     scenarios = build_scenarios(mechanism, _draws(mechanism, keys, np.full(len(keys), _NUDGE)), seed)
     return build_loop(mechanism, compensator, scenarios)
 
 
 def _draws(mechanism: Mechanism, keys: list[_Key], moved: Any) -> dict[str, Any]:
-    """The values of all keys in as many lanes; in the lane of a key it has `moved`, (keys,), by that much."""
-    # Something has to say how many lanes there are.
+    """Return the values of all keys, a lane per key, in which this key is increased by `moved`, (keys,)."""
+    # Without a key of the mechanism, this entry determines the number of lanes.
     draws: dict[str, Any] = {"approach.phase": np.full(len(keys), mechanism.approach.phase)}
     for lane, key in enumerate(keys):
         if key.gain is None:
@@ -166,7 +177,7 @@ def _draws(mechanism: Mechanism, keys: list[_Key], moved: Any) -> dict[str, Any]
 def _moving(
     mechanism: Mechanism, keys: list[_Key], gains: dict[str, float], seed: int
 ) -> tuple[Gains, Gains, Scenario, Scenario]:
-    """Gains and scenarios, a lane for each key, and their derivatives by the key of the lane."""
+    """Return gains and scenarios with a lane for each key, and their derivatives with respect to this key."""
     lanes = len(keys)
     values = {name: jnp.full(lanes, value) for name, value in gains.items()}
     rates = {name: jnp.array([1.0 * (key.gain == name) for key in keys]) for name in gains}
@@ -177,7 +188,7 @@ def _moving(
         )
 
     batch, slopes = jax.jvp(scenarios, (jnp.zeros(lanes),), (jnp.ones(lanes),))
-    # The noise of every lane is that of the first.
+    # All lanes have the noise of the first one.
     batch = batch._replace(key=jnp.broadcast_to(batch.key[:, :1], batch.key.shape))
     slopes = jax.tree.map(lambda leaf, slope: slope if eqx.is_inexact_array(leaf) else None, batch, slopes)
     return values, rates, batch, slopes
@@ -187,14 +198,14 @@ def _moving(
 def _slopes(
     of: str, loop: Loop, gains: Gains, gain_rates: Gains, batch: Scenario, batch_rates: Any
 ) -> tuple[Array, Array]:
-    """Derivative of the figure `of` and status of every contact, (slots, lanes)."""
+    """Return the derivative of the result `of` and the status of every contact, (slots, lanes)."""
     moving, fixed = eqx.partition(batch, eqx.is_inexact_array)
 
-    def figure(gains: Gains, moving: Any) -> tuple[Array, Array]:
+    def result(gains: Gains, moving: Any) -> tuple[Array, Array]:
         scenario = eqx.combine(moving, fixed)
         metrics = rollout(loop, gains, scenario)
         outcome = compare_with_reference(loop, scenario, metrics)
         return getattr(outcome if of in Outcome._fields else metrics, of), metrics.status
 
-    _, slopes, status = jax.jvp(figure, (gains, moving), (gain_rates, batch_rates), has_aux=True)
+    _, slopes, status = jax.jvp(result, (gains, moving), (gain_rates, batch_rates), has_aux=True)
     return slopes, status

@@ -1,13 +1,14 @@
-"""Programs kept between calls as the compiler made them: what runs again is neither traced nor lowered.
+"""Cache of compiled programs across processes, which avoids both tracing and lowering.
 
-That takes longer than running a short batch. What jax knows of a compiled program is kept in a file whose
-name is made of all it depends on: the sources, the versions of what they stand on, static arguments, shapes,
-the settings of jax, the compiler's flags and options, and the processor. The machine code stays in the
-compile cache and is named by its key there: jax can write code whole, but what it has read itself it writes
-so that it ends in an error when it runs. As with that cache, whoever may write into the folder may run code
-in the process that reads it: files are sealed against damage, not against their author.
+Tracing and lowering take longer than running a short batch. JAX's description of a compiled program is stored
+in a file, whose name is the hash of everything that determines it: sources, versions of dependencies, static
+arguments, shapes, settings of JAX, compiler flags and options, and processor. The machine code stays in the
+compile cache, and the file contains its key there: JAX can serialise machine code completely, but code that
+it has itself deserialised fails after another serialisation. As with the compile cache, anyone who may write
+into the folder may run code in the process that reads it: checksums protect against damage, not against
+malicious files.
 
-Not all that is used of jax here is public. Where it is not there, and on graphics cards, nothing is kept.
+Some functions of JAX used here are private. If one is missing, and on graphics cards, nothing is cached.
 """
 
 import dataclasses
@@ -30,14 +31,14 @@ from jaxhil.simulation import compile_cache
 from jaxhil.simulation.environment import known_options, program_folder, rounding_flags, xla_flags
 from jaxhil.simulation.sources import PACKAGES, sources_sha256, versions
 
-ENDING = ".compiled"  # of the files' names
-READING = "/jax/compilation_cache/cache_retrieval_time_sec"  # jax's name for the time that takes
-CODE = "exec"  # what jax calls machine code in its pickles
-# What a program may call: of LAPACK, which is made ready before the program is used, and what only tells the
-# compiler where arrays are. Anything else may be a function of the process that wrote it.
+ENDING = ".compiled"  # suffix of the file names
+READING = "/jax/compilation_cache/cache_retrieval_time_sec"  # JAX's name for the time of reading a program
+CODE = "exec"  # JAX's tag of machine code in its pickles
+# Calls that a program may contain: of LAPACK, which is initialised before the program is used, and
+# annotations of the arrays' placement. Any other call may refer to a function of the writing process.
 CALLS = re.compile(r"lapack_\w+|Sharding|SPMD\w+|xla\.sdy\.\w+")
 
-_programs: dict[Any, Callable[..., Any]] = {}  # of this process
+_programs: dict[Any, Callable[..., Any]] = {}  # programs of this process
 
 
 def run(
@@ -46,29 +47,30 @@ def run(
     *arguments: Any,
     options: Mapping[str, int | str] = MappingProxyType({}),
 ) -> Any:
-    """`function(static, *arguments)`, compiled with the compiler's `options`.
+    """Return `function(static, *arguments)`, compiled with the compiler's `options`.
 
-    `function` is one of a module; its result is made of arrays, tuples and named tuples. `static` is
-    hashable, and its `repr` tells all of it; `arguments` are pytrees of arrays, those of equal shapes placed
-    alike. Programs are kept beside the compiled ones, but for those of what is foreign.
+    `function` is defined at the top of a module; its result consists of arrays, tuples and named tuples.
+    `static` is hashable, and its `repr` describes it completely. `arguments` are pytrees of arrays; arrays of
+    equal shape have equal placement. Programs are cached on disk unless they contain user-registered laws.
     """
     program, leaves = _look_up(function, static, arguments, options)
     return program(*leaves)
 
 
 def prepare(function: Callable[..., Any], static: Any, *arguments: Any) -> None:
-    """Make what `run` will run on such arguments."""
+    """Compile the program that `run` will use for these arguments."""
     program, leaves = _look_up(function, static, arguments, {})
     make(program, leaves)
 
 
 def make(program: Any, arguments: Iterable[Any]) -> None:
-    """Compile what `compiled` returned, if it is not."""
+    """Compile the result of `compiled`, unless it is compiled already."""
     if not isinstance(program, jax.stages.Compiled):
         program.lower(*arguments).compile()
 
 
 def _look_up(function, static, arguments, options):
+    """Return the program for these arguments, and their leaves."""
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
@@ -79,16 +81,16 @@ def _look_up(function, static, arguments, options):
         def flat(*leaves):
             return function(static, *jax.tree.unflatten(structure, leaves))
 
-        def made():
+        def jitted():
             flat.__name__ = function.__name__
             return jax.jit(flat, compiler_options=known_options(options))
 
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
-        named = function.__module__, function.__qualname__
-        made_of = (*named, static, structure, placed, sorted(options.items()))
-        # Arguments may have laws in their structure.
+        name = function.__module__, function.__qualname__
+        made_of = (*name, static, structure, placed, sorted(options.items()))
+        # The structure of the arguments may contain laws.
         foreign = is_foreign((static, jax.tree.unflatten(structure, [None] * len(leaves))))
-        program = compiled(made_of, made, leaves, None if foreign else folder)
+        program = compiled(made_of, jitted, leaves, None if foreign else folder)
         _programs[key] = program
     return program, leaves
 
@@ -99,16 +101,16 @@ def compiled(
     arguments: Iterable[Any],
     folder: str | os.PathLike[str] | None,
 ) -> Callable[..., Any]:
-    """The jitted program that `made` returns, compiled for such arrays; as it is without a folder.
+    """Return the jitted program from `made`, compiled for such arrays; without a folder not yet compiled.
 
-    The `repr` of what it is `made_of` tells all of that.
+    The `repr` of `made_of` describes completely from what the program is made.
     """
     if folder is None or jax.default_backend() != "cpu":
         return made()
     try:
         path = Path(folder) / f"{_name(made_of)}{ENDING}"
     except Exception:
-        # A jax that does not tell all that the name is made of.
+        # This version of JAX lacks a part of the name.
         return made()
     program = _read(path)
     if program is None:
@@ -120,12 +122,15 @@ def compiled(
 
 
 def calls_of(text: str) -> set[str]:
-    """The names of all that a lowered program calls."""
+    """Return the names of all calls in a lowered program."""
     return {quoted or plain for quoted, plain in re.findall(r'custom_call @(?:"([^"]*)"|([^\s(]+))', text)}
 
 
 def is_foreign(value: Any) -> bool:
-    """Whether anything of another package is in it, or what its text does not tell: an array, a function."""
+    """Return whether a value contains objects of other packages, or arrays or functions.
+
+    Their `repr` may not describe them completely.
+    """
     if value is None or isinstance(value, (str, bool, int, float)):
         return False
     if type(value) not in (tuple, list, dict) and type(value).__module__.split(".")[0] not in PACKAGES:
@@ -138,41 +143,44 @@ def is_foreign(value: Any) -> bool:
 
 
 def _name(made_of) -> str:
+    """Return the hash of everything that determines a program."""
     from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 
     processor = xla_client.get_topology_for_devices(jax.devices()).fingerprint()
     settings = _settings()
     if not settings:
         raise LookupError("settings")
-    here = processor, jax.device_count(), rounding_flags(xla_flags()), sorted(settings)
-    text = repr((made_of, here, sources_sha256(), versions()))
+    process = processor, jax.device_count(), rounding_flags(xla_flags()), sorted(settings)
+    text = repr((made_of, process, sources_sha256(), versions()))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _settings() -> tuple[tuple[str, Any], ...]:
-    """What jax is set to in this thread now, but for folders; nothing where it does not tell."""
-    known = getattr(jax.config, "values", {})
-    return tuple([(name, getattr(jax.config, name, known[name])) for name in known if name[-4:] != "_dir"])
+    """Return JAX's settings in this thread, except folders; empty if JAX does not provide them."""
+    values = getattr(jax.config, "values", {})
+    return tuple([(name, getattr(jax.config, name, values[name])) for name in values if name[-4:] != "_dir"])
 
 
 def _read(path: Path) -> Any:
-    """The program kept in a file; None if there is none, or none that can be read."""
-    begun = time.monotonic()
+    """Return the program from a file; None if there is none or it is unreadable."""
+    start = time.monotonic()
     content = read_sealed(path)
     if content is None:
         return None
     try:
         program = _from_bytes(content)
-        jax.monitoring.record_event_duration_secs(READING, time.monotonic() - begun)
+        jax.monitoring.record_event_duration_secs(READING, time.monotonic() - start)
         return program
     except Exception:
-        # Written whole, but by something else; or the machine code is gone.
+        # Another version wrote the file, or the machine code was deleted.
         return None
 
 
 def _write(path: Path, program: Any, key: str, calls: set[str]) -> None:
-    """All or nothing; a folder that has become full or read-only, and a jax that cannot do it, cost only the
-    next call's time."""
+    """Write a program atomically; errors are ignored, since only the next call takes longer.
+
+    Possible errors are a full or read-only folder, or a version of JAX that cannot serialise.
+    """
     if not all(CALLS.fullmatch(name) for name in calls):
         return
     with suppress(Exception):
@@ -182,12 +190,16 @@ def _write(path: Path, program: Any, key: str, calls: set[str]) -> None:
 
 
 def _to_bytes(program, key, calls_lapack):
+    """Return the content of a program's file."""
     from jax.experimental import serialize_executable
 
     content, unloaded = io.BytesIO(), program._executable._unloaded_executable
 
     class Pickler(serialize_executable._JaxPjrtPickler):
+        """Pickler that writes the key of the machine code instead of the code."""
+
         def persistent_id(self, obj):
+            """Return the key instead of the machine code."""
             return (CODE, key) if obj is unloaded.xla_executable else super().persistent_id(obj)
 
     pickle.dump((calls_lapack, [device.id for device in unloaded.device_list]), content)
@@ -196,12 +208,16 @@ def _to_bytes(program, key, calls_lapack):
 
 
 def _from_bytes(content):
+    """Return the program from a file's content."""
     from jax._src import compilation_cache
     from jax._src.lax import linalg
     from jax.experimental import serialize_executable
 
     class Unpickler(serialize_executable._JaxPjrtUnpickler):
+        """Unpickler that reads the machine code from the compile cache."""
+
         def persistent_load(self, pid):
+            """Return the machine code with a key."""
             if pid[0] != CODE:
                 return super().persistent_load(pid)
             client, devices = self.backend, self.execution_devices
@@ -211,11 +227,11 @@ def _from_bytes(content):
             return code
 
     file = io.BytesIO(content)
-    calls_lapack, places = pickle.load(file)
+    calls_lapack, indices = pickle.load(file)
     if calls_lapack:
-        # As a rule that happens when a call of it is lowered.
+        # Normally JAX does this when it lowers a call of LAPACK.
         linalg.initialize_lapack()
     devices = {device.id: device for device in jax.devices()}
-    client, own = jax.devices()[0].client, [devices[place] for place in places]
-    unloaded, arguments, result, no_kwargs = Unpickler(file, client, own).load()
+    client, used_devices = jax.devices()[0].client, [devices[index] for index in indices]
+    unloaded, arguments, result, no_kwargs = Unpickler(file, client, used_devices).load()
     return jax.stages.Compiled(unloaded.load(), [], arguments, result, no_kwargs=no_kwargs)

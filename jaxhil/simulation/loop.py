@@ -1,8 +1,8 @@
-"""The loop of a hardware-in-the-loop contact rig: what is fixed before the first tick, and how a run begins.
+"""Loop of a hardware-in-the-loop contact rig: its static structure, its constants, and the start of a run.
 
-`jaxhil.simulation.tick` runs one tick of it, through the stages of notebooks/guide/model.md section 1. Time
-runs in control periods, and each lane of a batch has its own. A `Loop` is static: it shapes the compiled
-program. `RigConstants` are arrays that stay constant during a run. `LoopState` is what evolves.
+`jaxhil.simulation.tick` runs one tick, with the stages of notebooks/guide/model.md, section 1. Time is in
+control periods, and each lane of a batch has its own. A `Loop` is static: it determines the compiled program.
+`RigConstants` are arrays that stay constant during a run. `LoopState` is the state.
 """
 
 from typing import NamedTuple
@@ -29,13 +29,13 @@ from jaxhil.simulation.scenario import Scenario
 
 
 class Loop(eqx.Module):
-    """What shapes the compiled loop; every field is static."""
+    """Structure of the loop, which determines the compiled program; every field is static."""
 
     law: ContactLaw = eqx.field(static=True)  # contact law
-    compensator: Compensator = eqx.field(static=True)  # the law of the controller
-    integrator: str = eqx.field(static=True)  # of the numerical model, a name of `INTEGRATORS`
-    hold: str = eqx.field(static=True)  # of the command within a period, "linear" or "zoh"
-    latency: int = eqx.field(static=True)  # of the command, 0 or 1 periods
+    compensator: Compensator = eqx.field(static=True)  # compensator
+    integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `INTEGRATORS`
+    hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
+    latency: int = eqx.field(static=True)  # latency of the command, 0 or 1 periods
     has_lag: bool = eqx.field(static=True)  # whether the force sensor has a first-order lag
     has_force_bias: bool = eqx.field(static=True)  # whether the force sensor has a bias
     has_force_noise: bool = eqx.field(static=True)  # whether the force sensor has noise
@@ -44,79 +44,82 @@ class Loop(eqx.Module):
     has_sample_effects: bool = eqx.field(static=True)
     # whether the motion simulator has limits of velocity or acceleration
     has_limits: bool = eqx.field(static=True)
-    # the first derivative of the mechanism's position that jumps at the ticks (0: the position itself; 3
-    # stands for all higher ones)
+    # order of the lowest derivative of the mechanism's position that jumps at the ticks; 3 if higher than 2
     first_break: int = eqx.field(static=True)
-    cells: CellCounts = eqx.field(static=True)  # of a sampling interval; `NO_CELLS` where samples suffice
+    cells: CellCounts = eqx.field(static=True)  # cells of a sampling interval; `NO_CELLS` if samples suffice
     is_two_sided: bool = eqx.field(static=True)  # whether there is a second surface
     ring: int = eqx.field(static=True)  # samples in the delay lines of the sensors
     controller_ring: int = eqx.field(static=True)  # samples in the delay lines of the controller
-    energies: bool = eqx.field(static=True)  # whether the work of the contact force is followed
+    energies: bool = eqx.field(static=True)  # whether the work of the contact force is recorded
     probed: bool = eqx.field(static=True)  # whether scenarios have a `Probe`
-    chatter: bool = eqx.field(static=True)  # whether the swings of the force command are followed
+    chatter: bool = eqx.field(static=True)  # whether the swings of the force command are recorded
 
     @property
     def reads_always(self) -> bool:
-        """Whether the force sensor reads a force without contact: it has noise or a bias."""
+        """Return whether the force sensor reads a force without contact, due to noise or bias."""
         return self.has_force_noise or self.has_force_bias
 
     @property
     def is_idle_in_flight(self) -> bool:
-        """Whether nothing happens in flight before the hardware touches: drives that can follow, no noise,
-        bias or steps of a reading, a law that waits for the contact, no probe that counts from x_d = 0."""
+        """Return whether nothing happens in flight before the hardware touches.
+
+        This requires no limits of the drives, no noise, bias or rounding of readings, a compensator that
+        waits for the contact, and no probe, whose time counts from x_d = 0.
+        """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)
         return waits and not (uneven or self.probed)
 
     @property
     def first_tick(self) -> int:
-        """The number that ticks begin with: rings are read up to one ring behind."""
+        """Return the number of the first tick: delay lines are read up to one ring back."""
         return max(self.ring, self.controller_ring)
 
     @property
     def has_corners(self) -> bool:
-        """Whether the real force's peak may be a corner, at a tick or where the motion turns."""
+        """Return whether the real force may have its peak at a corner: at a tick or a reversal."""
         return self.first_break in (1, 2) or (self.first_break > 0 and self.law.jumps)
 
     @property
     def follows_intervals(self) -> bool:
-        """Whether the motion is needed between samples."""
+        """Return whether the motion between samples is needed."""
         return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
     @property
     def has_cells(self) -> bool:
-        """Whether the contact is followed along the exact motion between samples."""
+        """Return whether the contact follows the exact motion between samples."""
         return self.cells.part > 0
 
 
 class Delays(NamedTuple):
-    """The delays of a loop in sampling intervals.
+    """Delays of a loop in sampling intervals.
 
-    With one surface the contact law is evaluated as soon as the motion is known, by the transport delay ahead
-    of time. With two its parameters may change meanwhile: it is then evaluated when the motion happens, and
-    the other numbers count from there."""
+    With one surface the contact law is evaluated as soon as the motion is known, which is earlier than the
+    motion by the transport delay. With two surfaces its parameters may change in the meantime. It is then
+    evaluated when the motion takes place, and the other delays count from there.
+    """
 
-    force: Delay  # at which the force is read
-    position: Delay  # at which the position is read
-    real: Int[Array, "*batch"]  # intervals to look back for the newest force that acts by a tick
+    force: Delay  # delay of the force reading
+    position: Delay  # delay of the position reading
+    real: Int[Array, "*batch"]  # intervals to look back for the newest force that acts before a tick
     contact: Int[Array, "*batch"]  # intervals after which the contact law is evaluated
 
 
 class RigConstants(NamedTuple):
-    """What stays constant during a run, per lane."""
+    """Constants of a run, per lane."""
 
-    scenario: Scenario  # the lane's own numbers
-    propagation: Propagation  # motion simulator, discretised
-    cells: Cells | None  # of a sampling interval; None for a loop without
+    scenario: Scenario  # numbers of the lane
+    propagation: Propagation  # discretised motion simulator
+    cells: Cells | None  # cells of a sampling interval; None for a loop without cells
     delays: Delays  # in sampling intervals
-    constants: Constants  # what the controller knows of the rig
-    inverse_mass: Float[Array, "*batch"]  # [1/kg], of the equivalent mass
+    constants: Constants  # rig data that the controller knows
+    inverse_mass: Float[Array, "*batch"]  # inverse of the equivalent mass [1/kg]
 
 
 def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -> RigConstants:
     """Discretise the linear parts exactly and split every delay into sampling intervals and a fraction.
 
-    Unless its position is `measured`, a run has none to read: less to work out at every tick.
+    Without `measured`, runs have no position reading, which saves time in every tick.
     """
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)
@@ -150,7 +153,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
 
 
 def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
-    """Every delay of a scenario in sampling intervals."""
+    """Return every delay of a scenario in sampling intervals."""
     period, simulator = scenario.control_period, scenario.simulator
     force = split_delay(simulator.delay + scenario.force_sensor.delay, period)
     position = split_delay(simulator.delay + scenario.position_sensor.delay, period)
@@ -171,9 +174,10 @@ def enter(
     velocity: Array,
     tick: Array,
 ) -> LoopState:
-    """Start a run at `tick` in uniform motion at `position` [m], `velocity` [m/s]; rings need no filling.
+    """Start a run at `tick` in uniform motion at `position` [m], `velocity` [m/s].
 
-    The motion simulator is in the steady state of that motion's history, as it was held.
+    The motion simulator is in the steady state of this motion, including the hold of the command. The delay
+    lines need not be filled.
     """
     stride = rig.constants.control_period * velocity
     commands = tuple(

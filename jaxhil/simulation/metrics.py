@@ -1,4 +1,4 @@
-"""Figures of the contacts that are over: restitution, peaks, duration, energies, and how each ended."""
+"""Metrics of finished contacts: restitution, peaks, duration, energies, and status."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ STATUS_NAMES = {
     DIVERGED: "diverged",
     NON_FINITE: "non-finite",
 }
-# What a status says in a sentence, of those with which a run ends badly.
+# Explanations of the statuses other than `OK`.
 STATUS_REASONS = {
     "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
     "the force sensor did not show it; or the contact before left faster than velocity_limit, and the drives "
@@ -30,40 +30,40 @@ STATUS_REASONS = {
 
 
 class Metrics(NamedTuple):
-    """Figures of every contact, (slots, *batch).
+    """Metrics of every contact, (slots, *batch).
 
-    excess_variation is V / 2 - (max F_c - min F_c), V the total variation sum |F_c(n+1) - F_c(n)| of the
-    command, which counts as 0 before the contact and after it. The least V / 2 there is, max - min, is that
-    of a command that swings but once: up to its maximum, down to its minimum and back to 0. What is beyond
-    is chatter: max - min for every whole swing too many.
+    excess_variation is V / 2 - (max F_c - min F_c), where V = sum |F_c(n+1) - F_c(n)| is the total variation
+    of the command, which counts as 0 before and after the contact. A command that rises to its maximum, falls
+    to its minimum and returns to 0 has the least V / 2, which is max - min. The excess is chatter: max - min
+    for each additional full swing.
 
-    position_shortfall is the largest |c - c'| at any tick of the contact, c the position command that the
-    compensator asks for and c' the one that velocity and acceleration limits let through to the drives. It is
-    0, to the bit, where neither limit binds or there is none.
+    position_shortfall is the largest |c - c'| at any tick of the contact, where c is the compensator's
+    position command and c' the command after the velocity and acceleration limits. It is exactly 0 if no
+    limit is active.
     """
 
     restitution: Float[Array, "slots *batch"]  # rebound speed over approach speed [1]
     approach_velocity: Float[Array, "slots *batch"]  # of the numerical model before the contact [m/s]
     peak_force: Float[Array, "slots *batch"]  # largest real contact force [N]
     peak_command: Float[Array, "slots *batch"]  # largest |F_c| [N]
-    excess_variation: Float[Array, "slots *batch"]  # of F_c [N], see above; 0 unless followed
-    # how far the motion simulator's limits held the command back [m], see above
+    excess_variation: Float[Array, "slots *batch"]  # of F_c [N], see above; 0 unless recorded
+    # greatest change of the position command by the limits [m], see above
     position_shortfall: Float[Array, "slots *batch"]
     duration: Float[Array, "slots *batch"]  # time with a real force [s]
-    # done on the mechanism by the real force along x_a [J]; 0 unless followed
+    # work done on the mechanism by the real force along x_a [J]; 0 unless recorded
     work_in: Float[Array, "slots *batch"]
-    work_out: Float[Array, "slots *batch"]  # returned by it [J]; 0 unless followed
-    # root mean square of x_d's depth off that of the same contact in space, as long as that lasts, each since
-    # it touched [m]; 0 unless probed
+    work_out: Float[Array, "slots *batch"]  # work returned by the mechanism [J]; 0 unless recorded
+    # root mean square difference of the penetrations of x_d and of the ideal contact, each since its touch,
+    # for the ideal contact's duration [m]; 0 unless probed
     trajectory_error: Float[Array, "slots *batch"]
-    # of the force measurement as the compensator estimates it by then [s]; 0 unless it does
+    # compensator's estimate of the force measurement's delay [s]; 0 unless it has one
     force_delay: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
-    ticks: Int[Array, "slots *batch"]  # run by then, and skipped on approaches
+    ticks: Int[Array, "slots *batch"]  # ticks until then, including the skipped ticks of approaches
 
 
 def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
-    """Before any contact."""
+    """Return the metrics before any contact."""
     numbers = jnp.full((slots, *like.shape), jnp.nan, like.dtype)
     counts = jnp.zeros((slots, *like.shape), jnp.int32)
     return Metrics(
@@ -84,7 +84,10 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
 
 
 def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
-    """Status of the contact under way, `age` ticks into its run: OK, also while it goes on."""
+    """Return the status of the current contact, `age` ticks into its run.
+
+    It is OK also while the contact continues.
+    """
     period = scenario.control_period
     way = jnp.where(
         jnp.isfinite(scenario.clearance), scenario.clearance, -jnp.minimum(scenario.contact_plane, 0)
@@ -93,7 +96,7 @@ def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
     patience = limit + 10 * way / scenario.velocity / period
     waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > patience)
     late = (watch.elapsed > limit) | waiting
-    # Without a measured force there is no contact, whatever made the numerical model turn back.
+    # Without a measured force there was no contact, whatever reversed the numerical model.
     ended = jnp.where(watch.measured, OK, NOT_REACHED)
     cut = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
     status = jnp.where(watch.over, ended, jnp.where(late, cut, OK))
@@ -112,15 +115,25 @@ def collect(
     ticks: Array,
     force_delay: Array | None = None,
 ) -> Metrics:
-    """Enter the contacts that are `over`, and were reached, at their `index`; `ticks` have run by now, and
-    the law estimates a `force_delay` [s], or does not."""
+    """Write the metrics of contacts that are `over` and were reached, at their `index`.
+
+    Args:
+        scenario: Scenarios.
+        metrics: Metrics so far.
+        watch: Records of the current contacts.
+        index: Slot of each lane's contact.
+        over: Whether a lane's contact is over.
+        status: Status of the contact.
+        ticks: Number of ticks so far.
+        force_delay: Compensator's estimate of the force measurement's delay [s]; None without one.
+    """
     period = scenario.control_period
-    none = jnp.zeros_like(period)
-    work_in, work_out = watch.works or (none, none)
-    excess = none
+    zeros = jnp.zeros_like(period)
+    work_in, work_out = watch.works or (zeros, zeros)
+    excess = zeros
     if watch.swings is not None:
         excess = watch.swings.variation / 2 - (watch.swings.highest - watch.swings.lowest)
-    followed = {
+    optional = {
         "position_shortfall": watch.shortfall,
         "trajectory_error": None if watch.deviation is None else root_mean_square(watch.deviation),
         "force_delay": force_delay,
@@ -136,13 +149,13 @@ def collect(
         work_out=work_out,
         status=status,
         ticks=ticks,
-        **{name: none if value is None else value for name, value in followed.items()},
+        **{name: zeros if value is None else value for name, value in optional.items()},
     )
     slots = metrics.restitution.shape[0]
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
-    here = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
-    entered = Metrics(*(jnp.where(here, v[None], m) for v, m in zip(values, metrics, strict=True)))
-    # What is not followed still is what it was before any contact: no work in every turn-over.
-    return entered._replace(
-        **{name: getattr(metrics, name) for name, value in followed.items() if value is None}
+    mask = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
+    updated = Metrics(*(jnp.where(mask, v[None], m) for v, m in zip(values, metrics, strict=True)))
+    # Values that are not recorded keep their initial value, which saves time.
+    return updated._replace(
+        **{name: getattr(metrics, name) for name, value in optional.items() if value is None}
     )

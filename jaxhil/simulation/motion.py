@@ -1,4 +1,4 @@
-"""The nominal run tick by tick, and the same contacts in space: what plots are drawn from."""
+"""Nominal run tick by tick, and the ideal contacts, for plots."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -17,34 +17,39 @@ from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.recording import Lane, prepare_recording, record_lanes
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
-STEPS = 8000  # of the integration in space
-POINTS = 800  # of them kept
+STEPS = 8000  # steps of the ideal contact's integration
+POINTS = 800  # number of stored points
 
-Laws = Mapping[str, tuple[str, Mapping[str, float]]]  # by name, a compensator and its gains
+Laws = Mapping[str, tuple[str, Mapping[str, float]]]  # compensator and gains by name
 
 
 class Curve(NamedTuple):
-    """A motion over time."""
+    """Motion over time."""
 
-    velocity: float  # at which it entered [m/s]
+    velocity: float  # approach velocity [m/s]
     time: np.ndarray  # [s]
-    force: np.ndarray  # on the numerical model [N]
-    position: np.ndarray  # of the numerical model [m]
-    force_measured: np.ndarray | None  # [N]; None in space
-    position_measured: np.ndarray | None  # [m]; None in space
+    force: np.ndarray  # force on the numerical model [N]
+    position: np.ndarray  # position of the numerical model [m]
+    force_measured: np.ndarray | None  # [N]; None for the ideal contact
+    position_measured: np.ndarray | None  # [m]; None for the ideal contact
 
 
 class Piece(NamedTuple):
-    """One run of the schedule: a contact, or with two surfaces all of them. Time 0 is the first touch of
-    uniform motion."""
+    """One run of the schedule: a contact or, with two surfaces, all contacts.
 
-    name: str  # of the run
+    Time 0 is the first touch, extrapolated by uniform motion.
+    """
+
+    name: str  # name of the run
     surfaces: tuple[float, ...]  # positions of the mechanism's surfaces [m]
-    curves: dict[str, Curve]  # by name, "in space" among them
+    curves: dict[str, Curve]  # curves by name; "in space" is the ideal contact
 
 
 def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piece]:
-    """The pieces of the nominal run under each of the `laws`; the run in space enters as the last of them."""
+    """Return the pieces of the nominal run under each of the `laws`.
+
+    The ideal contacts have the approach velocities of the last law's run.
+    """
     runs: dict[str, list[Curve]] = {}
     lanes = list(_lanes(mechanism, laws, seed))
     for names, loaded, scenarios in lanes:
@@ -53,48 +58,49 @@ def nominal_motion(mechanism: Mechanism, laws: Laws, seed: int = 0) -> list[Piec
 
 
 def scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[Piece]:
-    """The pieces of one scenario's run, a batch of one lane, which the plots call `name`."""
+    """Return the pieces of one scenario's run, a batch of one lane; plots call it `name`."""
     return _pieces(loaded.mechanism, scenarios, _runs(loaded, scenarios, [name]))
 
 
 def prepare_motion(mechanism: Mechanism, laws: Laws) -> None:
-    """Compile what `nominal_motion` will run under such laws."""
+    """Compile the programs of `nominal_motion` for these laws."""
     for _, loaded, scenarios in _lanes(mechanism, laws, 0):
         prepare_recording(loaded, scenarios)
 
 
 def _lanes(mechanism: Mechanism, laws: Laws, seed: int) -> Iterator[tuple[list[str], LoadedGains, Scenario]]:
-    """Of each compensator the names of its gains and the nominal scenario in as many lanes."""
+    """Yield for each compensator the names of its gains and the nominal scenario, a lane per name."""
     for compensator in dict.fromkeys(compensator for compensator, _ in laws.values()):
-        own = {name: gains for name, (one, gains) in laws.items() if one == compensator}
-        phase = np.full(len(own), mechanism.approach.phase)
+        gains_by_name = {name: gains for name, (law, gains) in laws.items() if law == compensator}
+        phase = np.full(len(gains_by_name), mechanism.approach.phase)
         scenarios = build_scenarios(mechanism, {"approach.phase": phase}, seed)
-        every = list(own.values())
-        lanes: Any = {name: np.array([gains[name] for gains in every]) for name in every[0]}
-        yield list(own), LoadedGains({}, compensator, lanes, mechanism), scenarios
+        sets = list(gains_by_name.values())
+        lanes: Any = {name: np.array([gains[name] for gains in sets]) for name in sets[0]}
+        yield list(gains_by_name), LoadedGains({}, compensator, lanes, mechanism), scenarios
 
 
 def _runs(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> dict[str, list[Curve]]:
-    """A lane for each of the names; the lanes differ by their gains alone."""
+    """Return the curves of a lane for each name; the lanes differ only in their gains."""
     _, recorded = record_lanes(loaded, scenarios)
     return {name: _split(lane, scenarios) for name, lane in zip(names, recorded, strict=True)}
 
 
 def _pieces(mechanism: Mechanism, scenarios: Scenario, runs: dict[str, list[Curve]]) -> list[Piece]:
+    """Return the pieces of runs, with the ideal contacts for the last run."""
     leading = list(runs.values())[-1]
     clearance = float(scenarios.clearance[0])
     two = bool(np.isfinite(clearance))
     surfaces = (0.0, -clearance) if two else (0.0,)
     pieces = []
-    for number, space in enumerate(_in_space(mechanism, scenarios, leading)):
-        others = {name: run[number] for name, run in runs.items() if number < len(run)}
+    for number, ideal in enumerate(_ideal_curves(mechanism, scenarios, leading)):
+        curves = {name: run[number] for name, run in runs.items() if number < len(run)}
         name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
-        pieces.append(Piece(name, surfaces, {"in space": space, **others}))
+        pieces.append(Piece(name, surfaces, {"in space": ideal, **curves}))
     return pieces
 
 
 def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
-    """A lane's runs."""
+    """Return the curves of a lane's runs."""
     signals = lane.signals
     begins = np.flatnonzero(signals.age == 0)
     ends = np.append(begins[1:], len(signals.age))
@@ -115,26 +121,26 @@ def _split(lane: Lane, scenarios: Scenario) -> list[Curve]:
     return pieces
 
 
-def _in_space(mechanism: Mechanism, scenarios: Scenario, entered: list[Curve]) -> list[Curve]:
-    """The reference's motion from each contact on, from 0.02 s before the touch to the end of that curve."""
-    velocity = np.array([curve.velocity for curve in entered])
-    step = (np.array([curve.time[-1] for curve in entered]) + APPROACH) / STEPS
+def _ideal_curves(mechanism: Mechanism, scenarios: Scenario, curves: list[Curve]) -> list[Curve]:
+    """Return the ideal motion from 0.02 s before each contact's touch to the end of the contact's curve."""
+    velocity = np.array([curve.velocity for curve in curves])
+    step = (np.array([curve.time[-1] for curve in curves]) + APPROACH) / STEPS
     forces, positions = kept_programs.run(
         _integrate,
         contact_law(mechanism.contact.law).simulated,
         jax.tree.map(lambda leaf: leaf[..., 0], scenarios.contact),
         scenarios.clearance[0],
         scenarios.equivalent_mass[0],
-        np.arange(len(entered)),
+        np.arange(len(curves)),
         velocity,
         step,
     )
-    keep = slice(None, None, STEPS // POINTS)
+    stored = slice(None, None, STEPS // POINTS)
     times = -APPROACH + step[:, None] * np.arange(STEPS)[None]
     motions = zip(times, np.asarray(forces), np.asarray(positions), strict=True)
     return [
-        Curve(curve.velocity, time[keep], force[keep], position[keep], None, None)
-        for curve, (time, force, position) in zip(entered, motions, strict=True)
+        Curve(curve.velocity, time[stored], force[stored], position[stored], None, None)
+        for curve, (time, force, position) in zip(curves, motions, strict=True)
     ]
 
 
@@ -147,13 +153,13 @@ def _integrate(
     velocities: Float[Array, "runs"],
     steps: Float[Array, "runs"],
 ) -> tuple[Float[Array, "runs steps"], Float[Array, "runs steps"]]:
-    """Force [N] and position [m] of M x'' = -F by semi-implicit Euler, in steps too small to see.
+    """Return force [N] and position [m] of M x'' = -F by semi-implicit Euler with very small steps.
 
-    Runs begin with the contacts `firsts`. The next contact's parameters hold once a contact is left.
+    Runs begin with the contacts `firsts`. The parameters of the next contact apply after a contact has ended.
     """
     last = contacts.damping.shape[0] - 1
 
-    def one(first, velocity, step):
+    def integrate(first, velocity, step):
         def advance(carry, _):
             position, speed, index, touched, state = carry
             parameters = jax.tree.map(lambda leaf: leaf[jnp.minimum(index, last)], contacts)
@@ -166,4 +172,4 @@ def _integrate(
         start = (-velocity * APPROACH, velocity, first, jnp.array(False), law.init(velocity))
         return lax.scan(advance, start, None, length=STEPS)[1]
 
-    return jax.vmap(one)(firsts, velocities, steps)
+    return jax.vmap(integrate)(firsts, velocities, steps)

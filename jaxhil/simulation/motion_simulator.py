@@ -1,14 +1,13 @@
-"""The motion simulator: x_a = G(s) e^{-s tau_p} x_d, propagated exactly from tick to tick.
+"""Motion simulator x_a = G(s) e^{-s tau_p} x_d, discretised exactly from tick to tick.
 
-A transport delay commutes with a linear system. So G is driven by the *undelayed* command, whose corners
-are the ticks themselves; x_a at any time t is its response at t - tau_p, and a sensor with delay tau_f sees
-the response at t - tau_p - tau_f. Every delay becomes one number: how long ago the response is read. Between
-ticks (sampling interval k spans t_k to t_{k+1}) the command is a straight line, and the response at the
-fraction s of a interval is a fixed row of numbers times (state, command at the interval's start, command at
-its end): the matrix exponential of the system augmented by its input. Nothing is interpolated and nothing is
-rounded to ticks.
+A transport delay commutes with a linear system. G is therefore driven by the undelayed command, whose corners
+are at the ticks. x_a at time t is its response at t - tau_p, and a sensor with delay tau_f reads the response
+at t - tau_p - tau_f. Every delay is thus the age of the response that is read. In sampling interval k, from
+t_k to t_{k+1}, the command is a straight line. The response at the fraction s of an interval is a constant
+row times (state, command at the interval's start, command at its end), from the matrix exponential of the
+system augmented by its input. There is no interpolation and no rounding to ticks.
 
-Time inside is in control periods. States are w, w', ..., w^(n-1) with den(p) w = u, y = num(p) w.
+Time is in control periods here. States are w, w', ..., w^(n-1) with den(p) w = u, y = num(p) w.
 """
 
 from typing import NamedTuple
@@ -17,17 +16,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-SQUARINGS, TERMS = 6, 13
+SQUARINGS, TERMS = 6, 13  # of the matrix exponential
 
-# One array of the batch shape per component: a stacked state would be taken apart at every tick.
+# One array of the batch shape per component: a stacked state would have to be split at every tick.
 State = tuple[Array, ...]
 
 
 class Delay(NamedTuple):
-    """A delay of r control periods, as whole sampling intervals to look back and a place within one."""
+    """Delay of r control periods, as whole sampling intervals to look back and a position within one."""
 
     intervals: Int[Array, "*batch"]  # to look back from the newest one, which is interval n - 1 at tick n
-    # place in (0, 1] within it: a reading at a tick takes the value just before the tick acts
+    # position in (0, 1] within it: a reading at a tick has the value just before the tick
     fraction: Float[Array, "*batch"]
 
 
@@ -35,19 +34,19 @@ class Propagation(NamedTuple):
     """Exact discrete motion simulator; rows act on (state, command at start, command at end)."""
 
     transition: Float[Array, "order columns *batch"]  # rows of the state one period later
-    position: Float[Array, "columns *batch"]  # row at the force sensor's place in the sampling interval [m]
+    position: Float[Array, "columns *batch"]  # row at the force sensor's sampling instant [m]
     velocity: Float[Array, "columns *batch"]  # row there [m/s]
-    # row at the position sensor's place [m]; None where nobody reads it
+    # row at the position sensor's sampling instant [m]; None if unused
     measured_position: Float[Array, "columns *batch"] | None
-    # rows of position and velocity at the interval's start, from within, where asked for
+    # rows of position and velocity at the interval's start (right limit); None unless requested
     start: tuple[Array, Array] | None
-    end: tuple[Array, Array] | None  # at its end, likewise
-    steady_command: Float[Array, "order *batch"]  # state of a uniform motion, per command now
-    steady_velocity: Float[Array, "order *batch"]  # state of a uniform motion, per its growth in a period
+    end: tuple[Array, Array] | None  # rows at its end (left limit); None unless requested
+    steady_command: Float[Array, "order *batch"]  # steady state per unit of the command
+    steady_velocity: Float[Array, "order *batch"]  # steady state per growth of the command in a period
 
 
 def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> Delay:
-    """Whole intervals and fraction of `delay` [s]; whole multiples of the period are met to 1e-9."""
+    """Return whole intervals and fraction of `delay` [s]; multiples of the period are recognised to 1e-9."""
     periods = delay / control_period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
     return Delay(whole.astype(jnp.int32), 1 - (periods - whole))
@@ -62,36 +61,37 @@ def propagation(
     hold: str,
     ends: bool = False,
 ) -> Propagation:
-    """Exact discretisation of num(s)/den(s) (descending powers, strictly proper; order 0 is ideal).
+    """Discretise num(s)/den(s) exactly (descending powers, strictly proper; order 0 is ideal).
 
-    With z' = A z + B u in periods, z(s) = E(s) (z, u(0), u(1) - u(0)) where E(s) is the exponential of
-    s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). Gradients pass to every parameter.
+    With z' = A z + B u in periods, z(s) = E(s) (z, u(0), u(1) - u(0)), where E(s) is the exponential of s
+    [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). Derivatives pass to every parameter. `ends` requests
+    the rows at the interval's start and end.
     """
     order = denominator.shape[0] - 1
     if order == 0:
         return _ideal(control_period, force_fraction, position_fraction, hold, ends)
     system, output = _companion(numerator, denominator, control_period)
-    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
     generator, _ = generator_rows(numerator, denominator, control_period)
-    places = [one, force_fraction]
+    instants = [ones, force_fraction]
     if ends:
-        places.append(zero)
+        instants.append(zeros)
     if position_fraction is not None:
-        places.append(position_fraction)
-    fractions = jnp.stack(places)
-    # Axes: row, column, place in the interval, batch.
+        instants.append(position_fraction)
+    fractions = jnp.stack(instants)
+    # The axes are row, column, instant in the interval, batch.
     rows = exponential(generator[:, :, None] * fractions[None, None], fractions)
-    # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
+    # This changes columns for (z, u(0), u(1) - u(0)) into columns for (z, u(0), u(1)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
     state = rows[:order]
 
-    def motion(place):
-        place = rows[:, :, place]
-        rates = [*place[1:order], _combine(system[order - 1], place[:order]) + place[order]]
-        return _combine(output, place[:order]), _combine(output, rates) / control_period[None]
+    def motion(instant):
+        state_rows = rows[:, :, instant]
+        rates = [*state_rows[1:order], _combine(system[order - 1], state_rows[:order]) + state_rows[order]]
+        return _combine(output, state_rows[:order]), _combine(output, rates) / control_period[None]
 
     position, velocity = motion(1)
-    steady_command = jnp.stack([-1 / system[order - 1][0]] + [zero] * (order - 1))
+    steady_command = jnp.stack([-1 / system[order - 1][0]] + [zeros] * (order - 1))
     return Propagation(
         transition=state[:, :, 0],
         position=position,
@@ -109,40 +109,43 @@ def generator_rows(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "order order_plus_2 *batch"], list[Array]]:
-    """Return the rows of (A, B, 0), with time in periods, and the weights with which the position is made of
-    the state; the order is at least 1."""
+    """Return the rows of (A, B, 0), with time in periods, and the output weights of the state.
+
+    The position is the sum of weights times states; the order is at least 1.
+    """
     order = denominator.shape[0] - 1
     system, output = _companion(numerator, denominator, control_period)
-    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
-    generator = [[*row, zero, zero] for row in system]
-    generator[order - 1][order] = one
+    zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    generator = [[*row, zeros, zeros] for row in system]
+    generator[order - 1][order] = ones
     return jnp.stack([jnp.stack(row) for row in generator]), output
 
 
 def exponential(
     upper: Float[Array, "order order_plus_2 *batch"], ramp: Float[Array, "*batch"]
 ) -> Float[Array, "order_plus_1 order_plus_2 *batch"]:
-    """First order + 1 rows of the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]], whose first rows
-    are `upper` and whose r is `ramp`: by scaling, Taylor and squaring, to rounding for norms up to 64.
+    """Return the first order + 1 rows of the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]].
 
-    Its last rows are (0, 1, r) and (0, 0, 1): they are not worked out. Matrix axes come first, so that every
-    product is a few vector operations over the batch; a library call per lane costs more than the whole
-    contact.
+    `upper` are its first rows (A, B, 0), and `ramp` is r. Scaling, Taylor series and squaring give rounding
+    accuracy for norms up to 64. The last rows, (0, 1, r) and (0, 0, 1), are not computed. Matrix axes come
+    first, so that every product is a few vector operations over the batch; a library call per lane costs more
+    than the whole contact.
     """
     order, size = upper.shape[:2]
     units = jnp.eye(size, dtype=upper.dtype).reshape(size, size, *[1] * ramp.ndim)
     scaled = upper / 2**SQUARINGS
 
     def ramp_row(ramp):
+        """Return the row (0, 1, r)."""
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Upper rows of a product of two such matrices, or their powers."""
+        """Return the upper rows of a product of two such matrices, or of their powers."""
         total = _product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
 
-    # Loops, not unrolled: fused into one another the products would be computed over and over.
+    # The loops are not unrolled: the compiler would fuse the products and compute them repeatedly.
     def horner(step, carry):
         terms = jnp.asarray(TERMS - step, ramp.dtype)
         return units[:order] + product(scaled, *carry) / terms, ramp / 2**SQUARINGS / terms
@@ -158,12 +161,12 @@ def exponential(
 
 
 def advance(transition: Array, state: State, start: Array, end: Array) -> State:
-    """The state one period later."""
+    """Return the state one period later."""
     return tuple(read(transition[i], state, start, end) for i in range(len(state)))
 
 
 def read(row: Array, state: State, start: Array, end: Array) -> Array:
-    """One row times (state, command at the interval's start, command at its end)."""
+    """Return a row times (state, command at the interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for i, component in enumerate(state):
         total = total + row[i] * component
@@ -171,7 +174,7 @@ def read(row: Array, state: State, start: Array, end: Array) -> Array:
 
 
 def read_measured(plant: Propagation, state: State, start: Array, end: Array) -> Array | None:
-    """Position [m] at its sensor's place in the sampling interval; None where nobody reads it."""
+    """Return the position [m] at its sensor's sampling instant; None if unused."""
     return None if plant.measured_position is None else read(plant.measured_position, state, start, end)
 
 
@@ -180,29 +183,31 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """The row of the rate [1/s] of what a row gives at a place within the sampling interval.
+    """Return the row of the time derivative [1/s] of a row's result within the sampling interval.
 
-    There d/ds E(s) = E(s) G, G the generator of `propagation`.
+    It uses d/ds E(s) = E(s) G, where G is the generator of `propagation`.
     """
     *state, start, end = row
     zero = jnp.zeros_like(start)
-    level = start + end
+    growth = start + end
     if state:
         system = _last_row(denominator, control_period)
         rates = [below + state[-1] * a for below, a in zip([zero, *state[:-1]], system, strict=True)]
         driven = state[-1]
     else:
         rates, driven = [], zero
-    return jnp.stack([*rates, driven - level, level]) / control_period[None]
+    return jnp.stack([*rates, driven - growth, growth]) / control_period[None]
 
 
 def steady_state(plant: Propagation, command: Array, step: Array) -> State:
-    """State at a tick of a uniform motion: drive input `command` now, growing by `step` per period."""
+    """Return the state in uniform motion: drive input `command`, which grows by `step` per period."""
     order = plant.steady_command.shape[0]
     return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
 
 
 def _ideal(control_period, force_fraction, position_fraction, hold, ends):
+    """Return the propagation of an ideal motion simulator, which follows its command exactly."""
+
     def position(fraction):
         return jnp.stack([1 - fraction, fraction])
 
@@ -223,30 +228,32 @@ def _ideal(control_period, force_fraction, position_fraction, hold, ends):
 
 
 def _companion(numerator, denominator, control_period):
-    """Rows of A (the last carries the coefficients) and output weights, time in periods."""
+    """Return rows of A (the last has the coefficients) and output weights, with time in periods."""
     order = denominator.shape[0] - 1
     powers = [control_period**i for i in range(order + 1)]
-    zero, one = jnp.zeros_like(control_period), jnp.ones_like(control_period)
-    system = [[one if j == i + 1 else zero for j in range(order)] for i in range(order - 1)]
+    zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
+    system = [[ones if j == i + 1 else zeros for j in range(order)] for i in range(order - 1)]
     system.append(_last_row(denominator, control_period))
     output = [numerator[order - 1 - i] * powers[order - i] / denominator[0] for i in range(order)]
     return system, output
 
 
 def _last_row(denominator, control_period):
+    """Return the last row of A."""
     order = denominator.shape[0] - 1
     return [-denominator[order - i] * control_period ** (order - i) / denominator[0] for i in range(order)]
 
 
 def _steady_velocity(system, transition, steady_command, hold):
+    """Return the steady state per growth of the command in a period."""
     order = steady_command.shape[0]
     if hold == "linear":
-        # Ramp response: w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.
+        # The ramp response is w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.
         constant = -system[order - 1][0]
         linear = -system[order - 1][1] if order > 1 else jnp.ones_like(constant)
         steady = jnp.zeros_like(steady_command).at[0].set(-linear / constant**2)
         return steady.at[1].set(1 / constant) if order > 1 else steady
-    # Staircase: z(k+1) = Ad z(k) + Bd u(k+1) with z(k) = alpha u(k+1) + beta step.
+    # For a staircase, z(k+1) = Ad z(k) + Bd u(k+1) with z(k) = alpha u(k+1) + beta step.
     identity = jnp.eye(order, dtype=steady_command.dtype)
     batch_first = jnp.moveaxis(transition[:, :order], (0, 1), (-2, -1))
     right = jnp.moveaxis(steady_command, 0, -1)[..., None]
@@ -257,7 +264,7 @@ def _steady_velocity(system, transition, steady_command, hold):
 
 
 def _combine(weights, rows):
-    """sum_i weights_i rows_i, rows (columns, *batch)."""
+    """Return sum_i weights_i rows_i; rows are (columns, *batch)."""
     total = weights[0][None] * rows[0]
     for weight, row in zip(weights[1:], rows[1:], strict=True):
         total = total + weight[None] * row
@@ -265,6 +272,7 @@ def _combine(weights, rows):
 
 
 def _product(left, right):
+    """Return the matrix product."""
     total = left[:, 0, None] * right[None, 0]
     for k in range(1, left.shape[0]):
         total = total + left[:, k, None] * right[None, k]

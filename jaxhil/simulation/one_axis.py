@@ -38,7 +38,7 @@ class OneAxis(RigModel):
         return build_loop(mechanism, compensator, scenarios, **parts)
 
     def runs(self, mechanism: Mechanism) -> int:
-        """Return how many contacts a scenario has."""
+        """Return the number of contacts of a scenario."""
         return mechanism.approach.contacts
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
@@ -46,12 +46,12 @@ class OneAxis(RigModel):
         return compare_with_reference(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return scenarios of which the `idle` lanes have no contact."""
+        """Return scenarios in which the `idle` lanes have no contact."""
         contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return the order of a run's duration [s]: half a period sqrt(M/k) per contact; for sorting only."""
+        """Return a rough duration [s]: half a period sqrt(M/k) per contact, used only for sorting."""
         stiffness = np.asarray(scenarios.contact.stiffness)
         while stiffness.ndim > 2:
             stiffness = stiffness[:, 0]
@@ -60,7 +60,7 @@ class OneAxis(RigModel):
         return np.sum(np.where(slots, periods, 0), axis=0)
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return a number that differs where the whole periods of a delay do; for sorting only."""
+        """Return a number that differs if a delay's whole periods differ, used only for sorting."""
         simulator = np.asarray(scenarios.simulator.delay)
         period = np.asarray(scenarios.control_period)
         force, position = (
@@ -70,7 +70,7 @@ class OneAxis(RigModel):
         return force + position / (1 + np.max(position))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return the scenarios with sensors that have no noise."""
+        """Return the scenarios with noise-free sensors."""
         force, position = (
             sensor._replace(noise_std=np.zeros_like(sensor.noise_std))
             for sensor in (scenarios.force_sensor, scenarios.position_sensor)
@@ -86,17 +86,17 @@ class OneAxis(RigModel):
         return loop.compensator.name
 
     def prepared(self, loop: Loop, scenarios: Scenario) -> RigConstants:
-        """Return what stays constant during a run, worked out once for all gains."""
+        """Return the constants of a run, which do not depend on the gains."""
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Return the outcome of what `prepared` returned, differentiable by the gains."""
+        """Return the outcome of a result of `prepared`; differentiable with respect to the gains."""
         if loop.compensator.is_large:
             rig = _apart(rig)
         return compare_with_reference(loop, rig.scenario, run_contacts(loop, gains, rig))
 
     def noise_amplification(self, loop: Loop, gains: Gains, rig: RigConstants) -> Float[Array, "*batch"]:
-        """Return by how much the compensator amplifies the force sensor's noise [1]."""
+        """Return the compensator's amplification of the force sensor's noise [1]."""
         return loop.compensator.noise_amplification(gains, rig.constants)
 
 
@@ -105,10 +105,10 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _apart(rig: RigConstants) -> RigConstants:
-    """Return the same rig, such that loops around its runs are compiled apart from them.
+    """Return an equal rig for which XLA compiles loops around the runs separately from them.
 
-    XLA makes the outermost loop that does not sort one function, all loops within it included, and LLVM's
-    time for a function grows with the square of its length.
+    XLA compiles the outermost loop without a sort, with all loops in it, as one function, and LLVM's time for
+    a function grows with the square of its length. The sort of two numbers here keeps outer loops separate.
     """
     contacts = rig.scenario.contacts
     most = jnp.max(contacts)

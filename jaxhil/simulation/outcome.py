@@ -14,21 +14,21 @@ from jaxhil.simulation.scenario import Scenario
 
 
 class Outcome(NamedTuple):
-    """A run beside the ideal contact, per contact, (slots, *batch)."""
+    """Metrics of runs beside those of the ideal contact, per contact, (slots, *batch)."""
 
-    metrics: Metrics  # of the run
+    metrics: Metrics  # metrics of the run
     # e* of the ideal contact, entered at the same speed [1]
     reference_restitution: Float[Array, "slots *batch"]
-    reference_peak_force: Float[Array, "slots *batch"]  # of that contact [N]
-    # of that contact [s]; infinite if the bodies never separate
+    reference_peak_force: Float[Array, "slots *batch"]  # peak force of the ideal contact [N]
+    # duration of the ideal contact [s]; infinite if the bodies never separate
     reference_duration: Float[Array, "slots *batch"]
     error: Float[Array, "slots *batch"]  # e - e* [1]
-    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the reference's peak force [1]
-    # excess variation of F_c (`Metrics`) over the reference's peak force [1]
+    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the ideal contact's peak force [1]
+    # excess variation of F_c (`Metrics`) over the ideal contact's peak force [1]
     chatter: Float[Array, "slots *batch"]
-    wanted: Bool[Array, "slots *batch"]  # whether the contact was asked for
+    wanted: Bool[Array, "slots *batch"]  # whether the scenario has this contact
     good: Bool[Array, "slots *batch"]  # whether it was reached and ended well
-    # whether its real force or its duration is beyond the bounds beside the ideal contact (`contact_bounds`)
+    # whether its real force or its duration violates the bounds of `contact_bounds`
     unlike: Bool[Array, "slots *batch"]
 
     @property
@@ -43,7 +43,7 @@ class Outcome(NamedTuple):
 
 
 def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
-    """Compare a run with the ideal contacts, each entered at the speed it had on the rig."""
+    """Compare a run with the ideal contacts, each with the approach velocity that it had on the rig."""
     slots = metrics.restitution.shape[0]
     number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
         slots, *[1] * (metrics.restitution.ndim - 1)
@@ -54,10 +54,12 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
     contact = parameters_by_slot(scenario.contact)
     mass = jnp.broadcast_to(scenario.equivalent_mass, velocity.shape)
     reference = loop.law.reference(contact, mass, velocity)
-    known = scenario.reference
-    if known is not None:
-        given = ~jnp.isnan(known.restitution)
-        reference = Reference(*(jnp.where(given, a, b) for a, b in zip(known, reference, strict=True)))
+    known_reference = scenario.reference
+    if known_reference is not None:
+        is_known = ~jnp.isnan(known_reference.restitution)
+        reference = Reference(
+            *(jnp.where(is_known, a, b) for a, b in zip(known_reference, reference, strict=True))
+        )
     return Outcome(
         metrics=metrics,
         reference_restitution=reference.restitution,

@@ -1,6 +1,6 @@
-"""Motion in the cells of a sampling interval, and the pieces of it on which the motion goes one way.
+"""Motion in the cells of a sampling interval, and its monotone pieces.
 
-A place s in a cell goes from 0 to 1. Arrays have the axes (pieces of a cell, cells, *batch).
+The relative time s in a cell is from 0 to 1. Arrays have the axes (pieces of a cell, cells, *batch).
 """
 
 from typing import NamedTuple
@@ -11,33 +11,33 @@ from jaxtyping import Array
 
 from jaxhil.simulation.roots import crossing
 
-SHORT = 8  # degree of a series on a short cell, in which the motion turns at most once
+SHORT = 8  # degree of a series on a short cell, in which the motion reverses at most once
 
 
 class Path(NamedTuple):
-    """The motion in each cell; a place s in a cell goes from 0 to 1."""
+    """Motion in each cell; the relative time s in a cell is from 0 to 1."""
 
     position: Array  # series of the position [m], (powers, cells, *batch)
-    rate: Array  # series of its change [m per period]
-    length: Array  # of the cells [periods], (cells, *batch)
+    rate: Array  # series of the velocity [m per period]
+    length: Array  # length of the cells [periods], (cells, *batch)
 
 
 class Pieces(NamedTuple):
-    """Cells cut where the motion turns, (pieces of a cell, cells, *batch)."""
+    """Cells divided where the motion reverses, (pieces of a cell, cells, *batch)."""
 
     path: Path
-    low: Array  # place at which a piece begins
-    high: Array  # place at which it ends
-    way: Array  # 1 where the position grows, else -1
+    low: Array  # s at which a piece begins
+    high: Array  # s at which it ends
+    way: Array  # 1 if the position increases, else -1
 
 
 def path_of(series: Array, length: Array) -> Path:
-    """Return the motion whose series in powers of the time since a cell's start [periods] are given."""
+    """Return the motion with this series in powers of the time since a cell's start [periods]."""
     return Path(series, _derivative(series), length)
 
 
 def cut_at_turns(path: Path) -> Pieces:
-    """Return the pieces of cells in which the motion turns at most twice, of short ones at most once."""
+    """Return the pieces of cells in which the motion reverses at most twice, in short ones at most once."""
     low, high = jnp.zeros_like(path.length), jnp.ones_like(path.length)
     if len(path.position) == 2:
         return pieces_between(path, jnp.stack([low, high]))
@@ -46,23 +46,23 @@ def cut_at_turns(path: Path) -> Pieces:
     bend = crossing(rate_at, path._replace(rate=_derivative(path.rate)), low, high, high)
     begin, end = jnp.stack([low, bend]), jnp.stack([bend, high])
     early, late = crossing(rate_at, path, begin, end, end)
-    # On each piece the velocity too goes one way: a damper lets go once at most.
+    # The velocity is monotone on each piece too, so that the force of a damper vanishes at most once.
     return pieces_between(path, jnp.stack([low, early, bend, late, high]))
 
 
 def pieces_between(path: Path, edges: Array) -> Pieces:
-    """Return the pieces between places, (edges, cells, *batch)."""
+    """Return the pieces between relative times, (edges, cells, *batch)."""
     moved = position_at(path, edges[1:]) - position_at(path, edges[:-1])
     return Pieces(path, edges[:-1], edges[1:], jnp.where(moved < 0, -1, 1).astype(moved.dtype))
 
 
 def position_at(path: Path, s: Array) -> Array:
-    """Position [m] at the place s."""
+    """Return the position [m] at the relative time s."""
     return horner(path.position, s * path.length)
 
 
 def rate_at(path: Path, s: Array) -> Array:
-    """Change of the position [m per period] at the place s."""
+    """Return the velocity [m per period] at the relative time s."""
     return horner(path.rate, s * path.length)
 
 
@@ -75,5 +75,6 @@ def horner(series: Array, tau: Array) -> Array:
 
 
 def _derivative(series):
+    """Return the series of the derivative."""
     orders = np.arange(1, len(series)).reshape(-1, *[1] * (series.ndim - 1))
     return series[1:] * orders.astype(series.dtype)

@@ -1,7 +1,7 @@
-"""What a mechanism file means: its contacts as they are in space, beside what the rig can do.
+"""Plausibility of a mechanism file: its ideal contacts compared with the abilities of the rig.
 
-The figures are those of `ContactLaw.reference`, the closed forms where a law has them: no tick is run. From
-them follow the warnings of what can hardly be meant, and how many ticks a run takes.
+The metrics are those of `ContactLaw.reference`, in closed form if the law has one; no tick is run. They give
+warnings about implausible numbers, and the number of ticks of a run.
 """
 
 import itertools
@@ -23,50 +23,50 @@ from jaxhil.simulation.free_flight import APPROACH
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import LONGEST_CONTACT, MotionSimulator, Scenario, build_scenarios
 
-MOST_TICKS = 1e7  # of a contact
-MOST_TICKS_OF_A_RUN = 1e9  # they are counted in 32 bits
+MOST_TICKS = 1e7  # limit on the ticks of a contact
+MOST_TICKS_OF_A_RUN = 1e9  # limit on the ticks of a run, which are counted in 32 bits
 
-FREQUENCIES = 0.05, 50.0  # Hz, of contacts that can be meant
-FASTEST = 0.1  # contact frequency over control rate, likewise
-LARGEST_VELOCITY = 1.0  # m/s, likewise
-SHOWN = 4  # contact frequencies in the line, beyond which only their range is said
+FREQUENCIES = 0.05, 50.0  # Hz; plausible contact frequencies
+FASTEST = 0.1  # greatest plausible contact frequency, over the control rate
+LARGEST_VELOCITY = 1.0  # m/s; greatest plausible approach velocity
+SHOWN = 4  # greatest number of contact frequencies in the line; for more, only their range
 
-_RARELY = 1e-9  # the share of draws beyond either end of what is taken to be drawn
-# Keys that decide on the number of ticks, and on the motion simulator's poles.
+_RARELY = 1e-9  # share of draws that are ignored at either end of a distribution
+# Prefixes of keys that determine the number of ticks, the drives' speeds, and the motion simulator's poles.
 _TICKS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
 _SPEEDS = ("approach.velocity", "rig.simulator.velocity_limit")
 _POLES = ("rig.simulator.", "rig.control_period")
 
 
 class ContactFigures(NamedTuple):
-    """A contact in space, entered at the speed of the first approach."""
+    """Ideal contact, entered at the velocity of the first approach."""
 
-    number: int  # of the first contact of the schedule that is so, from 1
-    frequency: float  # of a spring sqrt(k/M)/(2 pi), of other laws 1/(2 duration) [Hz]
+    number: int  # index of the first contact of the schedule with these metrics, from 1
+    frequency: float  # sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws [Hz]
     duration: float  # [s]; infinite if the bodies do not separate
     peak_force: float  # [N]
 
 
 class Meaning(NamedTuple):
-    """What a mechanism file means, nominally."""
+    """Summary of a nominal mechanism."""
 
     equivalent_mass: float  # [kg]
-    contacts: tuple[ContactFigures, ...]  # those that differ
+    contacts: tuple[ContactFigures, ...]  # distinct contacts of the schedule
     control_rate: float  # [Hz]
-    simulator_bandwidth: float  # of the motion simulator [Hz]; infinite for an ideal one
-    force_range: float  # of the force sensor [N]; infinite for none
-    duration: float  # of the run, about [s]
-    warnings: tuple[str, ...]  # what can hardly be meant: key, what was found, what is expected
+    simulator_bandwidth: float  # bandwidth of the motion simulator [Hz]; infinite for an ideal one
+    force_range: float  # range of the force sensor [N]; infinite for none
+    duration: float  # approximate duration of the run [s]
+    warnings: tuple[str, ...]  # implausible numbers: key, found value, expected value
 
     def line(self, name: str) -> str:
-        """All of it in one line, the warnings apart."""
-        frequencies = [one.frequency for one in self.contacts]
+        """Return the summary in one line, without the warnings."""
+        frequencies = [contact.frequency for contact in self.contacts]
         fastest = max(frequencies)
         rates = f"{_share(fastest, self.control_rate)} of the control rate ({self.control_rate:.4g} Hz)"
         if math.isfinite(self.simulator_bandwidth):
             bandwidth = f"the motion simulator's bandwidth ({self.simulator_bandwidth:.3g} Hz)"
             rates += f" and {_share(fastest, self.simulator_bandwidth)} of {bandwidth}"
-        peak = max(one.peak_force for one in self.contacts)
+        peak = max(contact.peak_force for contact in self.contacts)
         part = "the sensor has no range"
         if math.isfinite(self.force_range):
             part = f"{_share(peak, self.force_range)} of the sensor's range ({self.force_range:.4g} N)"
@@ -78,10 +78,10 @@ class Meaning(NamedTuple):
 
 
 def meaning(mechanism: Mechanism) -> Meaning:
-    """What a valid mechanism means, nominally."""
+    """Return the summary of a valid mechanism."""
     with computing():
         scenarios = build_scenarios(mechanism)
-        reference = _in_space(mechanism, scenarios)
+        reference = _ideal_contacts(mechanism, scenarios)
     contacts = _contacts(mechanism, reference)
     rig = mechanism.rig
     return Meaning(
@@ -96,11 +96,11 @@ def meaning(mechanism: Mechanism) -> Meaning:
 
 
 def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = False) -> None:
-    """A run can be computed, nominally or also where the uncertain numbers are `drawn`: no contact takes more
-    than 1e7 ticks, its approach included, nor all of them more than 1e9, no pole of the motion simulator is
-    beyond `FASTEST_POLE`, and the drives can follow the first approach.
+    """Raise `InputError` if a run cannot be computed, nominally or, with `drawn`, for any draw.
 
-    `label` is what an error calls the mechanism. Raises `InputError`.
+    A contact may take at most 1e7 ticks, its approach included, and a run at most 1e9. No pole of the motion
+    simulator may exceed `FASTEST_POLE`, and the drives must be able to follow the first approach. An error
+    calls the mechanism `label`.
     """
     name = label or mechanism.name
     lanes = build_scenarios(mechanism, _corners(mechanism, _POLES) if drawn else None)
@@ -110,6 +110,7 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
 
 
 def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
+    """Raise `InputError` if an approach is faster than the drives' velocity limit."""
     limits = scenarios.simulator.velocity_limit
     lane = int(np.argmax(scenarios.velocity - limits))
     if limits[lane] < scenarios.velocity[lane]:
@@ -120,7 +121,10 @@ def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
 
 
 def check_poles(name: str, denominator: Any, control_period: Any) -> None:
-    """No pole of motion simulators, (order + 1, lanes), is beyond `FASTEST_POLE`. Raises `InputError`."""
+    """Raise `InputError` if a pole of a motion simulator exceeds `FASTEST_POLE`.
+
+    `denominator` is (order + 1, lanes), `control_period` (lanes,) [s].
+    """
     for lane, period in enumerate(control_period):
         coefficients = np.asarray(denominator)[:, lane]
         with np.errstate(all="ignore"):
@@ -133,14 +137,16 @@ def check_poles(name: str, denominator: Any, control_period: Any) -> None:
 
 
 def bandwidth(simulator: MotionSimulator) -> float:
-    """Frequency [Hz] at which the gain of the first lane's G first is 1/sqrt(2); infinite for an ideal one,
-    NaN where it cannot be computed."""
-    numerator, denominator = (np.asarray(one, float)[:, 0] for one in simulator[:2])
+    """Return the lowest frequency [Hz] at which the gain of the first lane's G is 1/sqrt(2).
+
+    It is infinite for an ideal motion simulator, and NaN if it cannot be computed.
+    """
+    numerator, denominator = (np.asarray(part, float)[:, 0] for part in simulator[:2])
     order = len(denominator) - 1
     if order == 0:
         return math.inf
     with np.errstate(all="ignore"):
-        # In units of the poles' mean frequency, in which coefficients are of like size.
+        # Dividing by the poles' mean frequency gives coefficients of similar size.
         unit = abs(denominator[-1] / denominator[0]) ** (1 / order)
         powers = unit ** np.arange(order, -1, -1.0) / denominator[-1]
         twice, once = 2 * _squared(numerator * powers[1:]), _squared(denominator * powers)
@@ -153,14 +159,15 @@ def bandwidth(simulator: MotionSimulator) -> float:
 
 
 def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
+    """Raise `InputError` if a contact or a run takes too many ticks."""
     contacts = mechanism.approach.contacts
     allowed = min(MOST_TICKS, MOST_TICKS_OF_A_RUN / contacts)
-    # As a rule there is no need to know how long the contacts are.
+    # This upper bound usually suffices, without computing the contacts.
     longest = APPROACH + scenarios.control_period + 2 * LONGEST_CONTACT + _patience(scenarios)
     if np.all(longest <= allowed * scenarios.control_period):
         return
     with computing():
-        way, lasts = _seconds(scenarios, _in_space(mechanism, scenarios))
+        way, lasts = _seconds(scenarios, _ideal_contacts(mechanism, scenarios))
     with np.errstate(all="ignore"):
         ticks = (way + lasts) / scenarios.control_period
     slot, lane = np.unravel_index(np.argmax(ticks), ticks.shape)
@@ -177,28 +184,29 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
 
 
 def _squared(polynomial: np.ndarray) -> np.ndarray:
-    """|p(jw)|^2 as a polynomial in w^2, descending powers."""
+    """Return |p(jw)|^2 as a polynomial in w^2, descending powers."""
     degrees = np.arange(len(polynomial) - 1, -1, -1)
     product = np.convolve(polynomial, polynomial * (-1.0) ** degrees)[::2]
     return product * (-1.0) ** degrees
 
 
-def _in_space(mechanism: Mechanism, scenarios: Scenario) -> Reference:
-    """The contacts in space, (contacts, lanes), each entered at the speed of the first approach."""
+def _ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> Reference:
+    """Return the ideal contacts, (contacts, lanes), each entered at the first approach's velocity."""
     shape = scenarios.phase.shape
-    mass, velocity = (np.broadcast_to(one, shape) for one in (scenarios.equivalent_mass, scenarios.velocity))
+    mass, velocity = (np.broadcast_to(x, shape) for x in (scenarios.equivalent_mass, scenarios.velocity))
     law = contact_law(mechanism.contact.law).simulated
-    found = kept_programs.run(_reference, law, scenarios.contact, mass, velocity)
-    numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in found]
+    reference = kept_programs.run(_reference, law, scenarios.contact, mass, velocity)
+    numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in reference]
     return Reference(*numbers)
 
 
 def _reference(law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any) -> Reference:
+    """Return the ideal contacts of a law, (slots, lanes)."""
     return law.reference(parameters_by_slot(parameters), mass, velocity)
 
 
 def _contacts(mechanism: Mechanism, reference: Reference) -> tuple[ContactFigures, ...]:
-    """The first lane's contacts that differ, in the order of the schedule."""
+    """Return the first lane's distinct contacts, in the order of the schedule."""
     durations = np.nan_to_num(reference.duration[:, 0], nan=math.inf, posinf=math.inf)
     contacts: dict[tuple[float, ...], ContactFigures] = {}
     for slot, duration in enumerate(durations):
@@ -213,8 +221,10 @@ def _contacts(mechanism: Mechanism, reference: Reference) -> tuple[ContactFigure
 
 
 def _seconds(scenarios: Scenario, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
-    """About how long the way to each contact takes, and the contact with the wait for its end [s], each
-    (contacts, lanes)."""
+    """Return approximate durations [s], (contacts, lanes), of the way to each contact and of the contact.
+
+    The contact's duration includes the wait for its end.
+    """
     contacts = len(reference.duration)
     sensor, simulator, velocity = scenarios.force_sensor, scenarios.simulator, scenarios.velocity
     wait = simulator.delay + sensor.delay + 20 * sensor.time_constant + 2 * scenarios.control_period
@@ -233,8 +243,10 @@ def _seconds(scenarios: Scenario, reference: Reference) -> tuple[np.ndarray, np.
 
 
 def _patience(scenarios: Scenario) -> np.ndarray:
-    """For how long [s] the next touch is waited for between two surfaces, and by how much longer than for a
-    contact where there is but one."""
+    """Return the longest wait [s] for a touch.
+
+    With two surfaces this is the wait for the next touch; with one, the wait in excess of a contact's limit.
+    """
     with np.errstate(all="ignore"):
         crossing = 10 * scenarios.clearance / scenarios.velocity
         nearer = 10 * np.maximum(-scenarios.contact_plane, 0.0) / scenarios.velocity
@@ -242,7 +254,10 @@ def _patience(scenarios: Scenario) -> np.ndarray:
 
 
 def _corners(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Draws with every uncertain number whose path begins so at either end: all combinations of them."""
+    """Return draws with every uncertain number at either end of its distribution, in all combinations.
+
+    Only numbers whose paths begin with one of the prefixes are varied.
+    """
     columns = dimensions(mechanism)
     paths = [path for path in columns if path.startswith(prefixes)]
     corners = list(itertools.product((_RARELY, 1 - _RARELY), repeat=len(paths)))
@@ -256,61 +271,66 @@ def _corners(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.nd
 
 
 def _warnings(mechanism: Mechanism, contacts: tuple[ContactFigures, ...]) -> list[str]:
-    rig, contact, found = mechanism.rig, mechanism.contact, []
-    fastest = max(contacts, key=lambda one: one.frequency)
-    slowest = min(contacts, key=lambda one: one.frequency)
-    strongest = max(contacts, key=lambda one: one.peak_force)
+    """Return warnings about implausible numbers."""
+    rig, contact, warnings = mechanism.rig, mechanism.contact, []
+    fastest = max(contacts, key=lambda item: item.frequency)
+    slowest = min(contacts, key=lambda item: item.frequency)
+    strongest = max(contacts, key=lambda item: item.peak_force)
     least, most = FREQUENCIES
     limit = FASTEST / rig.control_period
     if fastest.frequency > limit:
-        found.append(f"{_frequency(fastest)}, expected at most {limit:.4g} Hz, 1/10 of the control rate")
+        warnings.append(f"{_frequency(fastest)}, expected at most {limit:.4g} Hz, 1/10 of the control rate")
     elif fastest.frequency > most:
-        found.append(f"{_frequency(fastest)}, expected at most {most:g} Hz")
+        warnings.append(f"{_frequency(fastest)}, expected at most {most:g} Hz")
     if slowest.frequency < least:
-        found.append(f"{_frequency(slowest)}, expected at least {least:g} Hz")
+        warnings.append(f"{_frequency(slowest)}, expected at least {least:g} Hz")
     if mechanism.approach.velocity > LARGEST_VELOCITY:
         velocity = f"{mechanism.approach.velocity:.4g} m/s"
-        found.append(f"approach.velocity: found {velocity}, expected at most {LARGEST_VELOCITY:g} m/s")
+        warnings.append(f"approach.velocity: found {velocity}, expected at most {LARGEST_VELOCITY:g} m/s")
     if strongest.peak_force > rig.force_sensor.range:
         peak = f"the {strongest.peak_force:.3g} N of contact {strongest.number} in space"
-        found.append(f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected beyond {peak}")
+        warnings.append(
+            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected beyond {peak}"
+        )
     if not contact_law(contact.law).damped and any(contact.damping):
         largest = max(contact.damping)
-        found.append(
+        warnings.append(
             f"contact.damping: found {largest:.4g} N s/m, expected 0: law {contact.law} has no damping"
         )
-    return found + _late(mechanism, min(contacts, key=lambda one: one.duration))
+    return warnings + _late(mechanism, min(contacts, key=lambda item: item.duration))
 
 
 def _frequency(contact: ContactFigures) -> str:
+    """Return the beginning of a warning about a contact's frequency."""
     frequency = f"a contact frequency of {contact.frequency:.3g} Hz (contact {contact.number})"
     return f"contact.stiffness: found {frequency}"
 
 
 def _late(mechanism: Mechanism, shortest: ContactFigures) -> list[str]:
-    """A warning of readings that come when the shortest contact is over."""
+    """Return a warning if readings arrive after the shortest contact is over."""
     rig = mechanism.rig
     force = rig.force_sensor.delay + rig.force_sensor.time_constant
     lasts = f"less than contact {shortest.number} lasts, {shortest.duration:.3g} s"
-    for key, own, others in (
+    for key, sensor_delay, suffix in (
         ("simulator", 0.0, ""),
         ("force_sensor", force, " with its lag and the motion simulator's delay"),
         ("position_sensor", rig.position_sensor.delay, " with the motion simulator's"),
     ):
-        delay = rig.simulator.delay + own
+        delay = rig.simulator.delay + sensor_delay
         if delay > shortest.duration:
-            return [f"rig.{key}.delay: found {delay:.3g} s{others}, expected {lasts}"]
+            return [f"rig.{key}.delay: found {delay:.3g} s{suffix}, expected {lasts}"]
     return []
 
 
 def _share(value: float, whole: float) -> str:
-    """`value` as a part of `whole`, in words."""
+    """Return `value` as a fraction of `whole`, as text."""
     share = value / whole
     return f"1/{1 / share:.0f}" if 0 < share < 0.1 else f"{share:.2g}"
 
 
 def _listed(frequencies: list[float]) -> str:
-    texts = list(dict.fromkeys(f"{one:.3g}" for one in frequencies))
+    """Return the frequencies, or their range, as text."""
+    texts = list(dict.fromkeys(f"{frequency:.3g}" for frequency in frequencies))
     if len(texts) > SHOWN:
         return f"{min(frequencies):.3g} to {max(frequencies):.3g}"
     return ", ".join(texts)

@@ -1,8 +1,8 @@
-"""What a run is probed with, beside its contact: a push on the hardware, and the motion it should have had.
+"""Probe of a run beside its contact: a push on the hardware, and the reference trajectory.
 
-A push that no model knows of shows whether a law is transparent: whether what happens to the hardware reaches
-the numerical model. The motion of the same contact in space shows how far the model is led off it. Both count
-from the first touch, of the hardware the one, of the numerical model the other.
+A push that no model contains shows whether a compensator is transparent: whether events on the hardware reach
+the numerical model. The motion in the ideal contact shows how far the model deviates from it. The time of the
+push counts from the hardware's first touch, that of the trajectory from the numerical model's first touch.
 """
 
 from typing import NamedTuple
@@ -12,14 +12,14 @@ from jaxtyping import Array, Bool, Float
 
 
 class Push(NamedTuple):
-    """A force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0."""
+    """Force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0."""
 
     size: Float[Array, "*batch"]  # against the penetration [N]
-    centre: Float[Array, "*batch"]  # in time since the hardware's first touch [s]
+    centre: Float[Array, "*batch"]  # time since the hardware's first touch [s]
     width: Float[Array, "*batch"]  # [s]
 
     def force(self, time: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """p [N] at a time [s] since the first touch."""
+        """Return p [N] at a time [s] since the first touch."""
         since = time - self.centre + self.width / 2
         inside = (since > 0) & (since < self.width)
         phase = jnp.where(inside, since, 0) * (jnp.pi / self.width)
@@ -28,10 +28,10 @@ class Push(NamedTuple):
     def lagged(
         self, time: Float[Array, "*batch"], time_constant: Float[Array, "*batch"]
     ) -> Float[Array, "*batch"]:
-        """What a sensor with a first-order lag [s] reads of it: 1/(1 + s tau_s) applied to p, in closed form.
+        """Return the push as read by a sensor with a first-order lag [s]: 1/(1 + s tau_s) applied to p.
 
-        With w = pi/width and s since the push began: size/(1 + (w tau)^2) (sin ws - w tau cos ws
-        + w tau exp(-s/tau)) until it ends, then exponential decay.
+        With w = pi/width and s the time since the push began, the closed form is size/(1 + (w tau)^2) (sin ws
+        - w tau cos ws + w tau exp(-s/tau)) until the push ends, then exponential decay.
         """
         lags = time_constant > 0
         lag = jnp.where(lags, time_constant, 1)
@@ -47,33 +47,33 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """What each contact of a run is probed with."""
+    """Probe of each contact of a run."""
 
-    push: Push  # on the hardware, leaves (slots, *batch)
-    # penetration of the same contact in space [m] at times evenly spaced from its first touch to `span`
+    push: Push  # push on the hardware, leaves (slots, *batch)
+    # penetration of the ideal contact [m] at evenly spaced times from its first touch to `span`
     depth: Float[Array, "slots samples *batch"]
-    span: Float[Array, "slots *batch"]  # how long that contact is followed [s]
+    span: Float[Array, "slots *batch"]  # duration of the comparison [s]
 
 
 class FirstContact(NamedTuple):
-    """The hardware's first touch in the contact under way."""
+    """First touch of the hardware in the current contact."""
 
     made: Bool[Array, "*batch"]  # whether there was one
-    time: Float[Array, "*batch"]  # of it, in periods of the run
-    side: Float[Array, "*batch"]  # of the surface, 1 or -1
+    time: Float[Array, "*batch"]  # time of the touch, in periods of the run
+    side: Float[Array, "*batch"]  # side of the surface, 1 or -1
 
 
 class Deviation(NamedTuple):
-    """The numerical model beside the contact in space."""
+    """Deviation of the numerical model from the ideal contact."""
 
     entered: Bool[Array, "*batch"]  # whether the numerical model has entered the contact
-    time: Float[Array, "*batch"]  # of that, in periods of the run
-    squares: Float[Array, "*batch"]  # sum of the squares of what its depth is off by [m^2]
-    count: Float[Array, "*batch"]  # how many they are
+    time: Float[Array, "*batch"]  # time of the onset, in periods of the run
+    squares: Float[Array, "*batch"]  # sum of the squared deviations of its penetration [m^2]
+    count: Float[Array, "*batch"]  # number of these deviations
 
 
 def before_contact(like: Float[Array, "*batch"]) -> FirstContact:
-    """Before the first touch."""
+    """Return the state before the first touch."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
@@ -81,8 +81,11 @@ def before_contact(like: Float[Array, "*batch"]) -> FirstContact:
 def follow_hardware(
     first_contact: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
 ) -> FirstContact:
-    """Follow the hardware to a sample: at `now` [periods] it is `depth` [m] beyond the surface on `side`,
-    going deeper at `rate` [m/s]. The first touch lies where uniform motion met the surface."""
+    """Update the hardware's first touch with a sample.
+
+    At `now` [periods] the hardware is `depth` [m] beyond the surface on `side` and moves inward at `rate`
+    [m/s]. The time of the touch is extrapolated by uniform motion.
+    """
     first = ~first_contact.made & (depth > 0)
     return FirstContact(
         first_contact.made | first,
@@ -92,7 +95,7 @@ def follow_hardware(
 
 
 def no_deviation(like: Float[Array, "*batch"]) -> Deviation:
-    """Before the numerical model has entered."""
+    """Return the state before the numerical model touches."""
     zeros = jnp.zeros_like(like)
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 
@@ -107,15 +110,18 @@ def follow_model(
     period: Array,
     lasts: Array,
 ) -> Deviation:
-    """Compare the numerical model with the reference, at `now` [periods], as long as the contact `lasts`."""
+    """Compare the numerical model with the reference trajectory while the contact `lasts`.
+
+    At `now` [periods] the model has penetrated by `depth` [m] and moves inward at `rate` [m/s].
+    """
     first = ~deviation.entered & (depth > 0)
     entered = deviation.entered | first
     begin = jnp.where(first, now - _since(depth, rate, period), deviation.time)
     since = jnp.where(entered, now - begin, 0) * period
     samples = len(reference)
-    place = jnp.clip(since / span, 0, 1) * (samples - 1)
-    before = jnp.clip(jnp.floor(place), 0, samples - 2)
-    share = place - before
+    position = jnp.clip(since / span, 0, 1) * (samples - 1)
+    before = jnp.clip(jnp.floor(position), 0, samples - 2)
+    share = position - before
     index = before.astype(jnp.int32)[None]
     left = jnp.take_along_axis(reference, index, axis=0, mode="promise_in_bounds")[0]
     right = jnp.take_along_axis(reference, index + 1, axis=0, mode="promise_in_bounds")[0]
@@ -130,13 +136,13 @@ def follow_model(
 
 
 def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
-    """Of x_d's depth off the reference's [m]; 0 where nothing was compared."""
+    """Return the root mean square of the penetration's deviation [m]; 0 if nothing was compared."""
     mean = deviation.squares / jnp.maximum(deviation.count, 1)
     return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
 
 
 def _since(depth, rate, period):
-    """Periods since a uniform motion met the surface, one at most."""
+    """Return the periods since a uniform motion reached the surface, at most one."""
     stride = rate * period
     inward = stride > 0
     return jnp.where(inward, jnp.clip(depth / jnp.where(inward, stride, 1), 0, 1), 0)

@@ -1,4 +1,4 @@
-"""Beside the ticks of a probed run: the hardware is pushed, the numerical model compared with space."""
+"""Tick of a probed run: the push on the hardware, and the comparison with the ideal contact."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -22,9 +22,10 @@ def probe_beside(
     contact: Contact,
     watch: Watch,
 ) -> tuple[LoopState, Contact, Watch]:
-    """State, contact and watch of a tick with the probe's part in them.
+    """Return state, contact and watch of a tick, including the probe.
 
-    `sample` is the motion where the force is sampled; the contact may have been `over` before this tick.
+    `sample` is the motion at the force's sampling instant; `over` says whether the contact ended before this
+    tick.
     """
     first_contact, contact = push(rig, probe, state.first_contact, signals.age, sample, contact)
     watch = compare(rig.constants, probe, over, signals, watch)
@@ -39,7 +40,7 @@ def push(
     sample: Motion,
     contact: Contact,
 ) -> tuple[FirstContact, Contact]:
-    """Push the hardware, by the time since its first contact; the force sensor reads the push as well."""
+    """Push the hardware according to the time since its first touch; the force sensor reads the push too."""
     assert first_contact is not None
     scenario, period = rig.scenario, rig.constants.control_period
     signed = deflection(sample.position, scenario.clearance)
@@ -55,7 +56,7 @@ def push(
 
 
 def compare(constants: Constants, probe: Probe, over: Array, signals: Signals, watch: Watch) -> Watch:
-    """Compare x_d with the same contact in space, until it is `over`."""
+    """Compare x_d with the ideal contact, until the contact is `over`."""
     assert watch.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
     if watch.side is not None:

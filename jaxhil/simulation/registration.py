@@ -1,7 +1,8 @@
-"""Laws from elsewhere: a compensator or a contact law of the user's own, entered under its name.
+"""Registration of a user's compensator or contact law under its name.
 
-A law is one object whose class may be anywhere. From its registration on it is what a built-in one is: the
-mechanism files, gains and functions that name it mean this object. Registering is per process.
+A law is one object whose class may be defined anywhere. After its registration it is equivalent to a built-in
+law: its name in mechanism files, gain files and function arguments refers to this object. Registration is per
+process.
 """
 
 import inspect
@@ -23,15 +24,17 @@ _RUNTIME_METHODS = ("step", "reset", "position_command", "next_contact")
 
 
 def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None:
-    """Enter a compensator or a contact law under its `name`: simulation, tuning and gain files then know it.
+    """Register a compensator or a contact law under its `name` for simulation, tuning and gain files.
 
     `runtime` is the compensator's class for the rig, in plain Python, with gains of the same names and units
-    (`jaxhil.rig.registry.Compensator`): what exports a controller needs it. The law's own class may be
-    defined and registered again, as a notebook's cell that runs twice does; another name taken is refused.
+    (`jaxhil.rig.registry.Compensator`); the export of a controller needs it. The law's own class may be
+    defined and registered again, as in a notebook's cell that runs twice; the name of another law is
+    rejected.
 
-    Raises `InputError`, one line, for what is no law's instance, a name that is taken or not a word of
-    letters, digits and underscores, a law that holds arrays, gains without a unit or without bounds that
-    enclose the nominal value (tried on the default mechanism), a runtime class that does not fit the law.
+    Raise `InputError` if the object is not an instance of a law, if its name is taken or not a word of
+    letters, digits and underscores, if the law contains arrays, if gains have no unit or have bounds that do
+    not enclose the nominal value (evaluated on the default mechanism), or if the runtime class does not fit
+    the law.
     """
     if not isinstance(law, (Compensator, ContactLaw)):
         found = f"the class {law.__name__}" if isinstance(law, type) else shown(law)
@@ -55,30 +58,32 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
 
 
 def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
+    """Raise `InputError` if a law's name is invalid or belongs to another law."""
     name = getattr(law, "name", None)
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         where = f"register: {type(law).__name__}.name"
         allowed = "a word of letters, digits and underscores, as `name: ClassVar[str] = ...` gives it"
         raise InputError(f"{where}: found {shown(name or None)}, allowed {allowed}")
     if name in table:
-        home, other = ((type(one).__module__, type(one).__qualname__) for one in (law, table[name]))
-        if home != other or home[0].startswith("jaxhil."):
+        home, other_home = ((type(x).__module__, type(x).__qualname__) for x in (law, table[name]))
+        if home != other_home or home[0].startswith("jaxhil."):
             raise _refusal(law, "name", "the name of another law", f"none of {', '.join(table)}")
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
-    """Programs are compiled for a law: it has to be hashable, and equal to itself."""
+    """Raise `InputError` unless a law is hashable and equal to itself, as compiled programs require."""
     try:
         hash(law)
-        same = bool(law == law)
+        is_equal = bool(law == law)
     except Exception:
-        same = False
-    if not same:
+        is_equal = False
+    if not is_equal:
         allowed = "plain numbers, texts and tuples: a law holds no arrays"
         raise _refusal(law, "fields", "what cannot be hashed", allowed)
 
 
 def _check_gains(law: Compensator) -> None:
+    """Raise `InputError` if names, units or bounds of the gains are invalid."""
     gains = getattr(law, "gains", None)
     if not isinstance(gains, tuple) or not all(isinstance(gain, Gain) for gain in gains):
         raise _refusal(law, "gains", shown(gains), "a tuple of jaxhil.Gain")
@@ -92,6 +97,7 @@ def _check_gains(law: Compensator) -> None:
 
 
 def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
+    """Raise `InputError` unless lower <= nominal <= upper, all finite."""
     values = {}
     for part in ("lower", "nominal", "upper"):
         try:
@@ -107,25 +113,28 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
+    """Raise `InputError` if the runtime class lacks a method or has other gains than the law."""
     if not inspect.isclass(runtime):
         raise _refusal(law, "runtime", shown(runtime), "a class, as of jaxhil.rig.registry.Compensator")
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
         raise _refusal(law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method")
-    stated = getattr(runtime, "gains", None)
-    found = (
-        {name: getattr(one, "unit", None) for name, one in stated.items()}
-        if isinstance(stated, Mapping)
+    gains = getattr(runtime, "gains", None)
+    units = (
+        {name: getattr(gain, "unit", None) for name, gain in gains.items()}
+        if isinstance(gains, Mapping)
         else {}
     )
-    wanted = {gain.name: gain.unit for gain in law.gains}
-    if found != wanted:
-        raise _refusal(law, "runtime.gains", _units(found), f"{_units(wanted)}, as the law has them")
+    law_units = {gain.name: gain.unit for gain in law.gains}
+    if units != law_units:
+        raise _refusal(law, "runtime.gains", _units(units), f"{_units(law_units)}, as the law has them")
 
 
 def _units(gains: dict[str, Any]) -> str:
+    """Return names and units of gains as text."""
     return one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
 
 
 def _refusal(law: Compensator | ContactLaw, what: str, found: str, allowed: str) -> InputError:
+    """Return the error for a part of a law."""
     return InputError(f"register {law.name}: {what}: found {found}, allowed {allowed}")

@@ -1,8 +1,8 @@
-"""Rollout: a batch of scenarios through the loop, from the first approach until the last contact is over.
+"""Rollout of a batch of scenarios through the loop, from the first approach until the last contact is over.
 
-Ticks run in short stretches; between stretches, contacts that are over are entered into the metrics, the next
-ones begin, and free flight is skipped where nothing happens in it. The program ends with its slowest lane:
-nothing is computed for a fixed horizon. Forward-mode derivatives pass through to every array leaf.
+Ticks run in short segments ("stretches"). Between segments, finished contacts are written to the metrics, the
+next ones begin, and uneventful free flight is skipped. The program ends with its slowest lane; there is no
+fixed horizon. Forward-mode derivatives pass through to every array leaf.
 """
 
 import jax
@@ -24,29 +24,29 @@ from jaxhil.simulation.watch import FADED, build_rules, fresh_watch
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
-    """Metrics (slots, *batch) of every contact of every lane: `build_rig_constants`, then `run_contacts`.
+    """Return the metrics (slots, *batch) of every contact of every lane.
 
-    `gains` are scalars or of the batch shape: many gains at once are many lanes, not a `jax.vmap`, under
-    which the loop's condition and the rings' pointer would be the lanes' own.
+    `gains` are scalars or of the batch shape. Use lanes for several gains, not `jax.vmap`, which would give
+    each lane its own loop condition and ring pointer.
     """
     rig = build_rig_constants(loop, scenario, measured=loop.compensator.reads_position)
     return run_contacts(loop, gains, rig)
 
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
-    """`rollout` on a rig built before, for when many gains are tried on it."""
+    """Return the metrics as `rollout` does, with constants computed before, for many gains."""
     return run_to_its_end(loop, gains, rig).metrics
 
 
 def run_to_its_end(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
-    """The run when all its lanes are done."""
+    """Return the state after all lanes are done."""
 
     def body(run):
         run, _ = stretch(loop, rig, gains, run, record=False)
         if loop.is_two_sided:
             return turn_over(loop, rig, gains, run)
-        # Most stretches end no contact: lanes of a tile end theirs at about the same time. The rings, which
-        # a turn-over leaves alone, stay outside the branch, where they need not be copied.
+        # Most segments end no contact, since lanes of a tile end theirs at about the same time. The rings,
+        # which `turn_over` does not change, stay outside the branch and are not copied.
         rings = run.state.sensed.rings
         light = run._replace(state=run.state._replace(sensed=run.state.sensed._replace(rings=None)))
         light = lax.cond(
@@ -59,12 +59,12 @@ def run_to_its_end(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
 
 
 def stretch_length(loop: Loop) -> int:
-    """Ticks between turn-overs. Between two surfaces the next contact may begin at once."""
+    """Return the ticks per segment: 1 between two surfaces, where the next contact may begin at once."""
     return 1 if loop.is_two_sided else 16
 
 
 def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
-    """All lanes on their first approach, or at its end where nothing happens on it."""
+    """Return all lanes on their first approach, or at its end if nothing happens on it."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
     index = jnp.zeros(like.shape, jnp.int32)
@@ -91,7 +91,7 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
         entry_tick=index,
         first_contact=before_contact(zeros) if loop.probed else None,
     )
-    # Rings are read up to one ring behind: start there, so that no index is negative.
+    # Rings are read up to one ring back: with this first tick no index is negative.
     tick = jnp.array(loop.first_tick, jnp.int32)
     phase = _entry(scenario.phase, _slot(rig, index))
     state, skipped = begin_approach(loop, rig, gains, state, phase, like, tick, skip_flight)
@@ -110,7 +110,7 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
 def stretch(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, record: bool
 ) -> tuple[RunState, Tick | None]:
-    """A few ticks of the loop."""
+    """Run one segment of ticks; `record` returns the ticks too."""
     prepared = prepare(loop, rig, gains, run)
 
     def body(carry, noise):
@@ -123,7 +123,7 @@ def stretch(
 
 
 def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> Prepared:
-    """What the ticks of a stretch share."""
+    """Return the values that the ticks of a segment share."""
     return Prepared(
         gains=gains,
         rules=build_rules(rig.scenario),
@@ -133,7 +133,7 @@ def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> Prepa
 
 
 def noise_ahead(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> Noise:
-    """The sensors' noise, (ticks, *batch), at this tick and those that follow within a stretch."""
+    """Return the sensors' noise, (ticks, *batch), of the next ticks of a segment."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.entry_tick[None]
     return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
@@ -142,7 +142,7 @@ def noise_ahead(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> Noi
 def turn_over(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
 ) -> RunState:
-    """Enter contacts that are over, begin the next, skip free flight."""
+    """Write finished contacts to the metrics, begin the next ones, and skip free flight."""
     watch, state, scenario = run.watch, run.state, rig.scenario
     status = judge(scenario, watch, run.tick - state.entry_tick)
     over = _pending(rig, run)
@@ -153,22 +153,22 @@ def turn_over(
     index = run.index + over.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:
-        # No run begins in a uniform motion that the drives cannot follow.
+        # A run cannot begin with a motion that the drives cannot follow.
         ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
     active = run.active & ~(over & ends)
     blank = fresh_watch(loop, watch.approach)
     entry = _entry(scenario.contact, _slot(rig, index))
     if watch.command is not None:
         left = jnp.maximum(FADED * watch.peak_command, watch.command)
-        # A force before the turn-over begins the next contact at once, at the speed of the rebound.
-        kept = {
+        # A force that acts already begins the next contact at once; it approaches at the rebound's speed.
+        unchanged = {
             "approach": watch.rebound,
             "quiet": watch.quiet,
             "recent": watch.recent,
             "command": watch.command,
         }
-        watch = _choose(over, blank._replace(left=left, **kept), watch)
-        # A damped contact is over while the mechanism is still pressed in: its law holds until it is free.
+        watch = _choose(over, blank._replace(left=left, **unchanged), watch)
+        # A damped contact may end during penetration; its law's parameters apply until the mechanism is free.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_choose(free, entry, state.parameters))
         if state.first_contact is not None:
@@ -191,17 +191,18 @@ def turn_over(
 
 
 def _evolving(run):
-    """What changes from tick to tick."""
+    """Return the parts of the state that change from tick to tick."""
     return run.state, run.watch, run.tick
 
 
 def _resumed(run, evolving):
+    """Return the state with these parts replaced."""
     state, watch, now = evolving
     return run._replace(state=state, watch=watch, tick=now)
 
 
 def _rings(loop, ring, measured, order):
-    """Empty delay lines of what the loop has."""
+    """Return empty delay lines of the signals that the loop has."""
     interval = None
     if loop.is_two_sided:
         motion = Motion(ring, ring)
@@ -219,14 +220,14 @@ def _rings(loop, ring, measured, order):
 
 
 def _pending(rig, run):
-    """Lanes whose contact is over, or has failed."""
+    """Return the lanes whose contact is over or has failed."""
     status = judge(rig.scenario, run.watch, run.tick - run.state.entry_tick)
     return (run.watch.over | (status != OK)) & run.active
 
 
 def _restart(loop, gains, state, entered, begins, fresh):
-    """Take over the entered run on the lanes where it `begins`; rings and the law's parameters stay."""
-    rings = state.sensed._replace(
+    """Replace the state by the entered run where it `begins`; rings and the law's parameters stay."""
+    sensed_at_entry = state.sensed._replace(
         last=entered.sensed.last,
         touched=entered.sensed.touched,
         lagged=entered.sensed.lagged,
@@ -237,11 +238,11 @@ def _restart(loop, gains, state, entered, begins, fresh):
         entered._replace(sensed=None, controller=None, parameters=None),
         state._replace(sensed=None, controller=None, parameters=None),
     )
-    sensed = rings._replace(
-        last=_choose(begins, rings.last, state.sensed.last),
-        touched=_choose(begins, rings.touched, state.sensed.touched),
-        lagged=jnp.where(begins, rings.lagged, state.sensed.lagged),
-        first_position=_choose(begins, rings.first_position, state.sensed.first_position),
+    sensed = sensed_at_entry._replace(
+        last=_choose(begins, sensed_at_entry.last, state.sensed.last),
+        touched=_choose(begins, sensed_at_entry.touched, state.sensed.touched),
+        lagged=jnp.where(begins, sensed_at_entry.lagged, state.sensed.lagged),
+        first_position=_choose(begins, sensed_at_entry.first_position, state.sensed.first_position),
     )
     return chosen._replace(
         sensed=sensed,
@@ -251,12 +252,12 @@ def _restart(loop, gains, state, entered, begins, fresh):
 
 
 def _slot(rig, index):
-    """The slot of a contact; of one beyond them all, the last."""
+    """Return the slot of a contact; the last slot for contacts beyond the last one."""
     return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 
 def _entry(table, index):
-    """Entry `index` (per lane) of the leading axis of every leaf."""
+    """Return entry `index` (per lane) of the leading axis of every leaf."""
 
     def pick(leaf):
         indices = jnp.broadcast_to(index, leaf.shape[1:])[None]
@@ -266,5 +267,5 @@ def _entry(table, index):
 
 
 def _choose(condition, when_true, when_false):
-    """Leaf by leaf `where`; the condition is of the batch shape."""
+    """Select leaf by leaf; the condition is of the batch shape."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -1,7 +1,7 @@
-"""Roots of smooth functions between places at which their signs differ, and their derivatives.
+"""Roots of smooth functions within brackets at whose ends the signs differ, and their derivatives.
 
-Newton's method within a bracket, until every lane has its root. Forward-mode derivatives pass by the implicit
-function theorem, not through the iteration.
+Newton's method within the bracket iterates until every lane has its root. Forward-mode derivatives use the
+implicit function theorem, not the iteration.
 """
 
 from collections.abc import Callable
@@ -12,14 +12,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-MOST_STEPS = 60  # as many halvings reach rounding, whatever the function
-ROUNDING = 1e-9  # of a place, which is of order 1
+MOST_STEPS = 60  # bisections that give rounding accuracy for any function
+ROUNDING = 1e-9  # tolerance of the argument, which is of order 1
 
-Function = Callable[[Any, Array], Array]  # of data and of a place
+Function = Callable[[Any, Array], Array]  # function of data and an argument
 
 
 def positive_part(function: Function, data: Any, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the part of [low, high] on which a function is positive, if it changes its sign at most once."""
+    """Return the part of [low, high] on which a function is positive, if it changes sign at most once."""
     root, at_low, at_high = _root(function, data, low, high)
     begin = jnp.where(at_low > 0, low, jnp.where(at_high > 0, root, low))
     end = jnp.where(at_high > 0, high, jnp.where(at_low > 0, root, low))
@@ -29,43 +29,45 @@ def positive_part(function: Function, data: Any, low: Array, high: Array) -> tup
 def crossing(
     function: Function, data: Any, low: Array, high: Array, positive: Array, negative: Any = None
 ) -> Array:
-    """Return where a function changes its sign in [low, high]; where it does not, `positive` or, if the
-    function is negative and it is given, `negative`."""
+    """Return the argument in [low, high] at which a function changes sign.
+
+    Without a change of sign, return `positive`, or `negative` if this is given and the function is negative.
+    """
     root, at_low, at_high = _root(function, data, low, high)
     none = positive if negative is None else jnp.where(at_low > 0, positive, negative)
     return jnp.where((at_low > 0) != (at_high > 0), root, none)
 
 
 def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Return the root of a function between places at which its signs differ, and its values there."""
+    """Return the root of a function in a bracket, and the function's values at both ends."""
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
     change = at_high - at_low
-    # A step that is as short as this is followed by one below rounding.
+    # After a step as short as this, the next one is below rounding.
     short = jnp.finfo(at_low.dtype).eps ** 0.6
 
-    def at(place):
-        return jax.jvp(lambda s: function(fixed, s), (place,), (jnp.ones_like(place),))
+    def value_and_slope(s):
+        return jax.jvp(lambda s: function(fixed, s), (s,), (jnp.ones_like(s),))
 
     def is_under_way(carry):
         *_, sought, steps = carry
         return jnp.any(sought) & (steps < MOST_STEPS)
 
     def improve(carry):
-        low, high, place, _, steps = carry
-        value, slope = at(place)
+        low, high, guess, _, steps = carry
+        value, slope = value_and_slope(guess)
         above = (value > 0) == (change > 0)
-        low, high = jnp.where(above, low, place), jnp.where(above, place, high)
-        step = place - value / jnp.where(slope != 0, slope, 1)
-        # At the root itself rounding may put the step beyond the bracket.
+        low, high = jnp.where(above, low, guess), jnp.where(above, guess, high)
+        step = guess - value / jnp.where(slope != 0, slope, 1)
+        # At the root, rounding may place the step outside the bracket.
         inside = (slope != 0) & (step >= low - ROUNDING) & (step <= high + ROUNDING)
         nearer = jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2)
-        return low, high, nearer, crosses & (jnp.abs(nearer - place) > short), steps + 1
+        return low, high, nearer, crosses & (jnp.abs(nearer - guess) > short), steps + 1
 
     crosses = (at_low > 0) != (at_high > 0)
     secant = jnp.clip(low - at_low * (high - low) / jnp.where(change != 0, change, 1), low, high)
     _, _, root, _, _ = lax.while_loop(is_under_way, improve, (low, high, secant, crosses, 0))
-    _, slope = at(root)
-    # The derivative is that of one more step of Newton's method, whose value is left out.
+    _, slope = value_and_slope(root)
+    # One more step of Newton's method adds the derivative, but not its value.
     step = function(data, root) / jnp.where(slope != 0, slope, 1)
     return root - (step - lax.stop_gradient(step)), at_low, at_high

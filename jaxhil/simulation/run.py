@@ -1,4 +1,4 @@
-"""One run of a mechanism's contacts: what became of each contact, and every tick of the way there."""
+"""Run of a mechanism's contacts: results of each contact, and all ticks."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,62 +30,62 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 class ContactResult(NamedTuple):
-    """What became of one contact; NaN for what it does not have."""
+    """Results of one contact; NaN for results that it does not have."""
 
     restitution: float  # e, rebound speed over approach speed of the numerical model [1]
-    reference_restitution: float  # e*, that of the same contact in space, entered at the same speed [1]
-    error: float  # e - e* [1]; above 0 the contact diverges
-    peak_force: float  # of the real contact force [N]
-    reference_peak_force: float  # of the ideal contact [N]
-    peak_force_ratio: float  # peak force over the ideal contact's [1]
-    peak_command: float  # of |F_c|, the force on the numerical model [N]
-    position_shortfall: float  # by which the motion simulator's limits cut the position command [m]
+    reference_restitution: float  # e*, of the ideal contact with the same approach velocity [1]
+    error: float  # e - e* [1]; positive if the contact diverges
+    peak_force: float  # largest real contact force [N]
+    reference_peak_force: float  # peak force of the ideal contact [N]
+    peak_force_ratio: float  # peak force over the ideal contact's peak force [1]
+    peak_command: float  # largest |F_c|, the force on the numerical model [N]
+    position_shortfall: float  # largest change of the position command by the motion simulator's limits [m]
     duration: float  # time with a real contact force [s]
-    reference_duration: float  # of the ideal contact [s]
-    duration_ratio: float  # duration over the ideal contact's [1]
-    approach_velocity: float  # of the numerical model, on the tick before the contact [m/s]
-    force_delay: float | None  # of the measurement, as the compensator estimates it [s]; None if it does not
-    # "ok", or why it has no restitution: "timeout" (not over within 10 s), "diverged", "non-finite", "not
-    # reached" (the run ended before it, or no force of it was measured)
+    reference_duration: float  # duration of the ideal contact [s]
+    duration_ratio: float  # duration over the ideal contact's duration [1]
+    approach_velocity: float  # velocity of the numerical model at the tick before the contact [m/s]
+    force_delay: float | None  # compensator's estimate of the measurement's delay [s]; None without one
+    # "ok", or the reason for a missing restitution: "timeout" (not over within 10 s), "diverged",
+    # "non-finite", "not reached" (the run ended before it, or its force was not measured)
     status: str
 
 
 class Ticks(NamedTuple):
-    """Every tick of a run, all contacts one after the other; arrays of shape (ticks,)."""
+    """All ticks of a run, all contacts one after the other; arrays of shape (ticks,)."""
 
-    time: np.ndarray  # [s], from 0 on, a control period a tick
-    force_measured: np.ndarray  # what the force sensor reads [N]
-    force_command: np.ndarray  # F_c, what the compensator makes of it: the force on the numerical model [N]
-    position_desired: np.ndarray  # of the numerical model [m]
-    velocity_desired: np.ndarray  # of the numerical model [m/s]
-    position_measured: np.ndarray  # what the position sensor reads of the motion simulator [m]
-    contact: np.ndarray  # index of the contact under way or ahead, from 0
+    time: np.ndarray  # [s], from 0, one control period per tick
+    force_measured: np.ndarray  # reading of the force sensor [N]
+    force_command: np.ndarray  # F_c, output of the compensator and force on the numerical model [N]
+    position_desired: np.ndarray  # position of the numerical model [m]
+    velocity_desired: np.ndarray  # velocity of the numerical model [m/s]
+    position_measured: np.ndarray  # reading of the position sensor [m]
+    contact: np.ndarray  # index of the current or next contact, from 0
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The contacts of a mechanism under a compensator, run once.
+    """One run of a mechanism's contacts under a compensator.
 
-    The ticks (`time`, `force_measured`, ...: see `Ticks`) are recorded when first asked for.
+    The ticks (`time`, `force_measured`, ...: see `Ticks`) are recorded at first use.
     """
 
     mechanism: Mechanism = field(repr=False)
-    compensator: str  # its name
-    gains: dict[str, float]  # by name, in SI units
-    seed: int  # of the sensors' noise
+    compensator: str  # name of the compensator
+    gains: dict[str, float]  # gains by name, in SI units
+    seed: int  # seed of the sensors' noise
     contacts: tuple[ContactResult, ...]  # one for every contact of the schedule
-    status: str  # "ok", or the status of the first contact that is not
+    status: str  # "ok", or the status of the first contact with another status
 
     @cached_property
     def meaning(self) -> Meaning:
-        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant."""
+        """Summary of the mechanism: mass, ideal contacts, rates, and `warnings` of implausible numbers."""
         return meaning(self.mechanism)
 
     def reasons(self, limit: float = 0.01) -> list[str]:
-        """Return why the run is bad, in words; an empty list if it is good.
+        """Return the reasons for which the run is bad, as sentences; an empty list if it is good.
 
-        A run is good if every contact ended, no restitution error is beyond `limit` [1], and every real
-        contact's peak force and duration are within `contact_bounds` of the ideal contact's.
+        A run is good if every contact ended, no restitution error exceeds `limit` [1], and the peak force and
+        the duration of every real contact are within the bounds of `contact_bounds`.
         """
         if self.status != STATUS_NAMES[OK]:
             return [f"the run ended with status '{self.status}': {STATUS_REASONS[self.status]}"]
@@ -93,7 +93,7 @@ class Run:
 
     @cached_property
     def ticks(self) -> Ticks:
-        """Every tick up to the end of the last contact, or to the first number that is not finite."""
+        """All ticks up to the end of the last contact, or to the first number that is not finite."""
         with computing():
             scenarios = build_scenarios(self.mechanism, seed=self.seed)
             loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
@@ -116,12 +116,12 @@ class Run:
 
     @property
     def force_measured(self) -> np.ndarray:
-        """What the force sensor reads at every tick [N]."""
+        """Reading of the force sensor at every tick [N]."""
         return self.ticks.force_measured
 
     @property
     def force_command(self) -> np.ndarray:
-        """The force on the numerical model at every tick [N]."""
+        """Force on the numerical model at every tick [N]."""
         return self.ticks.force_command
 
     @property
@@ -136,7 +136,7 @@ class Run:
 
     @property
     def position_measured(self) -> np.ndarray:
-        """What the position sensor reads at every tick [m]."""
+        """Reading of the position sensor at every tick [m]."""
         return self.ticks.position_measured
 
     @property
@@ -145,16 +145,16 @@ class Run:
         return self.ticks.contact
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the ticks, a line each, under a line of their names; numbers in SI units, to the last bit.
+        """Write the ticks as CSV, one line each after a line of names, in SI units with all digits.
 
-        Raises `InputError` when the file cannot be written.
+        Raise `InputError` if the file cannot be written.
         """
         write_csv(path, {name: column.tolist() for name, column in self.ticks._asdict().items()})
 
     def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw force and position over time, contact by contact, beside the same contacts in space.
+        """Draw force and position over time for each contact, beside the ideal contact.
 
-        The name ends in .png, .pdf or .svg; folders on the way are made. Raises `InputError` when the file
+        The file name ends in .png, .pdf or .svg; parent folders are created. Raise `InputError` if the file
         cannot be written.
         """
         target = as_path(path)
@@ -178,14 +178,10 @@ def simulate(
     *,
     seed: int = 0,
 ) -> Run:
-    """Run the contacts of a mechanism once, as it is nominally.
+    """Run the contacts of a nominal mechanism of one axis once.
 
-    `mechanism` is a `Mechanism`, the name of a built-in one, or a path. `compensator` is a law's name.
-    `gains` is None (what the literature's rules say), a dict of some of them (the others are the
-    literature's), the name of one of the law's settings, or the path of a gain file; with a file, "none"
-    stands for its law. `seed` is that of the sensors' noise.
-
-    Raises `InputError`, one line, for whatever is wrong with them.
+    See `jaxhil.simulate`, which also accepts mechanisms of six axes, for the arguments. Raise `InputError` if
+    an argument is invalid.
     """
     checked = as_mechanism(mechanism)
     number = check_seed(seed)
@@ -201,7 +197,7 @@ def simulate(
 
 
 def check_seed(seed: Any) -> int:
-    """The seed, an integer >= 0. Raises `InputError`."""
+    """Return the seed, or raise `InputError` unless it is an integer >= 0."""
     number = seed.item() if isinstance(seed, np.integer) else seed
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
         raise InputError(f"seed: found {shown(seed)}, allowed an integer >= 0")
@@ -209,7 +205,7 @@ def check_seed(seed: Any) -> int:
 
 
 def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[str]:
-    """Name the largest restitution error, if it is beyond the limit."""
+    """Yield a sentence about the largest restitution error, if it exceeds the limit."""
     worst = max((contact.error for contact in contacts), key=abs)
     if not abs(worst) <= limit:
         kind = "divergence" if worst > 0 else "convergence"
@@ -217,28 +213,31 @@ def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[
 
 
 def _unlike(contacts: Sequence[ContactResult], mechanism: Mechanism) -> Iterator[str]:
-    """Name the real contacts that are too hard, too short or too long."""
-    for number, one in enumerate(contacts, start=1):
-        if too_hard(one.peak_force, one.reference_peak_force):
+    """Yield sentences about the real contacts that are too hard, too short or too long."""
+    for number, contact in enumerate(contacts, start=1):
+        force, ideal_force = contact.peak_force, contact.reference_peak_force
+        if too_hard(force, ideal_force):
             yield (
-                f"contact {number}: real peak force {one.peak_force:.4g} N, {one.peak_force_ratio:.3g} times "
-                f"the ideal contact's {one.reference_peak_force:.4g} N, allowed {MOST_FORCE:g} times"
+                f"contact {number}: real peak force {force:.4g} N, {contact.peak_force_ratio:.3g} times "
+                f"the ideal contact's {ideal_force:.4g} N, allowed {MOST_FORCE:g} times"
             )
-        if duration_off(one.duration, one.reference_duration, mechanism.rig.control_period):
+        duration, ideal_duration = contact.duration, contact.reference_duration
+        if duration_off(duration, ideal_duration, mechanism.rig.control_period):
             yield (
-                f"contact {number}: real contact of {1e3 * one.duration:.4g} ms, {one.duration_ratio:.3g} "
-                f"times the ideal contact's {1e3 * one.reference_duration:.4g} ms, allowed {SHORTEST:g} to "
+                f"contact {number}: real contact of {1e3 * duration:.4g} ms, {contact.duration_ratio:.3g} "
+                f"times the ideal contact's {1e3 * ideal_duration:.4g} ms, allowed {SHORTEST:g} to "
                 f"{LONGEST:g} times"
             )
 
 
 def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
+    """Return the results of one contact."""
     metrics = outcome.metrics
     status = int(metrics.status[slot, 0])
     ended = status == OK
 
-    def value(array: Any, known: bool) -> float:
-        return float(array[slot, 0]) if known else float("nan")
+    def value(array: Any, is_valid: bool) -> float:
+        return float(array[slot, 0]) if is_valid else float("nan")
 
     reached = status != NOT_REACHED
     return ContactResult(

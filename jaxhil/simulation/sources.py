@@ -1,4 +1,4 @@
-"""What results follow from besides the input: the sources of these packages, and what they stand on."""
+"""Fingerprint of source files and dependency versions, which determine results besides the input."""
 
 import hashlib
 import inspect
@@ -14,43 +14,44 @@ STANDS_ON = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy", "scipy
 
 
 def sources_sha256(*laws: object) -> str:
-    """SHA-256 of the names and contents of the Python files of the packages that are imported, as they were
-    when first asked for.
+    """Return the SHA-256 of names and contents of the imported packages' Python files, at the first call.
 
-    With `laws`, compensators and contact laws, also of those among them that are from elsewhere: their fields
-    and the module that they are in, as far as it has a source.
+    With `laws` (compensators and contact laws), the digest includes user-registered ones: their fields, and
+    the source of their module or class if available.
     """
-    own = _digest(
+    digest = _digest(
         tuple(Path(str(sys.modules[name].__file__)).parent for name in PACKAGES if name in sys.modules)
     )
     foreign = [law for law in laws if type(law).__module__.partition(".")[0] not in PACKAGES]
     if not foreign:
-        return own
-    told = [(type(law).__qualname__, repr(law), _source(type(law))) for law in foreign]
-    return hashlib.sha256(repr((own, told)).encode()).hexdigest()
+        return digest
+    descriptions = [(type(law).__qualname__, repr(law), _source(type(law))) for law in foreign]
+    return hashlib.sha256(repr((digest, descriptions)).encode()).hexdigest()
 
 
 @cache
 def versions(packages: tuple[str, ...] = ("jaxhil", *STANDS_ON)) -> dict[str, str]:
-    """Versions of Python and of packages, by default of all that the numbers depend on."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and of packages, by default of all that affect results."""
+    result = {"python": platform.python_version()}
     for name in packages:
         try:
-            found[name] = metadata.version(name)
+            result[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            result[name] = "not installed"
+    return result
 
 
 def _source(kind: type) -> str:
-    for one in (sys.modules.get(kind.__module__), kind):
+    """Return the source of a class's module, else of the class, else an empty text."""
+    for source in (sys.modules.get(kind.__module__), kind):
         with suppress(OSError, TypeError):
-            return inspect.getsource(one)  # pyright: ignore[reportArgumentType]
+            return inspect.getsource(source)  # pyright: ignore[reportArgumentType]
     return ""
 
 
 @cache
 def _digest(roots: tuple[Path, ...]) -> str:
+    """Return the SHA-256 of the Python files in these folders."""
     whole = hashlib.sha256()
     for root in roots:
         for source in sorted(root.rglob("*.py")):

@@ -1,13 +1,13 @@
-"""One tick of the hardware-in-the-loop contact rig, in the six stages of notebooks/guide/model.md section 1.
+"""One tick of the hardware-in-the-loop contact rig, in the six stages of notebooks/guide/model.md, section 1.
 
     sense           read the force sensor and the position sensor
     compensate      F_c from (F, x_d, v_d, x_a)
     integrate       M x_d'' = -F_c over one control period
     actuate         command -> limits, latency, hold -> motion simulator
-    contact_force   force of the real contact, where the force sensor will read it
-    record_contact  beginning, end, restitution, peaks and energies of the contact under way
+    contact_force   force of the real contact at the force sensor's sampling instant
+    record_contact  beginning, end, restitution, peaks and energies of the current contact
 
-`RunState` is what is carried from tick to tick, `Tick` what is recorded of one.
+`RunState` is the state from tick to tick, `Tick` the record of one tick.
 """
 
 from typing import Any, NamedTuple
@@ -44,41 +44,41 @@ from jaxhil.simulation.watch import Rules, Watch, record_contact
 
 
 class RunState(NamedTuple):
-    """What is carried from tick to tick."""
+    """State from tick to tick."""
 
-    state: LoopState  # of the loop
-    watch: Watch  # the contact under way
-    metrics: Metrics  # of the contacts that are over
-    index: Int[Array, "*batch"]  # of the contact under way, from 0
-    active: Bool[Array, "*batch"]  # whether the lane still has contacts to come
-    tick: Int[Array, ""]  # the number of ticks run, common to all lanes
-    skipped: Int[Array, "*batch"]  # ticks of approaches, in which nothing happens
+    state: LoopState  # state of the loop
+    watch: Watch  # record of the current contact
+    metrics: Metrics  # metrics of finished contacts
+    index: Int[Array, "*batch"]  # index of the current contact, from 0
+    active: Bool[Array, "*batch"]  # whether the lane is still running
+    tick: Int[Array, ""]  # number of the next tick, common to all lanes
+    skipped: Int[Array, "*batch"]  # skipped ticks of approaches
 
 
 class Tick(NamedTuple):
-    """What is recorded of a tick."""
+    """Record of a tick."""
 
-    signals: Signals  # what the controller read
-    command: Float[Array, "*batch"]  # F_c [N], what the compensator made of it
-    plant_signals: PlantSignals  # of the contact, without the sensors
+    signals: Signals  # readings of the controller
+    command: Float[Array, "*batch"]  # F_c [N], output of the compensator
+    plant_signals: PlantSignals  # contact without the effects of the sensors
     active: Bool[Array, "*batch"]  # whether the lane was still running
     contact: Int[Array, "*batch"]  # index of the contact, from 0
-    # stiffness [N/m] and damping [N s/m], by a compensator that identifies them
+    # stiffness [N/m] and damping [N s/m], if the compensator identifies them
     identified: tuple[Array, Array] | None
     sent: Float[Array, "*batch"]  # position command at the tick's end [m], before any limits of the drives
 
 
 class Prepared(NamedTuple):
-    """What is worked out once for many ticks of a contact."""
+    """Values computed once for many ticks of a contact."""
 
-    gains: Gains  # of the compensator
-    controller: Any  # what the compensator has prepared from them
-    rules: Rules  # when a contact is over
-    probe: Probe | None  # of the contact under way, where the run is probed
+    gains: Gains  # gains of the compensator
+    controller: Any  # values that the compensator computed from them
+    rules: Rules  # conditions for the end of a contact
+    probe: Probe | None  # probe of the current contact; None without one
 
 
 class Model(NamedTuple):
-    """The numerical model after a control period."""
+    """Numerical model after a control period."""
 
     position: Float[Array, "*batch"]  # x_d [m]
     velocity: Float[Array, "*batch"]  # v_d [m/s]
@@ -86,21 +86,21 @@ class Model(NamedTuple):
 
 
 class Actuated(NamedTuple):
-    """What a position command makes of the rig."""
+    """Effect of a position command on the rig."""
 
     plant: Plant  # drives and motion simulator after the control period
     controller: Any  # state of the compensator
-    # of the mechanism where its sensor samples it [m]; None where nobody reads it
+    # position of the mechanism at its sampling instant [m]; None if unused
     position: Float[Array, "*batch"] | None
-    interval: SamplingInterval  # motion whose contact happens now
-    # ring of the motions whose contact is still to come; None with one surface
+    interval: SamplingInterval  # motion whose contact is computed now
+    # ring of the motions whose contact is not yet computed; None with one surface
     under_way: SamplingInterval | None
 
 
 def tick(
     loop: Loop, rig: RigConstants, prepared: Prepared, run: RunState, noise: Noise
 ) -> tuple[RunState, Tick]:
-    """One control period: what is carried on, and what is recorded of it."""
+    """Run one control period; return the next state and the tick's record."""
     state, now = run.state, run.tick
     signals, plant_signals = sense(loop, rig, state, now, noise)
     force, controller = compensate(loop, prepared, state, signals, now)
@@ -130,7 +130,7 @@ def tick(
 def sense(
     loop: Loop, rig: RigConstants, state: LoopState, now: Array, noise: Noise
 ) -> tuple[Signals, PlantSignals]:
-    """Stage 1: what the sensors read at tick `now`, noise included, and the plant's own signals."""
+    """Return the sensor readings at tick `now`, noise included, and the plant's own signals (stage 1)."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.entry_tick
     rings, delays = sensed.rings, rig.delays
@@ -156,7 +156,7 @@ def sense(
 def compensate(
     loop: Loop, prepared: Prepared, state: LoopState, signals: Signals, now: Array
 ) -> tuple[Array, Any]:
-    """Stage 2: the force command F_c [N], and the compensator's next state."""
+    """Return the force command F_c [N] and the compensator's next state (stage 2)."""
     force, controller = loop.compensator.step(prepared.controller, state.controller, signals, now)
     if loop.reads_always:
         force = jnp.where(signals.age == 0, 0, force)
@@ -164,7 +164,7 @@ def compensate(
 
 
 def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> Model:
-    """Stage 3: the numerical model after one control period of M x_d'' = -F_c, F_c = `force` [N]."""
+    """Integrate M x_d'' = -F_c over one control period, with F_c = `force` [N] (stage 3)."""
     acceleration = -force * rig.inverse_mass
     step = INTEGRATORS[loop.integrator]
     position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)
@@ -174,7 +174,7 @@ def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> 
 def actuate(
     loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, now: Array, model: Model, controller: Any
 ) -> Actuated:
-    """Stage 4: position command, its limits, latency and hold, and the motion simulator that follows it."""
+    """Send the position command through limits, latency, hold and motion simulator (stage 4)."""
     command, controller = loop.compensator.position_command(gains, controller, *model)
     command, step, wanted = _limited(rig, state.plant, command)
     commands = (command, *state.plant.commands)
@@ -198,7 +198,7 @@ def actuate(
 
 
 def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
-    """Stage 5: the real contact during the sampling interval that happens now."""
+    """Return the real contact during the sampling interval that takes place now (stage 5)."""
     if rig.cells is not None:
         return _contact_in_cells(loop, rig, state, interval)
     scenario, period = rig.scenario, rig.constants.control_period
@@ -228,12 +228,12 @@ def contact_force(loop: Loop, rig: RigConstants, state: LoopState, interval: Sam
 
 
 def _contact_in_cells(loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval) -> Contact:
-    """Stage 5 along the exact motion between samples."""
+    """Return the real contact along the exact motion between samples (stage 5)."""
     scenario, period, cells = rig.scenario, rig.constants.control_period, rig.cells
     assert cells is not None and interval.course is not None
     clearance = scenario.clearance if loop.is_two_sided else None
     touch = Touch(loop.law, state.parameters, clearance)
-    found = contact_in_cells(
+    result = contact_in_cells(
         touch,
         state.law,
         cells,
@@ -242,9 +242,9 @@ def _contact_in_cells(loop: Loop, rig: RigConstants, state: LoopState, interval:
         state.sensed.lagged,
         scenario.force_sensor.time_constant if loop.has_lag else None,
     )
-    surfaces = Surfaces(loop.law, state.parameters, found.at_sample, clearance)
+    surfaces = Surfaces(loop.law, state.parameters, result.at_sample, clearance)
     force, _ = surfaces.force(interval.sample)
-    last, works = state.sensed.last, found.works if loop.energies else None
+    last, works = state.sensed.last, result.works if loop.energies else None
     if loop.is_two_sided or loop.energies:
         last = surfaces.sample(interval.sample, force)
     if loop.energies and loop.first_break == 0:
@@ -252,19 +252,22 @@ def _contact_in_cells(loop: Loop, rig: RigConstants, state: LoopState, interval:
         works = work_of_jump(touch, state.law, before, interval.sample.position)
     reading = None
     if loop.has_lag:
-        # Cells do not resolve a lag that is none, of a lane beside others that have one.
+        # Cells cannot resolve the zero lag of a lane in a batch whose other lanes have one.
         lag = scenario.force_sensor.time_constant
-        reading = jnp.where(lag > INSTANT * period, found.reading, force)
-    before, after = found.touched
+        reading = jnp.where(lag > INSTANT * period, result.reading, force)
+    before, after = result.touched
     assert state.sensed.touched is not None
-    signals = PlantSignals(force, works, found.peak, state.sensed.touched + before)
-    return Contact(signals, reading, found.lagged, last, after, found.at_end)
+    signals = PlantSignals(force, works, result.peak, state.sensed.touched + before)
+    return Contact(signals, reading, result.lagged, last, after, result.at_end)
 
 
 def next_state(
     state: LoopState, now: Array, before: PlantSignals, model: Model, actuated: Actuated, contact: Contact
 ) -> LoopState:
-    """The state after the tick; the contact goes into the delay lines, from which `before` was read."""
+    """Return the state after the tick.
+
+    The contact is written to the delay lines, after `before` was read from them.
+    """
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
     samples = Rings(plant_signals, contact.reading, actuated.position, None)
     rings = write_in_turn(state.sensed.rings._replace(interval=None), now, samples)
@@ -284,12 +287,12 @@ def next_state(
 
 
 def _recall(ring, now, age, intervals):
-    """The sample so many sampling intervals before the newest; before the run there was no force."""
+    """Return a sample `intervals` before the newest one; before the run there was no force."""
     return look_back(ring, now - 1, intervals, age > intervals)
 
 
 def _recall_position(rig, state, now, age):
-    """The position of the mechanism a delay ago, of uniform motion before the run; NaN if nobody reads it."""
+    """Return the delayed position [m], from uniform motion before the run; NaN if unused."""
     ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
     if ring is None:
         return jnp.full_like(state.position, jnp.nan)
@@ -299,7 +302,7 @@ def _recall_position(rig, state, now, age):
 
 
 def _limited(rig, plant, command):
-    """The command after the limits, its step [m], and the command before them, where there are any."""
+    """Return the limited command, its step [m], and the command before limits (None without limits)."""
     if plant.wanted is None:
         return command, plant.step, None
     simulator = rig.scenario.simulator
@@ -311,7 +314,7 @@ def _limited(rig, plant, command):
 
 
 def _interval(rows, state, start, end, plane):
-    """Motion of the real mechanism over the interval under way, from the plane in which it touches."""
+    """Return the mechanism's motion over the current interval, relative to the surface at `plane` [m]."""
 
     def motion(position, velocity):
         return Motion(read(position, state, start, end) - plane, read(velocity, state, start, end))
@@ -323,6 +326,9 @@ def _interval(rows, state, start, end, plane):
 
 
 def _arrived(rig, under_way, now, age):
-    """The interval that happens now; before the run, at rest at the surface, which does not push."""
+    """Return the interval that takes place now.
+
+    Before the run it is at rest at the surface, without force.
+    """
     intervals = rig.delays.contact
     return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), under_way)

@@ -1,7 +1,7 @@
-"""The contact under way, followed tick by tick: when it begins and ends, its speeds, forces and energies.
+"""Record of the current contact from tick to tick: begin, end, speeds, forces and energies.
 
-What counts are the real contact (`PlantSignals`) and the force command; notebooks/guide/model.md section 2
-says when a contact begins and when it is over.
+It follows the real contact (`PlantSignals`) and the force command; notebooks/guide/model.md, section 2, says
+when a contact begins and when it is over.
 """
 
 from typing import NamedTuple
@@ -16,55 +16,61 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, no_deviation
 from jaxhil.simulation.scenario import Scenario
 
-LONGEST_FADING = 0.1  # s, waited for the compensator's command to die out, which a noisy one never does
-FADED = 1e-6  # of the command's peak
-RUNAWAY = 1e3  # of the first approach speed: no rig survives it
+LONGEST_FADING = 0.1  # s; longest wait for the command to decay, which a noisy command never does
+FADED = 1e-6  # of the command's peak; below it the command has decayed
+RUNAWAY = 1e3  # times the first approach speed; above it the run has diverged
 
 
 class Swings(NamedTuple):
-    """F_c of the contact under way; all of it begins with the 0 before the contact."""
+    """F_c in the current contact; all values begin with the 0 before the contact."""
 
-    last: Float[Array, "*batch"]  # value [N]
-    highest: Float[Array, "*batch"]  # value so far [N]
-    lowest: Float[Array, "*batch"]  # value so far [N]
+    last: Float[Array, "*batch"]  # last value [N]
+    highest: Float[Array, "*batch"]  # highest value so far [N]
+    lowest: Float[Array, "*batch"]  # lowest value so far [N]
     variation: Float[Array, "*batch"]  # total variation so far [N]
 
 
 class Watch(NamedTuple):
-    """The contact under way."""
+    """Record of the current contact."""
 
-    elapsed: Float[Array, "*batch"]  # ticks since it began; 0 before
-    over: Bool[Array, "*batch"]  # whether it is over, or the run has diverged
-    approach: Float[Array, "*batch"]  # speed of the numerical model before it [m/s]
+    elapsed: Float[Array, "*batch"]  # ticks since the contact began; 0 before
+    over: Bool[Array, "*batch"]  # whether the contact is over, or the run has diverged
+    approach: Float[Array, "*batch"]  # speed of the numerical model before the contact [m/s]
     rebound: Float[Array, "*batch"]  # speed of the numerical model now [m/s]
-    peak_force: Float[Array, "*batch"]  # of the real force [N]
-    peak_command: Float[Array, "*batch"]  # of |F_c| [N]
+    peak_force: Float[Array, "*batch"]  # largest real force [N]
+    peak_command: Float[Array, "*batch"]  # largest |F_c| [N]
     recent: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # ticks with a real force
-    measured: Bool[Array, "*batch"]  # whether the force sensor has read any of it
+    measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
     quiet: Float[Array, "*batch"]  # ticks since the last real force, or since a contact began without one
-    works: tuple[Array, ...]  # done on the mechanism and returned by it [J], where energies are followed
-    swings: Swings | None  # of the command, where they are followed
-    shortfall: Float[Array, "*batch"] | None  # largest of the position command [m], where it has limits
-    side: Float[Array, "*batch"] | None  # of the surface, 1 or -1, between two of them
-    command: Float[Array, "*batch"] | None  # |F_c| of the last tick [N], between two surfaces
-    # what was left of |F_c| when the last contact was over [N], between two surfaces
+    works: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
+    swings: Swings | None  # swings of the command; None unless recorded
+    shortfall: (
+        Float[Array, "*batch"] | None
+    )  # largest change of the position command by limits [m]; None without limits
+    side: Float[Array, "*batch"] | None  # side of the surface, 1 or -1; None with one surface
+    command: Float[Array, "*batch"] | None  # |F_c| of the last tick [N]; None with one surface
+    # |F_c| that remained at the end of the last contact [N]; None with one surface
     left: Float[Array, "*batch"] | None
-    deviation: Deviation | None  # of x_d from the contact in space, where the run is probed
+    deviation: Deviation | None  # deviation of x_d from the ideal contact; None without a probe
 
 
 class Rules(NamedTuple):
-    """When a contact is over."""
+    """Conditions for the end of a contact."""
 
-    quiet: Float[Array, "*batch"]  # ticks without a real force
-    # ticks without a real force after which the command need not have died out
+    quiet: Float[Array, "*batch"]  # least ticks without a real force
+    # ticks without a real force after which the command need not have decayed
     patience: Float[Array, "*batch"]
     fastest: Float[Array, "*batch"]  # speed beyond which the run has diverged [m/s]
-    clearance: Float[Array, "*batch"]  # between two surfaces [m]; infinite for one
+    clearance: Float[Array, "*batch"]  # distance between two surfaces [m]; infinite for one surface
 
 
 def build_rules(scenario: Scenario) -> Rules:
-    """Return the waits: h = tau_f + 20 sensor time constants + 2 T; 0.1 s more for the command."""
+    """Return the conditions for the end of a contact.
+
+    A contact ends tau_f + 20 sensor time constants + 2 T after the last real force, or up to 0.1 s later,
+    until the command has decayed.
+    """
     sensor, period = scenario.force_sensor, scenario.control_period
     quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
     patience = quiet + jnp.ceil(LONGEST_FADING / period)
@@ -72,7 +78,7 @@ def build_rules(scenario: Scenario) -> Rules:
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
-    """No contact, nor one for long."""
+    """Return the record before a contact, long after any force."""
     zeros = jnp.zeros_like(like)
     return Watch(
         elapsed=zeros,
@@ -104,17 +110,17 @@ def record_contact(
     command: Array,
     shortfall: Array | None,
 ) -> Watch:
-    """Stage 6 of a tick: follow the contact; `command` is F_c [N], `shortfall` that of `Plant`."""
+    """Update the record of the contact; `command` is F_c [N], `shortfall` that of `Plant` (stage 6)."""
     speed, magnitude = jnp.abs(signals.velocity_desired), jnp.abs(command)
     force = jnp.abs(plant_signals.force)
     touching = force > 0
     if plant_signals.touched is not None:
-        # A touch between two samples that do not show it.
+        # A touch may begin and end between two samples.
         touching = touching | ((watch.recent[1] == 0) & (plant_signals.touched > 0))
     begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
     side = _side(rules, watch, signals)
     peak_command = jnp.maximum(watch.peak_command, magnitude)
-    # The hardware may follow the numerical model late.
+    # The hardware follows the numerical model with a delay.
     quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
     touched = plant_signals.touched
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
@@ -123,9 +129,9 @@ def record_contact(
     lasts = begun & ~watch.over
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
-        # What runs away may come back: it is over at once.
+        # A diverged run is over at once, even if its speed decreases again.
         over=watch.over | ends | (speed > rules.fastest),
-        # Each speed stops being followed at its event; the approach's is that of the tick before.
+        # The approach speed is that of the tick before the onset, the rebound speed that at the end.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
         rebound=jnp.where(watch.over, watch.rebound, speed),
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
@@ -145,11 +151,11 @@ def record_contact(
 
 
 def _has_begun(loop, rules, watch, signals, touching, magnitude):
-    """Whether the contact has begun: by a force or, where there is always a reading, by a penetration."""
+    """Return whether the contact has begun: by a force or, with a noisy or biased sensor, a penetration."""
     if loop.reads_always:
         starts = touching | (deflection(signals.position_desired, rules.clearance) != 0)
     elif watch.left is not None:
-        # What is left of the last contact's command does not begin the next one.
+        # A command that remains from the last contact does not begin the next one.
         starts = touching | (magnitude > watch.left)
     else:
         starts = touching | (magnitude > 0)
@@ -159,7 +165,7 @@ def _has_begun(loop, rules, watch, signals, touching, magnitude):
 
 
 def _side(rules, watch, signals):
-    """The nearer of two surfaces until the contact begins; None with one surface."""
+    """Return the nearer of two surfaces, constant after the contact begins; None with one surface."""
     if watch.side is None:
         return None
     position = signals.position_desired
@@ -167,15 +173,16 @@ def _side(rules, watch, signals):
 
 
 def _nearer(rules, position):
-    """1 or -1, the nearer of two surfaces."""
+    """Return the side of the nearer of two surfaces, 1 or -1."""
     return jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
 
 
 def _ends(rules, signals, side, quiet, magnitude, peak_command):
-    """Return where a contact ends: the model moves away, without a force for long enough, the command gone.
+    """Return whether a contact ends.
 
-    No threshold depends on the noise: a command that happens to be small while its mean is not would end the
-    contact before all of its impulse is in.
+    It ends if the model moves away, there was no force for long enough, and the command has decayed. No
+    threshold depends on the noise: a command that is small by chance while its mean is not would end the
+    contact before its whole impulse has acted.
     """
     velocity = signals.velocity_desired
     faded = (magnitude <= FADED * peak_command) | (quiet >= rules.patience)
@@ -186,22 +193,26 @@ def _ends(rules, signals, side, quiet, magnitude, peak_command):
 
 
 def _peak_force(loop, watch, plant_signals, force):
-    """Largest real force [N] since the tick before."""
+    """Return the largest real force [N] since the last tick."""
     if plant_signals.peak is not None:
         return plant_signals.peak
-    # The force of a motion in jumps is constant between them.
+    # If the position itself jumps at the ticks, the force is constant between them.
     return force if loop.first_break == 0 else _vertex(watch.recent[0], watch.recent[1], force)
 
 
 def _largest_shortfall(watch, shortfall, lasts):
-    """Of the position command while the contact lasts [m]; None without limits."""
+    """Return the largest change of the position command by limits [m]; None without limits."""
     if watch.shortfall is None or shortfall is None:
         return watch.shortfall
     return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)
 
 
 def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
-    """One tick further, where the contact `lasts`; where it `ends` with this tick, the command is 0 next."""
+    """Update the swings of the command.
+
+    Lanes whose contact `lasts` are updated. The command counts as 0 after the tick at which the contact
+    `ends`.
+    """
     step = jnp.abs(command - swings.last) + jnp.where(ends, jnp.abs(command), 0)
     return Swings(
         last=jnp.where(lasts, command, swings.last),
@@ -212,7 +223,7 @@ def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
 
 
 def _vertex(before, middle, now):
-    """Largest force of the last period: the vertex of the parabola through three samples, if there is one."""
+    """Return the largest force of the last period, at the peak of the parabola through three samples."""
     bend = 2 * middle - before - now
     peaks = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
     vertex = middle + (now - before) ** 2 / (8 * jnp.where(peaks, bend, 1))
