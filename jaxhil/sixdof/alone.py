@@ -1,4 +1,4 @@
-"""Two bodies in space alone, without a rig: their first episode, and where it leads."""
+"""Ideal contact of two free bodies without a rig: their first episode and their final motion."""
 
 from collections.abc import Callable
 from functools import cache
@@ -19,41 +19,41 @@ from jaxhil.sixdof.scenario import Scenario
 
 
 class EpisodeInSpace(NamedTuple):
-    """As an episode of a run has it; NaN for what there is not."""
+    """First episode of the ideal contact, as in a run; NaN for values that it does not have."""
 
-    reference_restitution: float  # e*, of a single touch [1]
+    reference_restitution: float  # e*; NaN unless there is a single touch [1]
     effective_mass: float  # m_n at the first touch [kg]
-    approach_velocity: float  # along its normal [m/s]
-    point: tuple[float, ...]  # of the first touch, in T axes [m]
-    normal: tuple[float, ...]  # there, outward from the target
+    approach_velocity: float  # along the normal of the first touch [m/s]
+    point: tuple[float, ...]  # point of the first touch, in T axes [m]
+    normal: tuple[float, ...]  # normal there, outward from the target
     reference_peak_force: float  # [N]
-    reference_peak_moment: float  # about T [N m]
-    reference_duration: float  # in touch [s]
-    reference_touches: int  # candidates that began to touch
+    reference_peak_moment: float  # about T's origin [N m]
+    reference_duration: float  # time in touch [s]
+    reference_touches: int  # number of onsets of touch, over all candidates
 
 
 class SpaceRun(NamedTuple):
-    """What becomes of a mechanism's two bodies in space."""
+    """Ideal contact of a mechanism's two bodies."""
 
     episode: EpisodeInSpace
-    status: str  # "rebounded", "captured", held by a latch, or "miss"
-    final: Final  # the motion at the end of the file's duration
+    status: str  # "rebounded", "captured" (held by a latch), or "miss"
+    final: Final  # motion at the end of the file's duration
 
 
 def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
-    """Follow the bodies of a mechanism of six axes in space, from its start to the end of its duration.
+    """Simulate the ideal contact of a six-axis mechanism, from its start to the end of its duration.
 
-    Raises `InputError` for a start that cannot be run, and for a contact that is too stiff to be followed.
+    Raise `InputError` if the start is invalid or a contact is too stiff to be integrated.
     """
     with computing():
         scenario = build_scenarios(mechanism)
         check_scenario(mechanism, scenario)
-        found = jax.device_get(_compiled()(scenario))
-    check_followed(mechanism, found)
+        metrics = jax.device_get(_compiled()(scenario))
+    check_followed(mechanism, metrics)
 
     def value(name: str) -> Any:
-        one = np.asarray(getattr(found, name))[..., 0, 0]
-        return tuple(one.tolist()) if one.ndim else one.item()
+        entry = np.asarray(getattr(metrics, name))[..., 0, 0]
+        return tuple(entry.tolist()) if entry.ndim else entry.item()
 
     episode = EpisodeInSpace(*map(value, EpisodeInSpace._fields))
     status = (
@@ -64,8 +64,8 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
     return SpaceRun(episode, status, final_in_space(mechanism, float(ticks * period)))
 
 
-def _judged(scenario: Scenario) -> Metrics:
-    """The figures of an episode that begins with the run; only those in space have a meaning."""
+def _ideal_metrics(scenario: Scenario) -> Metrics:
+    """Return the metrics of the ideal contact; those of a rig's episode in them are meaningless."""
     start = jax.tree.map(lambda leaf: leaf[None], scenario.start)
     zero = jnp.zeros_like(scenario.duration)[None]
     none = zero.astype(jnp.int32)
@@ -88,4 +88,5 @@ def _judged(scenario: Scenario) -> Metrics:
 
 @cache
 def _compiled() -> Callable[[Scenario], Metrics]:
-    return jax.jit(_judged, compiler_options=known_options(ONCE))
+    """Return the compiled function for the metrics."""
+    return jax.jit(_ideal_metrics, compiler_options=known_options(ONCE))

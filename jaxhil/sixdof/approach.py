@@ -1,4 +1,4 @@
-"""How a run begins: free flight towards the first touch."""
+"""Start of a run: free flight towards the first touch."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, cross
 
-FAR = 10.0  # m: from where the chaser is lowered on the target
-STEPS, POLISHES = 400, 3  # of the search for the first touch
-FLIGHTS = 8  # steps of the flight back
+FAR = 10.0  # m; height from which the chaser is lowered on the target
+STEPS, POLISHES = 400, 3  # steps and final Newton steps of the search for the first touch
+FLIGHTS = 8  # steps of the backward flight
 
 
 def touching_height(
@@ -21,18 +21,19 @@ def touching_height(
     offset_y: Float[Array, "*batch"],
     attitude: Quaternion,
 ) -> Float[Array, "*batch"]:
-    """z [m] of C, in T axes, at which the chaser, lowered along z, first touches; NaN where it never does.
+    """Return z [m] of C, in T axes, at which the chaser, lowered along z, first touches; NaN if never.
 
-    A step as long as the gap cannot pass a surface; Newton's method has the last digits.
+    Steps are as long as the gap, so that they cannot pass a surface. Newton's method then gives the last
+    digits.
     """
 
     def depth(height: Array) -> Array:
         return deepest(groups, Pose(Vector(offset_x, offset_y, height), attitude))
 
     def polished(_, height: Array) -> Array:
-        at = jax.lax.stop_gradient(height)
-        found, slope = jax.jvp(depth, (at,), (jnp.ones_like(at),))
-        return at - found / jnp.where(slope < 0, slope, -1)
+        guess = jax.lax.stop_gradient(height)
+        value, slope = jax.jvp(depth, (guess,), (jnp.ones_like(guess),))
+        return guess - value / jnp.where(slope < 0, slope, -1)
 
     start = jnp.full_like(offset_x, FAR)
     height = jax.lax.fori_loop(0, STEPS, lambda _, z: z + jax.lax.stop_gradient(depth(z)), start)
@@ -42,14 +43,16 @@ def touching_height(
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
-    """States `before` [s] bodies in free flight are at a pose and twist: the target at rest, its centre of
-    mass at the origin and its body axes those of the world."""
+    """Return the states `before` [s] bodies in free flight have a pose and a twist.
+
+    The target is at rest, its centre of mass is at the origin, and its body axes are the world axes.
+    """
     zero = jnp.zeros_like(before)
     still = Vector(zero, zero, zero)
     target = build_state(bodies.target, still, still, identity(before), still)
     body = bodies.chaser
-    to_world, own = (body.interface_attitude or identity(before) for body in bodies)
-    attitude = compose(compose(to_world, pose.attitude), reverse(own))
+    to_world, to_body = (body.interface_attitude or identity(before) for body in bodies)
+    attitude = compose(compose(to_world, pose.attitude), reverse(to_body))
     angular = rotate(to_world, twist.angular)
     arm = rotate(attitude, body.interface)
     chaser = build_state(

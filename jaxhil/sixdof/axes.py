@@ -1,9 +1,9 @@
-"""The drives of the motion simulator: some axes, each with a model and a delay of its own.
+"""Drives of the motion simulator: axes that each have a model and a delay.
 
-An axis is a coordinate, a robot's coordinate or a leg; axes lie along the leading dimension, (axes, *batch).
-Each follows its command as on one axis (`jaxhil.simulation.motion_simulator`), propagated exactly. The
-hardware's pose at one time needs every axis at that time: as each has its own delay, each is sampled at its
-own place in a sampling interval, and looked up as many intervals back as its delay is long.
+An axis is a coordinate, a robot's coordinate or a leg; axes are the leading dimension, (axes, *batch). Each
+follows its command like the single axis of `jaxhil.simulation.motion_simulator`, discretised exactly. The
+hardware's pose at an instant needs the positions of all axes at this instant. As delays differ, each axis is
+sampled at its own fraction of a sampling interval, and looked up as many intervals back as its delay is long.
 """
 
 from typing import Any, NamedTuple
@@ -28,13 +28,13 @@ from jaxhil.simulation.scenario import MotionSimulator
 
 
 class Axes(NamedTuple):
-    """Axes of a motion simulator, discretised, and where the sensors sample them."""
+    """Discretised axes of a motion simulator, with the sensors' sampling instants."""
 
-    propagation: Propagation  # of each axis, (..., axes, *batch)
-    # row at the force sensor's place [1/s^2]; None where no tool is weighed
+    propagation: Propagation  # each axis's motion simulator, (..., axes, *batch)
+    # row at the force sensor's sampling instant [1/s^2]; None unless a tool is weighed
     acceleration: Float[Array, "columns axes *batch"] | None
-    force: Delay  # of each axis and the force sensor together, (axes, *batch)
-    position: Delay  # of each axis and the position sensor together, (axes, *batch)
+    force: Delay  # delay of each axis plus the force sensor, (axes, *batch)
+    position: Delay  # delay of each axis plus the position sensor, (axes, *batch)
 
 
 class Motion(NamedTuple):
@@ -42,22 +42,22 @@ class Motion(NamedTuple):
 
     position: Float[Array, "..."]  # (axes, *batch)
     rate: Float[Array, "..."]  # (axes, *batch)
-    acceleration: Float[Array, "..."] | None  # (axes, *batch); None where nobody needs it
+    acceleration: Float[Array, "..."] | None  # (axes, *batch); None if unused
 
 
 class Samples(NamedTuple):
-    """What the sensors meet."""
+    """Motion of the axes at the sensors' sampling instants."""
 
-    motion: Motion  # at the force sensor's sampling time
-    measured: Float[Array, "..."] | None  # positions at the position sensor's; None where nobody needs them
+    motion: Motion  # at the force sensor's sampling instant
+    measured: Float[Array, "..."] | None  # positions at the position sensor's; None if unused
 
 
 class Hardware(NamedTuple):
-    """What evolves of the axes and their samples."""
+    """State of the axes and their delay line."""
 
     commands: tuple[Array, ...]  # c(n), c(n-1), ... as sent to the drives, (axes, *batch) each
-    state: tuple[Array, ...]  # of the axes
-    ring: Float[Array, "rows *batch"]  # what each interval has been sampled for: samples, kinds, axes in one
+    state: tuple[Array, ...]  # state of the axes
+    ring: Float[Array, "rows *batch"]  # delay line; rows are (intervals, sampled quantities, axes), flattened
 
 
 def build_axes(
@@ -68,8 +68,10 @@ def build_axes(
     hold: str,
     weighed: bool = False,
 ) -> Axes:
-    """Axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s]. Accelerations and
-    measured positions are followed where a tool is `weighed`."""
+    """Return axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s].
+
+    `weighed` adds accelerations and measured positions, for the weight of a tool.
+    """
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
@@ -83,8 +85,10 @@ def build_axes(
 def enter(
     axes: Axes, at: Array, stride: Array, period: Array, hold: str, latency: int, ring: int
 ) -> Hardware:
-    """The hardware in uniform motion, `at` now and growing by `stride` in a control period [s], both
-    (axes, *batch); `ring`, a power of two, is longer than any delay in periods."""
+    """Return the hardware in uniform motion, at positions `at` that grow by `stride` in a control period [s].
+
+    Both are (axes, *batch). `ring` is the length of the delay line: a power of two, longer than any delay.
+    """
     commands = tuple(at - back * stride for back in range(latency + 1))
     drive = commands[-1] if hold == "linear" else commands[-1] + stride
     start = drive - stride
@@ -94,7 +98,7 @@ def enter(
     position, measured = read(rows.position, settled, start, end), read_measured(rows, settled, start, end)
     newest = _samples(axes, position, stride / period[None], 0 * stride, measured)
     growth = _samples(axes, stride, 0 * stride, 0 * stride, stride)
-    # The past fills the ring, one interval after the other.
+    # The delay line contains the uniform motion of the past intervals.
     back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
     newest, growth = (jnp.stack(jax.tree.leaves(samples))[None] for samples in (newest, growth))
     return Hardware(
@@ -103,25 +107,25 @@ def enter(
 
 
 def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
-    """What the sensors meet that read at `tick`, counted from the start of the run."""
+    """Return the samples that the sensors read at `tick`, counted from the start of the run."""
     force = axes.force.intervals
     delays, structure = jax.tree.flatten(_samples(axes, force, force, force, axes.position.intervals))
     size = force.size
     ring = hardware.ring.reshape(-1)
     last = ring.size // (len(delays) * size) - 1
     lane = jnp.arange(size, dtype=force.dtype).reshape(force.shape)
-    found = []
+    samples = []
     for kind, delay in enumerate(delays):
-        # A ring is read up to one ring behind: an index below 0 wraps.
-        place = ((tick - 1 - delay) & last) * (len(delays) * size) + (kind * size + lane)
-        found.append(ring.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False))
-    return structure.unflatten(found)
+        # The delay line is read up to its length back: an index below 0 wraps.
+        index = ((tick - 1 - delay) & last) * (len(delays) * size) + (kind * size + lane)
+        samples.append(ring.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False))
+    return structure.unflatten(samples)
 
 
 def actuate(
     axes: Axes, hardware: Hardware, tick: Int[Array, ""], command: Array, hold: str, latency: int
 ) -> Hardware:
-    """The hardware after the control period of `tick`, which ends with `command` sent."""
+    """Return the hardware after the control period of `tick`, at whose end `command` is sent."""
     commands = (command, *hardware.commands)
     end = commands[latency]
     start = commands[latency + 1] if hold == "linear" else end
@@ -130,12 +134,12 @@ def actuate(
     kinds = jax.tree.leaves(rows)
     last = ring.size // (len(kinds) * command.size) - 1
     for kind, row in enumerate(kinds):
-        place = ((tick & last) * len(kinds) + kind) * len(command)
-        ring = lax.dynamic_update_slice_in_dim(ring, read(row, state, start, end), place, 0)
+        index = ((tick & last) * len(kinds) + kind) * len(command)
+        ring = lax.dynamic_update_slice_in_dim(ring, read(row, state, start, end), index, 0)
     return Hardware(commands[: latency + 1], advance(exact.transition, state, start, end), ring)
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
-    """Of all that may be sampled what is."""
+    """Return the samples, without those that only a weighed tool needs."""
     weighed = axes.acceleration is not None
     return Samples(Motion(position, rate, acceleration if weighed else None), measured if weighed else None)

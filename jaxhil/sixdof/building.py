@@ -1,6 +1,6 @@
-"""From a mechanism of six axes, nominal or drawn, to the arrays of its runs.
+"""Construction of scenarios and loops from a six-axis mechanism, nominal or drawn.
 
-All is NumPy until a run is compiled, but for what is drawn as jax arrays. The batch is the trailing axis.
+Arrays are NumPy's until a run is compiled, except draws given as JAX arrays. The batch is the trailing axis.
 """
 
 from collections.abc import Mapping
@@ -27,17 +27,18 @@ from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
-APPROACH = 0.02  # s: how long before the first touch a run begins, and a part of a control period
-LONGEST = 10.0  # s, of a run whose start says nothing of its duration
+APPROACH = 0.02  # s; free flight before the first touch, in addition to the phase
+LONGEST = 10.0  # s; duration of a run whose start does not specify one
 
 
 def build_scenarios(
     mechanism: SixAxisMechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
 ) -> Scenario:
-    """Batch of scenarios of a mechanism.
+    """Return a batch of scenarios of a mechanism.
 
-    `draws` maps dotted paths to values, (number,) or for lists (number, *entries); what it lacks is nominal.
-    Without it, a batch of one: the nominal run. Noise keys depend on `seed` and `first` + lane alone.
+    `draws` maps dotted paths to values, (number,), or (number, *entries) for lists; other numbers are
+    nominal. Without draws the batch is the nominal run alone. Noise keys depend only on `seed` and `first` +
+    lane.
     """
     numbers = Values(mechanism, dict(draws or {}))
     bodies = Pair(*(_body(numbers, name) for name in ("target", "chaser")))
@@ -46,13 +47,13 @@ def build_scenarios(
     key: Any = np.stack([np.full(numbers.number, seed & 0xFFFFFFFF, np.uint32), indices])
     period = numbers("rig.control_period")
     if mechanism.start is not None:
-        start = _stated(numbers, bodies)
+        start = _specified(numbers, bodies)
         duration = numbers("start.duration") if mechanism.start.duration else numbers.constant(LONGEST)
     else:
         before = APPROACH + numbers("approach.phase") * period
-        start = _approaching(numbers, bodies, groups, before)
+        start = _before_touch(numbers, bodies, groups, before)
         duration = before + numbers("approach.duration")
-    # Compiled functions are typed by jax's arrays alone.
+    # Compiled functions accept only JAX arrays.
     return jax.tree.map(jnp.asarray, Scenario(
         bodies=bodies,
         start=start,
@@ -68,7 +69,7 @@ def build_scenarios(
 
 
 def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
-    """What shapes the compiled loop of a mechanism's scenarios."""
+    """Return the static loop of a mechanism's scenarios."""
     rig = mechanism.rig
     return build_loop(
         scenario,
@@ -84,6 +85,7 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
 
 
 def _body(numbers: Values, name: str) -> Body:
+    """Return a body by its name."""
     turned = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
@@ -93,8 +95,8 @@ def _body(numbers: Values, name: str) -> Body:
     )
 
 
-def _stated(numbers: Values, bodies: Pair) -> States:
-    """The states of [start]."""
+def _specified(numbers: Values, bodies: Pair) -> States:
+    """Return the states of [start]."""
 
     def state(name: str, body: Body):
         parts = numbers(f"start.{name}.attitude")
@@ -109,14 +111,15 @@ def _stated(numbers: Values, bodies: Pair) -> States:
     return States(state("target", bodies.target), state("chaser", bodies.chaser))
 
 
-def _approaching(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
-    """The states before the first touch of [approach]."""
+def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
+    """Return the states before the first touch of [approach]."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
+    """Return the states `before` [s] the chaser, with an offset and attitude, touches the target."""
     turned = exponential(vector(attitude))
     height = touching_height(groups, offset[0], offset[1], turned)
     pose = Pose(Vector(offset[0], offset[1], height), turned)
@@ -124,7 +127,7 @@ def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, befor
 
 
 def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
-    """What the axes move."""
+    """Return the relation of axes and coordinates."""
     path, simulator = "rig.simulator.", mechanism.rig.simulator
     if simulator.space == "task":
         return TaskSpace()
@@ -138,42 +141,49 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
 
 
 def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulator:
-    """Every model as a transfer function of each axis; `ideal` has order 0."""
+    """Return every axis's motion simulator as a transfer function; `ideal` has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:
-        """Of each axis: the target's robot has after the chaser's what it is said to have, else the same."""
-        own = numbers(path + key)
+        """Return a key's values for all axes.
+
+        With two robots, the target's axes follow the chaser's, and have the same values unless specified.
+        """
+        chaser = numbers(path + key)
         if mechanism.rig.simulator.target_robot is None:
-            return own
-        other = path + "target_robot." + key
-        return numbers.np.concatenate([own, numbers(other) if numbers.has(other) else own])
+            return chaser
+        target = path + "target_robot." + key
+        return numbers.np.concatenate([chaser, numbers(target) if numbers.has(target) else chaser])
 
     delay = of("delay")
-    one, stack = 0 * delay + 1, numbers.np.stack
+    ones, stack = 0 * delay + 1, numbers.np.stack
     numerator: Any
     denominator: Any
     if model == "ideal":
-        numerator, denominator = np.zeros((0, *one.shape)), one[None]
+        numerator, denominator = np.zeros((0, *ones.shape)), ones[None]
     elif model == "first_order":
-        numerator, denominator = one[None], stack([of("time_constant"), one])
+        numerator, denominator = ones[None], stack([of("time_constant"), ones])
     elif model == "second_order":
         frequency = 2 * np.pi * of("natural_frequency")
-        numerator = stack([0 * one, frequency**2])
-        denominator = stack([one, 2 * of("damping_ratio") * frequency, frequency**2])
+        numerator = stack([0 * ones, frequency**2])
+        denominator = stack([ones, 2 * of("damping_ratio") * frequency, frequency**2])
     elif model == "third_order":
         a_1, a_2, a_3 = numbers(path + "coefficients")
-        numerator, denominator = stack([0 * one, 0 * one, one]), stack([a_3 * one, a_2 * one, a_1 * one, one])
+        numerator, denominator = (
+            stack([0 * ones, 0 * ones, ones]),
+            stack([a_3 * ones, a_2 * ones, a_1 * ones, ones]),
+        )
     else:
-        denominator = numbers(path + "denominator")[:, None] * one
-        numerator = numbers(path + "numerator")[:, None] * one
+        denominator = numbers(path + "denominator")[:, None] * ones
+        numerator = numbers(path + "numerator")[:, None] * ones
         missing = len(denominator) - 1 - len(numerator)
-        numerator = numbers.np.concatenate([np.zeros((missing, *one.shape)), numerator])
-    limit: Any = np.full(one.shape, np.inf)
+        numerator = numbers.np.concatenate([np.zeros((missing, *ones.shape)), numerator])
+    limit: Any = np.full(ones.shape, np.inf)
     return MotionSimulator(numerator, denominator, delay, limit, limit)
 
 
 def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
+    """Return the force sensor and the controller's assumptions about it."""
     path = "rig.force_sensor."
     nothing: Any = np.zeros((6, numbers.number))
     tool = _tool(mechanism, numbers)
@@ -198,11 +208,11 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
 
 
 def _tool(mechanism: SixAxisMechanism, numbers: Values, assumed: str = "") -> sensor.Tool:
-    """The tool, or what the controller takes it to be: the nominal one where it is not told otherwise."""
-    given = mechanism.rig.force_sensor.tool or Tool(mass=0.0, com=[0.0, 0.0, 0.0])
+    """Return the tool or, with a suffix, the controller's assumed tool, by default the nominal one."""
+    tool = mechanism.rig.force_sensor.tool or Tool(mass=0.0, com=[0.0, 0.0, 0.0])
     path = "rig.force_sensor.tool."
     return sensor.Tool(
-        numbers(f"{path}mass{assumed}", given.mass),
-        numbers.vector(numbers(f"{path}com{assumed}", given.com)),
-        numbers.matrix(numbers.inertia(f"{path}inertia{assumed}", given.inertia)),
+        numbers(f"{path}mass{assumed}", tool.mass),
+        numbers.vector(numbers(f"{path}com{assumed}", tool.com)),
+        numbers.matrix(numbers.inertia(f"{path}inertia{assumed}", tool.inertia)),
     )

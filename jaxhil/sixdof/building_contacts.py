@@ -1,7 +1,7 @@
-"""The contacts of a mechanism file of six axes as groups of candidates, every copy of a pattern one of them,
-and its latches.
+"""Construction of contact groups and latches from a six-axis mechanism file.
 
-Candidates whose shapes and laws are of the same kinds make one group, whatever tables they stand in.
+Each copy of a pattern is a candidate. Candidates with equal kinds of shapes and laws form a group, whatever
+their tables.
 """
 
 from typing import Any, NamedTuple
@@ -25,9 +25,9 @@ from jaxhil.sixdof.vectors import Vector
 
 
 class Candidate(NamedTuple):
-    """One pair of shapes with its laws; leaves (number,)."""
+    """Pair of shapes with its laws; leaves (number,)."""
 
-    name: str  # of its table, and which of its copies it is
+    name: str  # name of its table, with the index of the copy in a pattern
     pair: Candidates
     law: ContactLaw
     parameters: ContactParameters
@@ -35,47 +35,48 @@ class Candidate(NamedTuple):
 
 
 def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
-    """All candidates, those of one kind together."""
+    """Return all candidates, grouped by kind."""
     groups: dict[Any, list[Candidate]] = {}
     for name, contact in mechanism.contact.items():
         count = contact.pattern.count if contact.pattern else 1
         for copy in range(count):
-            one = _candidate(contact, numbers, name, copy, count)
-            kind = one.law, len(contact.depths), jax.tree.structure((one.pair, one.friction))
-            groups.setdefault(kind, []).append(one)
+            candidate = _candidate(contact, numbers, name, copy, count)
+            structure = jax.tree.structure((candidate.pair, candidate.friction))
+            groups.setdefault((candidate.law, len(contact.depths), structure), []).append(candidate)
     return list(groups.values())
 
 
 def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
-    """What to call the candidates, in the order of `build_groups`."""
+    """Return the candidates' names, in the order of `build_groups`."""
     groups = candidates(mechanism, Values(mechanism, {}))
-    return tuple(one.name for group in groups for one in group)
+    return tuple(candidate.name for group in groups for candidate in group)
 
 
 def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactGroup, ...]:
-    """All candidates in groups, leaves (candidates, number)."""
+    """Return all candidates in groups, leaves (candidates, number)."""
 
     def stacked(*leaves: Any) -> Any:
-        # Slopes and depths have their segments before the candidates.
+        # The axis of segments of slopes and depths precedes that of the candidates.
         return numbers.np.stack(leaves, axis=max(leaves[0].ndim - 1, 0))
 
     return tuple(
         ContactGroup(
-            jax.tree.map(stacked, *(one.pair for one in group)),
+            jax.tree.map(stacked, *(candidate.pair for candidate in group)),
             group[0].law,
-            jax.tree.map(stacked, *(one.parameters for one in group)),
-            jax.tree.map(stacked, *(one.friction for one in group)),
+            jax.tree.map(stacked, *(candidate.parameters for candidate in group)),
+            jax.tree.map(stacked, *(candidate.friction for candidate in group)),
         )
         for group in candidates(mechanism, numbers)
     )
 
 
 def build_latches(mechanism: SixAxisMechanism, numbers: Values) -> tuple[Latch, ...]:
-    """Every table's latches, leaves (..., latches, number)."""
+    """Return the latches of every table, leaves (..., latches, number)."""
     return tuple(_latch(latch, numbers, f"latch.{name}") for name, latch in mechanism.latch.items())
 
 
 def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
+    """Return the latches of one table, one for each copy of its pattern."""
     count = latch.pattern.count if latch.pattern else 1
 
     def repeated(value: Any) -> Any:
@@ -104,6 +105,7 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
 
 
 def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
+    """Return one copy of a table's contact."""
     path = f"contact.{name}"
     turn = numbers(f"{path}.pattern.phase", 0.0) + 2 * np.pi * copy / count
     turns = {"chaser": turn, "target": turn + numbers(f"{path}.target_pattern.phase", 0.0)}
@@ -120,6 +122,7 @@ def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int,
 
 
 def _pair(chaser: Shape, target: Shape) -> Candidates:
+    """Return the pair of shapes."""
     if isinstance(chaser, Ball):
         return ChaserSpheres(chaser.centre, chaser.radius, target)
     if isinstance(target, Ball):
@@ -129,27 +132,31 @@ def _pair(chaser: Shape, target: Shape) -> Candidates:
 
 
 def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shape:
+    """Return a shape, rotated about z by `turn` [rad]."""
+
     def of(key: str) -> Any:
         return jnp.asarray(numbers(f"{path}.{key}"))
 
-    def place(key: str) -> Vector:
+    def point(key: str) -> Vector:
         return numbers.vector(numbers.turned(turn, numbers(f"{path}.{key}")))
 
     if shape.shape == "plane":
-        return Plane(place("point"), numbers.direction(numbers.turned(turn, numbers(f"{path}.normal"))))
+        return Plane(point("point"), numbers.direction(numbers.turned(turn, numbers(f"{path}.normal"))))
     if shape.shape == "capsule":
-        return Capsule(place("from"), place("to"), of("radius"))
+        return Capsule(point("from"), point("to"), of("radius"))
     if shape.shape == "drogue":
         cone = of("half_angle"), of("bottom_radius"), of("bottom")
         return Drogue(*cone) if shape.mouth_radius is None else Shell(*cone, of("mouth_radius"))
     if shape.shape == "box":
-        own = numbers.rotation(numbers(f"{path}.rotation", [0.0, 0.0, 0.0]))
+        attitude = numbers.rotation(numbers(f"{path}.rotation", [0.0, 0.0, 0.0]))
         about_z = numbers.rotation(numbers.np.stack([0 * turn, 0 * turn, turn]))
-        return Box(place("centre"), compose(about_z, own), numbers.vector(of("half_lengths")), of("rounding"))
-    return (Cavity if shape.inside else Ball)(place("centre"), of("radius"))
+        attitude = compose(about_z, attitude)
+        return Box(point("centre"), attitude, numbers.vector(of("half_lengths")), of("rounding"))
+    return (Cavity if shape.inside else Ball)(point("centre"), of("radius"))
 
 
 def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
+    """Return the contact law, specialised for the file's values."""
     return contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
 
 
@@ -169,6 +176,7 @@ def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> Contac
 
 
 def _friction(friction: six_axes.Friction | None, numbers: Values, path: str) -> Friction:
+    """Return the friction law."""
     if friction is None:
         return Frictionless()
     keys = ("slip",) if friction.law == "regularised" else ("stiffness", "damping")

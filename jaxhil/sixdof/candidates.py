@@ -1,8 +1,8 @@
-"""Contact candidates: pairs of shapes that may touch, and how deep they do.
+"""Contact candidates: pairs of shapes that may touch, and their penetration.
 
-Which pairs there are is known when the program is compiled: nothing is searched for, counted or sorted. All
-candidates of one kind lie along one leading array axis, (candidates, *batch), so that compile time does not
-grow with them.
+The pairs are known at compile time: the program does not search, count or sort. All candidates of one kind
+are along one leading array axis, (candidates, *batch), so that the compile time does not grow with their
+number.
 """
 
 import abc
@@ -17,16 +17,17 @@ from jaxhil.sixdof.rotations import rotate, rotate_back
 from jaxhil.sixdof.shapes import Capsule, Shape
 from jaxhil.sixdof.vectors import Vector, cross, direction, dot, norm
 
-# Of a segment's squared length: what holds the nearest points of parallel segments to their middles.
+# Relative to a segment's squared length; regularisation that draws the nearest points of parallel segments to
+# their middles.
 PARALLEL = 1e-9
 
 
 class Touch(NamedTuple):
-    """Two shapes at a pose; all in T axes."""
+    """Two shapes at a pose; all values are in T axes."""
 
     depth: Float[Array, "candidates *batch"]  # d [m], negative apart
     normal: Vector  # n, outward from the target's surface
-    point: Vector  # P, on the shape that the sphere meets, else on the target's: there the force acts [m]
+    point: Vector  # P, where the force acts: on the sphere's counterpart, or on the target's capsule [m]
 
 
 class Candidates(eqx.Module):
@@ -34,16 +35,16 @@ class Candidates(eqx.Module):
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:
-        """The pairs at a pose, whose leaves have a leading axis of length 1."""
+        """Return the contacts at a pose, whose leaves have a leading axis of length 1."""
 
     @property
     @abc.abstractmethod
     def size(self) -> Float[Array, "candidates *batch"]:
-        """Depth [m] at which the shapes have gone through each other; infinite where they cannot."""
+        """Penetration [m] at which a shape has passed through the other; infinite if it cannot."""
 
 
 class ChaserSpheres(Candidates):
-    """Spheres of the chaser, against one kind of the target's shapes. Radius 0 is a point."""
+    """Spheres of the chaser against one kind of the target's shapes; a sphere of radius 0 is a point."""
 
     centre: Vector  # in C axes [m]
     radius: Float[Array, "candidates *batch"]  # [m]
@@ -60,7 +61,7 @@ class ChaserSpheres(Candidates):
 
 
 class TargetSpheres(Candidates):
-    """Spheres of the target, against one kind of the chaser's shapes. Radius 0 is a point."""
+    """Spheres of the target against one kind of the chaser's shapes; a sphere of radius 0 is a point."""
 
     centre: Vector  # in T axes [m]
     radius: Float[Array, "candidates *batch"]  # [m]
@@ -101,22 +102,26 @@ class Capsules(Candidates):
 
 
 def motion_at(touch: Touch, pose: Pose, twist: Twist) -> tuple[Float[Array, "candidates *batch"], Vector]:
-    """Rate d' of the depth [m/s], and slip [m/s]: the chaser's motion along the target's surface."""
+    """Return the penetration rate d' [m/s] and the slip [m/s].
+
+    The slip is the chaser's velocity along the target's surface.
+    """
     velocity = twist.linear + cross(twist.angular, touch.point - pose.position)
     rate = -dot(touch.normal, velocity)
     return rate, velocity + rate * touch.normal
 
 
-def _nearest(one: Capsule, other: Capsule) -> tuple[Array, Array]:
-    """The fractions of two segments that are nearest to each other; where many are, near their middles.
+def _nearest(first: Capsule, second: Capsule) -> tuple[Array, Array]:
+    """Return the fractions of two segments at which they are nearest; near their middles if not unique.
 
-    Both at once, slightly held to the middles, then each to the other's, clamped to its ends.
+    Both are first found together with a slight regularisation, then each is the nearest to the other, within
+    its segment.
     """
-    u, v, apart = one.end - one.start, other.end - other.start, one.start - other.start
+    u, v, apart = first.end - first.start, second.end - second.start, first.start - second.start
     uu, vv, uv = dot(u, u) * (1 + PARALLEL), dot(v, v) * (1 + PARALLEL), dot(u, v)
-    held_u, held_v = (PARALLEL / 2 * dot(w, w) for w in (u, v))
+    shift_u, shift_v = (PARALLEL / 2 * dot(w, w) for w in (u, v))
     determinant = uu * vv - uv**2
-    towards = vv * (held_u - dot(u, apart)) + uv * (held_v + dot(v, apart))
+    towards = vv * (shift_u - dot(u, apart)) + uv * (shift_v + dot(v, apart))
     s = towards / jnp.where(determinant > 0, determinant, 1)
-    t = other.nearest(one.at(jnp.clip(s, 0, 1)))
-    return one.nearest(other.at(t)), t
+    t = second.nearest(first.at(jnp.clip(s, 0, 1)))
+    return first.nearest(second.at(t)), t

@@ -1,6 +1,6 @@
-"""Linear equations and roots of small matrices, of all lanes at once; a library would be called lane by lane.
+"""Linear equations and square roots of small matrices, for all lanes at once.
 
-Matrices are (rows, columns, *batch).
+Matrices are (rows, columns, *batch). A library would be called separately for each lane.
 """
 
 import jax
@@ -8,14 +8,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-ROOT_STEPS = 32  # to rounding for eigenvalues down to 1e-9 of their sum: small ones grow by 9/4 a step
+ROOT_STEPS = 32  # rounding accuracy for eigenvalues down to 1e-9 of their sum; small ones grow by 9/4 a step
 
 
 @jax.custom_jvp
 def solve(
     matrix: Float[Array, "size size *batch"], right: Float[Array, "size columns *batch"]
 ) -> Float[Array, "size columns *batch"]:
-    """matrix^-1 right, by the modified process of Gram and Schmidt on the columns of both."""
+    """Return matrix^-1 right, by the modified Gram-Schmidt process on the columns of both."""
     size = len(matrix)
 
     def project(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -30,24 +30,25 @@ def solve(
     _, triangle = lax.fori_loop(0, size, project, (table, jnp.zeros_like(table)))
 
     def substitute(step: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        rest, found = carry
+        rest, solution = carry
         k = size - 1 - step
         column = lax.dynamic_index_in_dim(triangle, k, 1)
         row = lax.dynamic_index_in_dim(rest, k, 0) / lax.dynamic_index_in_dim(column, k, 0)
-        return rest - column * row, lax.dynamic_update_slice_in_dim(found, row, k, 0)
+        return rest - column * row, lax.dynamic_update_slice_in_dim(solution, row, k, 0)
 
     return lax.fori_loop(0, size, substitute, (triangle[:, size:], jnp.zeros_like(right)))[1]
 
 
 @solve.defjvp
 def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the solution and its derivative."""
     (matrix, right), (slope, right_slope) = primals, tangents
-    found = solve(matrix, right)
-    return found, solve(matrix, right_slope - product(slope, found))
+    solution = solve(matrix, right)
+    return solution, solve(matrix, right_slope - product(slope, solution))
 
 
 def product(one: Float[Array, "rows inner *batch"], other: Float[Array, "inner columns *batch"]) -> Array:
-    """one @ other."""
+    """Return the matrix product one @ other."""
     total = one[:, 0, None] * other[None, 0]
     for k in range(1, len(other)):
         total = total + one[:, k, None] * other[None, k]
@@ -55,8 +56,10 @@ def product(one: Float[Array, "rows inner *batch"], other: Float[Array, "inner c
 
 
 def square_root(matrix: Float[Array, "size size *batch"]) -> Float[Array, "size size *batch"]:
-    """Symmetric root of symmetric positive definite matrices: Newton and Schulz's iteration, of products
-    alone."""
+    """Return the symmetric square root of symmetric positive definite matrices.
+
+    The Newton-Schulz iteration consists of matrix products only.
+    """
     unit = jnp.eye(len(matrix), dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * (matrix.ndim - 2))
     size = jnp.sum(unit * matrix, axis=(0, 1), keepdims=True)
 

@@ -1,7 +1,8 @@
-"""Contact at several points: normal force, friction, and the wrench that they make together.
+"""Contact at several points: normal forces, friction forces, and their resultant wrench.
 
-A contact law of `jaxhil.contact` gives each candidate's normal force from its depth and rate, a friction law
-the tangential one from its slip. Neither asks whether shapes are in touch: without depth there is no force.
+A contact law of `jaxhil.contact` gives each candidate's normal force from its penetration and rate, a
+friction law the tangential force from its slip. Neither tests for contact: without penetration the force is
+0.
 """
 
 from typing import Any, NamedTuple
@@ -19,15 +20,15 @@ from jaxhil.sixdof.vectors import Vector, cross
 
 
 class ContactGroup(eqx.Module):
-    """Candidates of one kind, with their laws; several kinds are several of these."""
+    """Candidates of one kind with their laws."""
 
-    candidates: Candidates  # where they are
-    law: ContactLaw = eqx.field(static=True)  # of the normal force
-    parameters: ContactParameters  # of the law, (candidates, *batch)
-    friction: Friction  # law of the tangential force
+    candidates: Candidates  # pairs of shapes
+    law: ContactLaw = eqx.field(static=True)  # contact law of the normal force
+    parameters: ContactParameters  # parameters of the contact law, (candidates, *batch)
+    friction: Friction  # friction law of the tangential force
 
     def init(self) -> "Memory":
-        """State before the first touch."""
+        """Return the laws' state before the first touch."""
         like = jnp.zeros_like(self.parameters.damping)
         return Memory(self.law.init(like), self.friction.init(like))
 
@@ -40,9 +41,9 @@ class Memory(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """The forces of each candidate on the chaser, in T axes."""
+    """Forces of each candidate on the chaser, in T axes."""
 
-    touch: Touch  # where
+    touch: Touch  # penetration, normal and point
     normal: Float[Array, "candidates *batch"]  # F [N]
     tangential: Vector  # f_t [N]
     slip: Vector  # [m/s]
@@ -51,12 +52,12 @@ class Forces(NamedTuple):
 def contact_forces(
     group: ContactGroup, memory: Memory, pose: Pose, twist: Twist, duration: Float[Array, "*batch"]
 ) -> tuple[Forces, Memory]:
-    """Forces at a pose and twist, `duration` [s] after the laws were evaluated last."""
+    """Return the forces at a pose and twist, `duration` [s] after the laws' last evaluation."""
     pose, twist, duration = jax.tree.map(lambda leaf: leaf[None], (pose, twist, duration))
     touch = group.candidates.touch(pose)
     rate, slip = motion_at(touch, pose, twist)
     normal, law = group.law.step(group.parameters, memory.law, touch.depth, rate)
-    # A law that may pull has no friction while it does.
+    # A pulling contact has no friction.
     pressed = jnp.where(normal > 0, normal, 0)
     tangential, friction = group.friction.step(
         Touching(pressed, touch.normal, slip, duration), memory.friction
@@ -65,7 +66,7 @@ def contact_forces(
 
 
 def total_wrench(forces: Forces) -> Wrench:
-    """The wrench of all candidates on the chaser, its moment about T's origin."""
+    """Return the wrench of all candidates on the chaser, with its moment about T's origin."""
     force = forces.normal * forces.touch.normal + forces.tangential
     moment = cross(forces.touch.point, force)
     return Wrench(*(jax.tree.map(lambda part: part.sum(axis=0), part) for part in (force, moment)))
@@ -78,20 +79,23 @@ def contact_wrench(
     twist: Twist,
     duration: Float[Array, "*batch"],
 ) -> tuple[Wrench, tuple[Forces, ...], tuple[Memory, ...]]:
-    """The wrench [N, N m] of contacts of several kinds, their forces, and the laws' next states."""
-    found = [
+    """Return the wrench [N, N m] of contacts of several kinds, their forces, and the laws' next states.
+
+    The laws were evaluated last `duration` [s] before.
+    """
+    results = [
         contact_forces(group, memory, pose, twist, duration)
         for group, memory in zip(groups, memories, strict=True)
     ]
     zero = Vector(*(jnp.zeros_like(duration) for _ in range(3)))
     wrench: Any = Wrench(zero, zero)
-    for forces, _ in found:
+    for forces, _ in results:
         wrench = jax.tree.map(jnp.add, wrench, total_wrench(forces))
-    return wrench, tuple(forces for forces, _ in found), tuple(memory for _, memory in found)
+    return wrench, tuple(forces for forces, _ in results), tuple(memory for _, memory in results)
 
 
 def deepest(groups: tuple[ContactGroup, ...], pose: Pose) -> Float[Array, "*batch"]:
-    """Depth [m] of the deepest candidate at a pose; minus infinity without any."""
+    """Return the penetration [m] of the deepest candidate at a pose; minus infinity without candidates."""
     lifted = jax.tree.map(lambda leaf: leaf[None], pose)
     depth = jnp.full_like(pose.position.x, -jnp.inf)
     for group in groups:

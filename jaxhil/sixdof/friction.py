@@ -1,7 +1,7 @@
-"""Friction laws: the tangential force of a contact against its normal force F and its slip.
+"""Friction laws: tangential force of a contact as a function of its normal force F and its slip.
 
-All stay within Coulomb's cone, |f_t| <= mu F. None needs a basis of the tangent plane, which cannot be chosen
-smoothly. Shapes: (candidates, *batch).
+All laws remain within Coulomb's cone, |f_t| <= mu F. None uses a basis of the tangent plane, which cannot be
+chosen smoothly. Shapes are (candidates, *batch).
 """
 
 import abc
@@ -15,37 +15,38 @@ from jaxhil.sixdof.vectors import Vector, dot, norm
 
 
 class Touching(NamedTuple):
-    """What a friction law sees of a contact."""
+    """Input of a friction law."""
 
-    force: Float[Array, "candidates *batch"]  # F, normal, not negative [N]
-    normal: Vector  # n
-    slip: Vector  # tangential velocity of the chaser against the target [m/s]
-    duration: Float[Array, "..."]  # since the law was evaluated last [s]
+    force: Float[Array, "candidates *batch"]  # normal force F >= 0 [N]
+    normal: Vector  # normal n
+    slip: Vector  # tangential velocity of the chaser relative to the target [m/s]
+    duration: Float[Array, "..."]  # time since the last evaluation of the law [s]
 
 
 class Friction(eqx.Module):
     """Interface of all friction laws."""
 
     def init(self, like: Float[Array, "candidates *batch"]) -> tuple[Vector, ...]:
-        """State before the first touch."""
+        """Return the state before the first touch."""
         return ()
 
     @abc.abstractmethod
     def step(self, touching: Touching, state: tuple[Vector, ...]) -> tuple[Vector, tuple[Vector, ...]]:
-        """Tangential force on the chaser [N], and the next state."""
+        """Return the tangential force on the chaser [N], and the next state."""
 
 
 class Frictionless(Friction):
-    """No tangential force."""
+    """Friction law without tangential force."""
 
     def step(self, touching, state):
         return 0 * touching.slip, state
 
 
 class Regularised(Friction):
-    """f_t = -mu F t/sqrt(|t|^2 + v_s^2): Coulomb's friction at slips t well above v_s, a damper below.
+    """Regularised Coulomb friction f_t = -mu F t/sqrt(|t|^2 + v_s^2).
 
-    What should stick creeps, at v_s s/sqrt(1 - s^2) for s = |f_t|/(mu F).
+    At slips t well above v_s it is Coulomb's friction, below it is a damper. Where bodies should stick they
+    creep, at v_s s/sqrt(1 - s^2) for s = |f_t|/(mu F).
     """
 
     coefficient: Float[Array, "candidates *batch"]  # mu [1]
@@ -58,10 +59,10 @@ class Regularised(Friction):
 
 
 class Bristle(Friction):
-    """f_t = -(k_t z + b_t t), |f_t| <= mu F, with the bristle's deflection z' = t - |t| z k_t/(mu F) (Dahl).
+    """Bristle friction f_t = -(k_t z + b_t t), |f_t| <= mu F, with z' = t - |t| z k_t/(mu F) (Dahl).
 
-    At rest a spring, at steady slip Coulomb's friction. One implicit step per evaluation; the deflection is
-    kept in the tangent plane, and is 0 without contact.
+    The bristle's deflection z acts as a spring at rest; steady slip gives Coulomb's friction. Each evaluation
+    is one implicit step. The deflection is projected to the tangent plane, and is 0 without contact.
     """
 
     coefficient: Float[Array, "candidates *batch"]  # mu [1]
@@ -77,7 +78,7 @@ class Bristle(Friction):
         slip, limit = touching.slip, self.coefficient * touching.force
         deflection = deflection - dot(deflection, touching.normal) * touching.normal
         moved = deflection + touching.duration * slip
-        # z/(1 + h |t| k_t/(mu F)), with nothing divided by a force of 0.
+        # This is z/(1 + h |t| k_t/(mu F)), without a division by zero force.
         resisted = limit + touching.duration * norm(slip) * self.stiffness
         deflection = (limit / jnp.where(resisted > 0, resisted, 1)) * moved
         force = self.stiffness * deflection + self.damping * slip

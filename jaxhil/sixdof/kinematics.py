@@ -1,4 +1,4 @@
-"""What the drives of a motion simulator move: from coordinates to axes, and from axes to the pose.
+"""Kinematics of motion simulators: from coordinates to axes, and from axes to the pose.
 
 Coordinates are (p, theta), six numbers along a leading axis, (6, *batch).
 """
@@ -17,11 +17,11 @@ from jaxhil.sixdof.vectors import vector
 
 
 class Moving(NamedTuple):
-    """Motion of C against T on the hardware."""
+    """Motion of C relative to T on the hardware."""
 
     pose: Pose
     twist: Twist
-    acceleration: Twist | None  # rate of the twist, where it is followed
+    acceleration: Twist | None  # time derivative of the twist; None if unused
 
 
 class Kinematics(eqx.Module):
@@ -29,24 +29,27 @@ class Kinematics(eqx.Module):
 
     @property
     def is_linear(self) -> bool:
-        """Whether a straight line of coordinates is one of the axes."""
+        """Return whether the axes are linear functions of the coordinates."""
         return True
 
     def reaches(self, axes: Float[Array, "axes *batch"]) -> Bool[Array, "*batch"]:
-        """Whether the axes can be there."""
+        """Return whether the axes' positions are within their workspace."""
         return jnp.ones(axes.shape[1:], bool)
 
     @abc.abstractmethod
     def command(self, coordinates: Float[Array, "6 *batch"]) -> Float[Array, "axes *batch"]:
-        """Positions of the axes that have the pose with these coordinates."""
+        """Return the positions of the axes for the pose with these coordinates."""
 
     @abc.abstractmethod
     def coordinates(self, motion: Motion, near: Float[Array, "6 *batch"]) -> Motion:
-        """Coordinates of the pose to which the axes move, with rates and accelerations; `near` them."""
+        """Return the coordinates of the axes' pose, with rates and accelerations.
+
+        `near` are coordinates close to the result.
+        """
 
 
 class TaskSpace(Kinematics):
-    """An axis each coordinate."""
+    """Motion simulator with one axis per coordinate."""
 
     def command(self, coordinates):
         return coordinates
@@ -56,12 +59,13 @@ class TaskSpace(Kinematics):
 
 
 class TwoRobots(Kinematics):
-    """One robot carries the chaser's mechanism, another the target's: twelve axes, the chaser's first.
+    """Motion simulator with a robot for the chaser's mechanism and another for the target's.
 
-    The pose is the difference of both, of which the target's robot makes a share.
+    There are twelve axes, the chaser's first. The pose is the difference of both robots' coordinates, of
+    which the target's robot moves a share.
     """
 
-    share: Float[Array, "6 *batch"]  # of each coordinate that the target's robot moves [1]
+    share: Float[Array, "6 *batch"]  # share of each coordinate that the target's robot moves [1]
 
     def command(self, coordinates):
         return jnp.concatenate([(1 - self.share) * coordinates, -self.share * coordinates])
@@ -72,14 +76,14 @@ class TwoRobots(Kinematics):
 
 
 def moving(motion: Motion) -> Moving:
-    """Pose, twist and acceleration of coordinates, their rates and accelerations."""
+    """Return pose, twist and acceleration from coordinates, their rates and accelerations."""
 
-    def place(at, rates):
+    def pose_and_twist(at, rates):
         return motion_of(*(Coordinates(vector(part[:3]), vector(part[3:])) for part in (at, rates)))
 
     if motion.acceleration is None:
-        return Moving(*place(motion.position, motion.rate), None)
+        return Moving(*pose_and_twist(motion.position, motion.rate), None)
     (pose, twist), (_, acceleration) = jax.jvp(
-        place, (motion.position, motion.rate), (motion.rate, motion.acceleration)
+        pose_and_twist, (motion.position, motion.rate), (motion.rate, motion.acceleration)
     )
     return Moving(pose, twist, Twist(*acceleration))

@@ -1,8 +1,8 @@
-"""The rig's loop in six degrees of freedom: one tick after the other.
+"""Loop of the rig in six degrees of freedom, tick by tick.
 
-A tick reads the wrench that the real contact had a force delay ago, compensates it, moves the two bodies of
-the numerical model by it, and sends their relative pose to the motion simulator, on which the contact is.
-The wrench is formed on the hardware's pose, in T axes about T's origin, and acts at the model's T.
+A tick reads the delayed wrench of the real contact, compensates it, moves the two bodies of the numerical
+model by it, and sends their relative pose to the motion simulator, which carries the contact. The wrench is
+computed at the hardware's pose, in T axes about T's origin, and acts at the model's T.
 """
 
 from dataclasses import replace
@@ -48,75 +48,75 @@ from jaxhil.sixdof.sensor import (
 )
 from jaxhil.sixdof.vectors import assembled, vector
 
-SIDES = ("fixed", "moving")  # of the force sensor
-HISTORY = 256  # ticks before a run in which axes follow what is no straight line to them
+SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
+HISTORY = 256  # ticks simulated before a run if the axes are not linear in the coordinates
 
 
 class Loop(eqx.Module):
-    """What shapes the compiled loop; every field is static."""
+    """Structure of the loop, which determines the compiled program; every field is static."""
 
-    integrator: str = eqx.field(static=True)  # of the numerical model, a name of `SHARES`
-    hold: str = eqx.field(static=True)  # of the command within a period, "linear" or "zoh"
-    latency: int = eqx.field(static=True)  # of the command, 0 or 1 periods
-    ring: int = eqx.field(static=True)  # samples that are kept, a power of two beyond the longest delay
-    side: str = eqx.field(static=True, default="fixed")  # of the force sensor, one of `SIDES`
+    integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
+    hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
+    latency: int = eqx.field(static=True)  # latency of the command, 0 or 1 periods
+    ring: int = eqx.field(static=True)  # length of the delay line, a power of two above the longest delay
+    side: str = eqx.field(static=True, default="fixed")  # side of the force sensor, one of `SIDES`
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
-    has_lag: bool = eqx.field(static=True, default=True)  # whether it has a lag
+    has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
     has_sample_effects: bool = eqx.field(static=True, default=True)  # quantum, dead zone or range
-    compensator: str = eqx.field(static=True, default="none")  # one of `SIX_AXES`
-    episodes: int = eqx.field(static=True, default=1)  # that are judged
+    compensator: str = eqx.field(static=True, default="none")  # name of the compensator, one of `SIX_AXES`
+    episodes: int = eqx.field(static=True, default=1)  # number of evaluated episodes
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
     pushed: bool = eqx.field(static=True, default=False)  # whether readings without a contact are not 0
 
 
 class Rig(NamedTuple):
-    """What stays constant during a run."""
+    """Constants of a run."""
 
-    bodies: Pair  # of the numerical model
-    axes: Axes  # of the motion simulator, with the sensors' delays
+    bodies: Pair  # bodies of the numerical model
+    axes: Axes  # axes of the motion simulator, with the sensors' delays
     kinematics: Kinematics
-    groups: tuple[ContactGroup, ...]  # the real contact
+    groups: tuple[ContactGroup, ...]  # candidates of the real contact
     latches: tuple[Latch, ...]
     sensor: Sensor
     period: Float[Array, "*batch"]  # T [s]
-    key: UInt32[Array, "2 *batch"]  # of the sensor's noise
-    gains: Gains  # of the compensator, (6, *batch)
+    key: UInt32[Array, "2 *batch"]  # key of the sensor's noise
+    gains: Gains  # gains of the compensator, (6, *batch)
 
 
 class Channels(NamedTuple):
-    """The force sensor's channels and the controller's memory of them."""
+    """State of the force sensor's channels and of their compensators."""
 
-    # reading of the last tick before the lag and behind it; None without one
+    # last reading before the lag and behind it; None without a lag
     lag: tuple[Wrench, Wrench] | None
     controller: tuple[Any, ...]  # state of the compensator of each channel
 
 
 class RunState(NamedTuple):
-    """What is carried from tick to tick."""
+    """State from tick to tick."""
 
-    states: States  # of the numerical model
-    near: Float[Array, "6 *batch"]  # coordinates of C against T then
+    states: States  # bodies of the numerical model
+    near: Float[Array, "6 *batch"]  # coordinates of C against T in these states
     hardware: Hardware
-    memories: tuple[Memory, ...]  # of the contact's laws
-    held: tuple[Held, ...]  # by the latches
+    memories: tuple[Memory, ...]  # states of the contact's laws
+    held: tuple[Held, ...]  # states of the latches
     channels: Channels
     tick: Int[Array, ""]
 
 
 class Tick(NamedTuple):
-    """What is recorded of a tick."""
+    """Record of a tick."""
 
-    states: States  # of the numerical model, at the tick
-    pose: Pose  # of the hardware, when the force sensor samples it
-    twist: Twist  # likewise
-    contact: Wrench  # of the real contact then, latches included
-    forces: tuple[Forces, ...]  # of its candidates
-    held: tuple[Held, ...]  # by the latches
-    command: Wrench  # that moves the numerical model
+    states: States  # bodies of the numerical model, at the tick
+    pose: Pose  # pose of the hardware at the force sensor's sampling instant
+    twist: Twist  # twist likewise
+    contact: Wrench  # wrench of the real contact then, latches included
+    forces: tuple[Forces, ...]  # forces of the candidates
+    held: tuple[Held, ...]  # states of the latches
+    command: Wrench  # wrench on the numerical model
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """The loop of a batch of scenarios; `static` are the fields of `Loop` that those do not tell."""
+    """Return the loop of a batch of scenarios; `static` are the fields that these do not determine."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
@@ -154,7 +154,10 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
 
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:
-    """Before tick 0: so far the command was in uniform motion, at the states' relative pose and rates."""
+    """Return the state before tick 0.
+
+    Before it the command was in uniform motion, at the states' relative pose and rates.
+    """
     pose, twist = relative(rig.bodies, states)
     at, rates = (jnp.stack(jax.tree.leaves(part)) for part in coordinates(pose, twist))
     stride = rates * rig.period[None]
@@ -184,108 +187,113 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
 
 def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
-    """The state after so many ticks, and every tick, (ticks, ...)."""
+    """Return the state after `ticks` ticks, and every tick, (ticks, ...)."""
     rig = build_rig(loop, gains, scenario)
     state = begin(loop, rig, scenario.start)
     return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)
 
 
 def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
-    """One control period."""
-    found = sampled(rig.axes, state.hardware, state.tick)
-    here = moving(rig.kinematics.coordinates(found.motion, state.near))
-    contact, forces, memories = contact_wrench(rig.groups, state.memories, here.pose, here.twist, rig.period)
-    held = []
+    """Run one control period; return the next state and the tick's record."""
+    samples = sampled(rig.axes, state.hardware, state.tick)
+    motion = moving(rig.kinematics.coordinates(samples.motion, state.near))
+    pose, twist, _ = motion
+    contact, forces, memories = contact_wrench(rig.groups, state.memories, pose, twist, rig.period)
+    latched = []
     for latch, before in zip(rig.latches, state.held, strict=True):
-        caught, now = latch_wrench(latch, before, here.pose, here.twist)
+        caught, now = latch_wrench(latch, before, pose, twist)
         contact = jax.tree.map(jnp.add, contact, caught)
-        held.append(now)
+        latched.append(now)
     measured = None
-    if found.measured is not None:
-        still = Motion(found.measured, jnp.zeros_like(found.measured), None)
+    if samples.measured is not None:
+        still = Motion(samples.measured, jnp.zeros_like(samples.measured), None)
         at = rig.kinematics.coordinates(still, state.near).position
         measured = Pose(vector(at[:3]), exponential(vector(at[3:])))
-    command, channels = _sense(loop, rig, state, contact, here, measured)
+    command, channels = _sense(loop, rig, state, contact, motion, measured)
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
     position, _ = command_of(rig.bodies, states)
     sent = rig.kinematics.command(position)
     hardware = actuate(rig.axes, state.hardware, state.tick, sent, loop.hold, loop.latency)
-    seen = Tick(state.states, here.pose, here.twist, contact, forces, tuple(held), command)
-    return RunState(states, position, hardware, memories, tuple(held), channels, state.tick + 1), seen
+    seen = Tick(state.states, pose, twist, contact, forces, tuple(latched), command)
+    return RunState(states, position, hardware, memories, tuple(latched), channels, state.tick + 1), seen
 
 
 def command_of(bodies: Pair, states: States) -> tuple[Array, Array]:
-    """Coordinates (6, *batch) of C against T in the numerical model, and their rates."""
+    """Return the coordinates (6, *batch) of C against T in the numerical model, and their rates."""
     at, rates = coordinates(*relative(bodies, states))
     return assembled(at), assembled(rates)
 
 
 def _sense(
-    loop: Loop, rig: Rig, state: RunState, contact: Wrench, here: Moving, measured: Pose | None
+    loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Pose | None
 ) -> tuple[Wrench, Channels]:
-    """What the sensor and the controller make of the contact: the wrench on the numerical model."""
+    """Return the wrench on the numerical model, from sensor and controller, and the channels' next state."""
     sensor, channels = rig.sensor, state.channels
-    if here.acceleration is None:
+    if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
     else:
-        load = tool_load(sensor.tool, here.pose, here.twist, here.acceleration, sensor.gravity)
-        raw = read_moving(contact, load, here.pose)
+        load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
+        raw = read_moving(contact, load, motion.pose)
     lagged = raw if channels.lag is None else _behind_lag(rig, state.tick, raw, *channels.lag)
     noise = _noise(rig, state.tick) if loop.has_noise else None
     reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
-    given: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
+    unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if measured is None:
-        found = undo_fixed(given, sensor.mounting)
+        contact = undo_fixed(unbiased, sensor.mounting)
     else:
         load = weight(sensor.assumed_tool, measured.attitude, sensor.assumed_gravity)
-        found = undo_moving(given, load, measured)
-    command, controller = _compensate(loop, rig, found, channels.controller, state.tick)
+        contact = undo_moving(unbiased, load, measured)
+    command, controller = _compensate(loop, rig, contact, channels.controller, state.tick)
     return command, Channels(None if channels.lag is None else (raw, lagged), controller)
 
 
 def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
-    """Behind the sensor's lag, of a reading that is a straight line between two ticks."""
-    first, never = now == (0 if rig.kinematics.is_linear else HISTORY), jnp.zeros_like(rig.period)
+    """Return the reading behind the sensor's lag; the input is a straight line between two ticks."""
+    first, zero = now == (0 if rig.kinematics.is_linear else HISTORY), jnp.zeros_like(rig.period)
 
     def late(now: Array, before: Array, lagged: Array) -> Array:
         before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
         middle = (before + now) / 2
-        return lag(lagged, never, rig.period, never, [before, middle, now], rig.sensor.time_constant)
+        return lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
 
-    found: Wrench = jax.tree.map(late, raw, last, lagged)
-    return found
+    reading: Wrench = jax.tree.map(late, raw, last, lagged)
+    return reading
 
 
-def _compensate(loop: Loop, rig: Rig, found: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
-    """The compensator on each channel by itself."""
+def _compensate(loop: Loop, rig: Rig, contact: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
+    """Apply the compensator to each channel separately."""
     law, constants = SIX_AXES[loop.compensator], _constants(rig)
-    forces, structure = jax.tree.flatten(found)
-    never, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
-    passed, after = [], []
+    forces, structure = jax.tree.flatten(contact)
+    zero, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
+    commands, next_states = [], []
     for channel, (force, state) in enumerate(zip(forces, states, strict=True)):
         prepared = law.prepare(_gains(loop, rig, channel), constants)
-        signals = Signals(force, never, never, never, age)
+        signals = Signals(force, zero, zero, zero, age)
         command, state = law.step(prepared, state, signals, now)
-        passed.append(command)
-        after.append(state)
-    return structure.unflatten(passed), tuple(after)
+        commands.append(command)
+        next_states.append(state)
+    return structure.unflatten(commands), tuple(next_states)
 
 
 def _wrench(channels: Array) -> Wrench:
+    """Return six channels, (6, *batch), as a wrench."""
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
 def _gains(loop: Loop, rig: Rig, channel: int) -> Gains:
+    """Return the gains of a channel."""
     law = SIX_AXES[loop.compensator]
     gains = {name: value[channel] for name, value in rig.gains.items()}
     return law.channel(gains, channel) if isinstance(law, PhaseLeadPerAxis) else gains
 
 
 def _constants(rig: Rig) -> Constants:
+    """Return the rig data that the controller knows."""
     return Constants(rig.period, jnp.full_like(rig.period, jnp.inf))
 
 
 def _noise(rig: Rig, now: Array) -> Array:
+    """Return the noise of six channels [N, N m] at a tick."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
     episode = jnp.zeros(rig.period.shape, jnp.int32)
@@ -293,7 +301,7 @@ def _noise(rig: Rig, now: Array) -> Array:
 
 
 def _six(value: Array, like: Array) -> Array:
-    """The value for each of six channels, (6, *batch)."""
+    """Return the value for each of six channels, (6, *batch)."""
     if value.ndim <= like.ndim:
         value = jnp.broadcast_to(value, like.shape)[None]
     return jnp.broadcast_to(value, (6, *like.shape))

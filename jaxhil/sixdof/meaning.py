@@ -1,4 +1,4 @@
-"""What a mechanism file of six axes means: its first contact as in space, beside what the rig can do."""
+"""Summary of a six-axis mechanism file: its first ideal contact compared with the abilities of the rig."""
 
 import math
 from typing import NamedTuple
@@ -7,22 +7,22 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
 from jaxhil.sixdof.units import unit_warnings
 
-FASTEST = 0.1  # contact frequency over control rate, of files that can be meant
+FASTEST = 0.1  # greatest plausible contact frequency, over the control rate
 
 
 class Meaning(NamedTuple):
-    """Of the first touch, nominally; NaN where nothing touches."""
+    """Summary of a nominal mechanism's first touch; NaN if nothing touches."""
 
     effective_mass: float  # m_n [kg]
-    frequency: float  # of the contact in space, 1/(2 duration) [Hz]; NaN where a latch holds in the end
-    peak_force: float  # in space [N]
-    restitution: float  # e* in space; NaN unless it is a single touch
-    delay: float  # of the loop: the slowest axis with its lag, and the force sensor [s]
-    slip_limit: float  # below which regularised friction is an unstable damper on the rig [m/s]; NaN without
-    warnings: tuple[str, ...]  # what can hardly be meant: key, what was found, what is expected
+    frequency: float  # of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch holds at its end
+    peak_force: float  # of the ideal contact [N]
+    restitution: float  # e* of the ideal contact; NaN unless there is a single touch
+    delay: float  # delay of the loop: slowest axis with its lag, and force sensor [s]
+    slip_limit: float  # least stable slip of regularised friction on the rig [m/s]; NaN without friction
+    warnings: tuple[str, ...]  # implausible numbers: key, found value, expected value
 
     def line(self, name: str) -> str:
-        """All of it in one line, the warnings apart."""
+        """Return the summary in one line, without the warnings."""
         if math.isnan(self.effective_mass):
             return f"{name}: nothing touches; the rig is {1e3 * self.delay:.3g} ms late"
         rebound = "" if math.isnan(self.restitution) else f", e* {self.restitution:.3g}"
@@ -42,14 +42,14 @@ def meaning(
     peak_force: float,
     restitution: float,
 ) -> Meaning:
-    """The meaning of a mechanism whose first contact in space has these figures, in SI units."""
+    """Return the summary of a mechanism whose first ideal contact has these metrics, in SI units."""
     rig = mechanism.rig
     delay = rig.force_sensor.delay + rig.force_sensor.time_constant + _lateness(rig.simulator)
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
-    found = list(unit_warnings(mechanism))
+    warnings = list(unit_warnings(mechanism))
     rate = 1 / rig.control_period
     if frequency > FASTEST * rate:
-        found.append(
+        warnings.append(
             f"contact: found a contact of {frequency:.3g} Hz, expected at most {FASTEST * rate:.4g} Hz, "
             "1/10 of the control rate"
         )
@@ -58,31 +58,31 @@ def meaning(
         friction = contact.friction
         if friction is None or friction.slip is None or not peak_force > 0:
             continue
-        # Of a delayed damper on a mass: stable below pi/2 of damping times delay over mass.
-        own = 2 / math.pi * friction.coefficient * peak_force * delay / tangential_mass
-        limit = own if math.isnan(limit) else max(limit, own)
-        if friction.slip < own:
-            found.append(
+        # A delayed damper on a mass is stable if damping times delay over mass is below pi/2.
+        slip = 2 / math.pi * friction.coefficient * peak_force * delay / tangential_mass
+        limit = slip if math.isnan(limit) else max(limit, slip)
+        if friction.slip < slip:
+            warnings.append(
                 f"contact.{name}.friction.slip: found {friction.slip:.3g} m/s, "
-                f"expected more than {own:.2g} m/s: below it the delayed friction chatters"
+                f"expected more than {slip:.2g} m/s: below it the delayed friction chatters"
             )
-    return Meaning(effective_mass, frequency, peak_force, restitution, delay, limit, tuple(found))
+    return Meaning(effective_mass, frequency, peak_force, restitution, delay, limit, tuple(warnings))
 
 
 def _lateness(simulator: Simulator) -> float:
-    """By how much [s] the slowest axis follows a uniform motion late; of two robots, both by their shares."""
-    own, robot = _lags(simulator, simulator), simulator.target_robot
+    """Return the slowest axis's delay in uniform motion [s]; with two robots, weighted by their shares."""
+    chaser_lags, robot = _lags(simulator, simulator), simulator.target_robot
     if robot is None:
-        return max(own)
-    other = _lags(simulator, robot)
+        return max(chaser_lags)
+    target_lags = _lags(simulator, robot)
     return max(
         (1 - share) * chaser + share * target
-        for share, chaser, target in zip(robot.share, own, other, strict=True)
+        for share, chaser, target in zip(robot.share, chaser_lags, target_lags, strict=True)
     )
 
 
 def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
-    """By how much [s] each axis of a robot follows a uniform motion late: its delay, and -G'(0)."""
+    """Return the delay [s] of each axis of a robot in uniform motion: transport delay plus -G'(0)."""
 
     def of(key: str) -> list[float]:
         return getattr(robot, key) or getattr(simulator, key)
@@ -99,4 +99,4 @@ def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
         *_, slope, value = simulator.denominator or []
         *_, lead, gain = 0.0, *(simulator.numerator or [])
         lag = [slope / value - lead / gain] * 6
-    return [one + delay for one, delay in zip(lag, of("delay"), strict=True)]
+    return [axis_lag + delay for axis_lag, delay in zip(lag, of("delay"), strict=True)]

@@ -1,4 +1,4 @@
-"""The largest size of something that is sampled, between its samples too."""
+"""Peak value of a sampled signal, including peaks between samples."""
 
 from typing import NamedTuple
 
@@ -7,29 +7,32 @@ from jaxtyping import Array, Bool, Float
 
 
 class Peak(NamedTuple):
-    """Largest size so far: of samples, and of the parabola through three of them that has a crest."""
+    """Largest value so far, of samples and of parabolas through three samples that have a peak."""
 
     largest: Float[Array, "*batch"]
     before: tuple[Array, Array]  # the last two samples
-    step: Float[Array, "*batch"]  # from the one to the other [s]
+    step: Float[Array, "*batch"]  # time between them [s]
 
 
 def no_peak(zero: Float[Array, "*batch"]) -> Peak:
-    """Before the first sample."""
+    """Return the state before the first sample."""
     return Peak(zero, (zero, zero), zero)
 
 
 def higher(peak: Peak, now: Array, step: Array, anew: Bool[Array, "*batch"] | bool = False) -> Peak:
-    """After another sample, a `step` [s] later; `anew` says that it is none of a smooth curve with those
-    before. A crest has three samples that are not 0."""
+    """Update the peak with the sample `now`, a `step` [s] after the last one.
+
+    `anew` means that the sample does not continue a smooth curve. A peak between samples requires that none
+    of the three samples is 0.
+    """
     first, middle = peak.before
-    known = (first > 0) & (now > 0) & (middle >= first) & (middle >= now) & (step > 0) & ~jnp.asarray(anew)
-    rises, falls = ((late - early) / jnp.where(known, length, 1)
+    smooth = (first > 0) & (now > 0) & (middle >= first) & (middle >= now) & (step > 0) & ~jnp.asarray(anew)
+    rises, falls = ((late - early) / jnp.where(smooth, length, 1)
                     for early, late, length in ((first, middle, peak.step), (middle, now, step)))  # fmt: skip
     both = peak.step + step
     bend = rises - falls
-    crest = known & (bend > 0)
-    slope = (rises * step + falls * peak.step) / jnp.where(crest, both, 1)
-    vertex = middle + slope**2 * both / (4 * jnp.where(crest, bend, 1))
-    largest = jnp.maximum(peak.largest, jnp.where(crest, vertex, now))
+    has_peak = smooth & (bend > 0)
+    slope = (rises * step + falls * peak.step) / jnp.where(has_peak, both, 1)
+    vertex = middle + slope**2 * both / (4 * jnp.where(has_peak, bend, 1))
+    largest = jnp.maximum(peak.largest, jnp.where(has_peak, vertex, now))
     return Peak(largest, (jnp.where(anew, 0, middle), now), step)

@@ -1,4 +1,4 @@
-"""Whether the nominal run of a mechanism of six axes can begin: apart, in reach, and soon over."""
+"""Checks that the nominal run of a six-axis mechanism starts apart, within reach, and is not too long."""
 
 from collections.abc import Callable
 from functools import cache
@@ -25,29 +25,29 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
 
-MOST_TICKS = 1e7  # of a run
+MOST_TICKS = 1e7  # limit on the ticks of a run
 LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
-LARGEST_CONDITION = 100.0  # of a hexapod's legs, lengths in m
-BLIND = STRETCH  # control periods in which shapes must not go through each other
+LARGEST_CONDITION = 100.0  # condition number of a hexapod's Jacobian, lengths in m
+BLIND = STRETCH  # control periods between checks, in which shapes must not pass through each other
 
 
 class Beginning(NamedTuple):
-    """The start of a run, and a hexapod's legs there and where C is T."""
+    """Start of a run, and a hexapod's legs there and at the pose with C at T."""
 
     coordinates: Float[Array, "6 *batch"]
-    depth: Float[Array, "*batch"]  # of the mechanisms in each other [m]
-    # Of each candidate: how fast its shapes pass [m/s], and their size [m].
+    depth: Float[Array, "*batch"]  # largest penetration [m]
+    # relative speed of each candidate's shapes [m/s], and their size [m]
     passing: tuple[tuple[Float[Array, "candidates *batch"], Float[Array, "candidates *batch"]], ...]
-    caught: tuple[Bool[Array, "latches *batch"], ...]  # by latches
-    legs: tuple[Float[Array, "6 *batch"], ...]  # [m]
-    conditions: tuple[Float[Array, "*batch"], ...]  # of their Jacobian
+    caught: tuple[Bool[Array, "latches *batch"], ...]  # whether latches catch at the start
+    legs: tuple[Float[Array, "6 *batch"], ...]  # lengths [m]
+    conditions: tuple[Float[Array, "*batch"], ...]  # condition numbers of their Jacobian
 
 
 def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
-    """The nominal run begins apart, at a pose that six coordinates can say and the rig can reach, and takes
-    at most 1e7 ticks.
+    """Raise `InputError` unless the nominal run can start.
 
-    Raises `InputError`.
+    It must start apart, at a pose within the range of the six coordinates and the reach of the rig, and take
+    at most 1e7 ticks.
     """
     ticks = float(scenario.duration[0] / scenario.control_period[0])
     where = "start" if mechanism.start is not None else "approach"
@@ -85,8 +85,8 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
 
 
 def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) -> None:
-    """No shapes are so fast that they can go through each other before anything is noticed."""
-    speeds, sizes = (np.concatenate([one[part][:, 0] for one in begins.passing] or [[]]) for part in (0, 1))
+    """Raise `InputError` if shapes are so fast that they could pass through each other undetected."""
+    speeds, sizes = (np.concatenate([pair[i][:, 0] for pair in begins.passing] or [[]]) for i in (0, 1))
     for name, speed, size in zip(candidate_names(mechanism), speeds, sizes, strict=True):
         most = size / (BLIND * period)
         if speed > most:
@@ -97,11 +97,14 @@ def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) 
 
 
 def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
-    """A hexapod reaches the start and the pose at which C is T, and holds the platform firmly there."""
+    """Raise `InputError` if a hexapod cannot reach two poses or is nearly singular there.
+
+    The poses are the start and the one with C at T.
+    """
     stroke = mechanism.rig.simulator.stroke
     poses = zip(("the start", "C at T"), begins.legs, begins.conditions, strict=False)
-    for pose, legs, hold in poses:
-        lengths, number = legs[:, 0], float(hold[0])
+    for pose, legs, conditions in poses:
+        lengths, number = legs[:, 0], float(conditions[0])
         if not number <= LARGEST_CONDITION:
             found = f"rig.simulator.base: found legs that hardly hold the platform with {pose}"
             allowed = f"joints whose Jacobian has a condition number of at most {LARGEST_CONDITION:g}"
@@ -114,10 +117,12 @@ def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
 
 @cache
 def _compiled() -> Callable[[Scenario], Beginning]:
+    """Return the compiled function for the start."""
     return jax.jit(_beginning, compiler_options=known_options(ONCE))
 
 
 def _beginning(scenario: Scenario) -> Beginning:
+    """Return the start of the runs."""
     pose, twist = relative(scenario.bodies, scenario.start)
     at, _ = command_of(scenario.bodies, scenario.start)
     caught = tuple(
@@ -128,8 +133,8 @@ def _beginning(scenario: Scenario) -> Beginning:
     hexapod = scenario.kinematics
     if isinstance(hexapod, Stewart):
         poses = at, jnp.zeros_like(at)
-        legs = tuple(hexapod.command(one) for one in poses)
-        conditions = tuple(condition(hexapod, one) for one in poses)
+        legs = tuple(hexapod.command(pose_at) for pose_at in poses)
+        conditions = tuple(condition(hexapod, pose_at) for pose_at in poses)
     lifted, moving = jax.tree.map(lambda leaf: leaf[None], (pose, twist))
     passing = []
     for group in scenario.groups:

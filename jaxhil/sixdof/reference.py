@@ -1,4 +1,4 @@
-"""An episode in space: what becomes of two bodies that meet without a rig between them."""
+"""Episode of the ideal contact: two bodies that touch without a rig."""
 
 from typing import NamedTuple
 
@@ -14,38 +14,41 @@ from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
 from jaxhil.sixdof.space import Flight, Instant, Space, advance_flight, choose, scale, start_flight
 from jaxhil.sixdof.vectors import Vector, norm
 
-FIRST = 1e-4  # s: the first step
-TOUCH_STEPS = 4  # of Newton's method for the time of the first touch
+FIRST = 1e-4  # s; first step
+TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
 
 
 class Meeting(NamedTuple):
-    """The first touch of an episode, in T axes."""
+    """First touch of an episode, in T axes."""
 
-    states: States  # then
-    point: Vector  # where [m]
-    normal: Vector  # of the target's surface
+    states: States  # states of the bodies
+    point: Vector  # point of the touch [m]
+    normal: Vector  # normal of the target's surface
 
 
 class Passage(NamedTuple):
-    """An episode on its way."""
+    """State of an episode's integration."""
 
     flight: Flight
     touching: tuple[Bool[Array, "candidates *batch"], ...]
-    touches: Int[Array, "*batch"]  # candidates that began to touch
-    touched: Float[Array, "*batch"]  # time in which something touched [s]
-    left: Float[Array, "*batch"]  # since when nothing touches [s]
-    before: States  # the last ones before the first touch
-    depths: tuple[Float[Array, "candidates *batch"], ...]  # of the candidates soon after it [m]
-    force: Peak  # [N]
-    moment: Peak  # about T's origin [N m]
+    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
+    touched: Float[Array, "*batch"]  # time in touch [s]
+    left: Float[Array, "*batch"]  # time of the last touch [s]
+    before: States  # last states before the first touch
+    depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the first step in touch [m]
+    force: Peak  # peak force [N]
+    moment: Peak  # peak moment about T's origin [N m]
     active: Bool[Array, "*batch"]
 
 
 def pass_through(
     space: Space, states: States, quiet: Array, until: Float[Array, "*batch"], longest: Array
 ) -> Passage:
-    """The episode of bodies that are free, until nothing has touched for a time `quiet` [s] after the first
-    touch, or until a time [s]; no step is longer than `longest` [s], shorter than any touch."""
+    """Integrate the episode of free bodies until it is over, or until a time [s].
+
+    It is over when nothing has touched for a time `quiet` [s] after the first touch. No step is longer than
+    `longest` [s], which must be shorter than any touch.
+    """
     flight = start_flight(space, states, jnp.minimum(FIRST, until))
     speed = scale(space, states)
     zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)
@@ -66,10 +69,10 @@ def pass_through(
 
     def body(passage: Passage) -> Passage:
         left = until - passage.flight.time
-        after, tried = advance_flight(space, passage.flight, jnp.minimum(longest, left), speed)
-        seen = _seen(passage, after, tried.now)
-        # What is tried again changes the length alone.
-        going = choose(tried.accepted, seen, passage)._replace(flight=after)
+        after, step = advance_flight(space, passage.flight, jnp.minimum(longest, left), speed)
+        updated = _updated(passage, after, step.now)
+        # A rejected step changes only the length of the next one.
+        going = choose(step.accepted, updated, passage)._replace(flight=after)
         free = (going.touches > 0) & (going.flight.time - going.left >= quiet) & ~_touches(going)
         done = free | (until - going.flight.time <= 1e-13 * until) | ~jnp.isfinite(going.flight.time)
         return choose(passage.active, going._replace(active=~done), passage)
@@ -78,28 +81,34 @@ def pass_through(
 
 
 def over_time(passage: Passage, quiet: Array) -> Float[Array, "*batch"]:
-    """When [s] the episode was over: where nothing touches at its end, `quiet` [s] after the last touch."""
+    """Return the time [s] at which the episode was over.
+
+    If nothing touches at its end, this is `quiet` [s] after the last touch.
+    """
     free = (passage.touches > 0) & ~_touches(passage)
     return jnp.minimum(passage.flight.time, jnp.where(free, passage.left + quiet, jnp.inf))
 
 
 def meet(space: Space, passage: Passage) -> Meeting:
-    """The first touch, found on the free flight before it."""
+    """Return the first touch, found on the free flight before it."""
     if not space.groups:
         apart = jnp.full_like(passage.left, jnp.nan)
         nowhere = Vector(apart, apart, apart)
         return Meeting(passage.before, nowhere, nowhere)
 
     def touch_of(states: States) -> tuple[Touch, Array]:
-        """That of the candidate which is the deepest at the end of the step, and the rate of its depth."""
+        """Return a candidate's touch and the rate of its penetration.
+
+        The candidate is the one with the largest penetration at the end of the step.
+        """
         pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
         touches = [group.candidates.touch(pose) for group in space.groups]
-        found = [(touch, motion_at(touch, pose, twist)[0]) for touch in touches]
-        return _deepest(found, passage.depths)
+        rates = [motion_at(touch, pose, twist)[0] for touch in touches]
+        return _deepest(list(zip(touches, rates, strict=True)), passage.depths)
 
-    # A loop, not unrolled: fused into one another the steps would be worked out over and over.
-    def newton(_, reached: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
-        time, states, _ = reached
+    # The loop is not unrolled: the compiler would fuse and repeat the computations.
+    def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
+        time, states, _ = carry
         touch, rate = touch_of(states)
         time = time - touch.depth / jnp.where(rate > 0, rate, jnp.inf)
         ahead = glide(space.bodies, passage.before, time)
@@ -112,28 +121,28 @@ def meet(space: Space, passage: Passage) -> Meeting:
     return meeting
 
 
-def _deepest(found: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
-    """Of all candidates the one with the largest of the depths."""
+def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
+    """Return the candidate with the largest of the penetrations `depths`."""
     best: tuple[tuple[Touch, Array], Array] | None = None
-    for one, depth in zip(found, depths, strict=True):
-        which = jnp.argmax(depth, axis=0)[None]
+    for candidate, depth in zip(candidates, depths, strict=True):
+        index = jnp.argmax(depth, axis=0)[None]
 
-        def of_it(leaf: Array, which: Array = which, like: Array = depth) -> Array:
-            return jnp.take_along_axis(jnp.broadcast_to(leaf, like.shape), which, axis=0)[0]
+        def pick(leaf: Array, index: Array = index, like: Array = depth) -> Array:
+            return jnp.take_along_axis(jnp.broadcast_to(leaf, like.shape), index, axis=0)[0]
 
-        here = jax.tree.map(of_it, one), of_it(depth)
-        best = here if best is None else choose(here[1] > best[1], here, best)
+        deepest = jax.tree.map(pick, candidate), pick(depth)
+        best = deepest if best is None else choose(deepest[1] > best[1], deepest, best)
     assert best is not None
     return best[0]
 
 
 def meeting_mass(bodies: Pair, meeting: Meeting) -> Float[Array, "*batch"]:
-    """Effective mass [kg] that the first touch meets along its normal."""
+    """Return the effective mass [kg] of the first touch along its normal."""
     return effective_mass(bodies, meeting.states, meeting.point, meeting.normal)
 
 
 def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
-    """The states after a short free flight [s], in one step."""
+    """Return the states after a short free flight [s], in one step."""
     zero = jnp.zeros_like(time)
     nothing = Vector(zero, zero, zero)
     return States(*(
@@ -142,20 +151,20 @@ def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
     ))  # fmt: skip
 
 
-def _seen(passage: Passage, after: Flight, now: Instant) -> Passage:
-    """What a step adds that ends now."""
+def _updated(passage: Passage, after: Flight, now: Instant) -> Passage:
+    """Return the episode after a step that ends `now`."""
     depths = tuple(forces.touch.depth for forces in now.forces)
     touching = tuple(depth > 0 for depth in depths)
     touches = passage.touches
-    for one, before in zip(touching, passage.touching, strict=True):
-        touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
+    for now_touching, before in zip(touching, passage.touching, strict=True):
+        touches = touches + jnp.sum(now_touching & ~before, axis=0, dtype=touches.dtype)
     ahead = passage._replace(flight=after, touching=touching, touches=touches)
     first = (passage.touches == 0) & (touches > 0)
     step = after.time - passage.flight.time
-    # What begins or ceases to touch makes the force jump or bend.
+    # At the begin or end of a touch the force jumps or has a corner.
     bends = jnp.zeros(step.shape, bool)
-    for one, before in zip(touching, passage.touching, strict=True):
-        bends = bends | jnp.any(one != before, axis=0)
+    for now_touching, before in zip(touching, passage.touching, strict=True):
+        bends = bends | jnp.any(now_touching != before, axis=0)
     touched = passage.touched + jnp.where(_touches(passage), step, 0)
     return ahead._replace(
         touched=touched,
@@ -168,8 +177,8 @@ def _seen(passage: Passage, after: Flight, now: Instant) -> Passage:
 
 
 def _touches(passage: Passage) -> Array:
-    """Whether something touches, or a latch holds."""
-    found = jnp.zeros(passage.left.shape, bool)
-    for one in (*passage.touching, *(held.caught for held in passage.flight.memories.held)):
-        found = found | jnp.any(one, axis=0)
-    return found
+    """Return whether something touches or a latch holds."""
+    result = jnp.zeros(passage.left.shape, bool)
+    for flags in (*passage.touching, *(latch.caught for latch in passage.flight.memories.held)):
+        result = result | jnp.any(flags, axis=0)
+    return result

@@ -1,7 +1,7 @@
-"""Chaser against target: relative pose and twist, wrenches, and the relative mass.
+"""Relative pose and twist of chaser and target, wrenches, and the relative mass.
 
-The interface frames are T on the target and C on the chaser; z of T is the docking axis and points from the
-target to the chaser. All that is relative is in T axes (notebooks/guide/six_axes.md, section 1).
+The interface frames are T on the target and C on the chaser. z of T is the docking axis and points from the
+target to the chaser. All relative quantities are in T axes (notebooks/guide/six_axes.md, section 1).
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from jaxhil.sixdof.vectors import Vector, cross, dot, vector
 
 
 class Frame(NamedTuple):
-    """An interface frame in the world."""
+    """Interface frame in the world."""
 
     position: Vector  # of its origin, in world axes [m]
     attitude: Quaternion  # from its axes to world axes
@@ -36,35 +36,35 @@ class Frame(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where C is against T."""
+    """Pose of C relative to T."""
 
     position: Vector  # p, of C's origin, in T axes [m]
     attitude: Quaternion  # from C axes to T axes
 
 
 class Twist(NamedTuple):
-    """Motion of C against T, as seen from T."""
+    """Velocity of C relative to T, as seen from T."""
 
     linear: Vector  # v, of C's origin, in T axes [m/s]
     angular: Vector  # w, in T axes [rad/s]
 
 
 class Coordinates(NamedTuple):
-    """Six numbers of a pose, or their rates."""
+    """Six coordinates of a pose, or their rates."""
 
     position: Vector  # p [m], or its rate [m/s]
     rotation: Vector  # rotation vector theta from T axes [rad], or its rate [rad/s]
 
 
 class Wrench(NamedTuple):
-    """What the target exerts on the chaser, in T axes."""
+    """Force and moment of the target on the chaser, in T axes."""
 
     force: Vector  # f [N]
     moment: Vector  # m, about T's origin unless said otherwise [N m]
 
 
 class Pair(NamedTuple):
-    """Of the two bodies one thing each."""
+    """Target and chaser."""
 
     target: Body
     chaser: Body
@@ -79,7 +79,7 @@ class States(NamedTuple):
 
 @jax.jit
 def interface_frame(body: Body, state: State) -> Frame:
-    """A body's interface frame."""
+    """Return a body's interface frame."""
     angular = rotate(state.attitude, angular_velocity(body, state))
     offset = rotate(state.attitude, body.interface)
     turned = body.interface_attitude
@@ -92,7 +92,7 @@ def interface_frame(body: Body, state: State) -> Frame:
 
 
 def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
-    """Pose and twist of the frame C against the frame T."""
+    """Return pose and twist of the frame C relative to the frame T."""
     apart = chaser.position - target.position
     velocity = chaser.velocity - target.velocity - cross(target.angular_velocity, apart)
     pose = Pose(rotate_back(target.attitude, apart), compose(reverse(target.attitude), chaser.attitude))
@@ -102,13 +102,13 @@ def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
 
 @jax.jit
 def relative(bodies: Pair, states: States) -> tuple[Pose, Twist]:
-    """Pose and twist of C against T."""
-    target, chaser = (interface_frame(*one) for one in zip(bodies, states, strict=True))
+    """Return pose and twist of C relative to T."""
+    target, chaser = (interface_frame(*item) for item in zip(bodies, states, strict=True))
     return relative_motion(target, chaser)
 
 
 def coordinates(pose: Pose, twist: Twist) -> tuple[Coordinates, Coordinates]:
-    """Coordinates (p, theta) of a pose, |theta| < pi, and their rates."""
+    """Return coordinates (p, theta) of a pose, with |theta| < pi, and their rates."""
     theta = logarithm(pose.attitude)
     return (
         Coordinates(pose.position, theta),
@@ -117,7 +117,7 @@ def coordinates(pose: Pose, twist: Twist) -> tuple[Coordinates, Coordinates]:
 
 
 def motion_of(at: Coordinates, rates: Coordinates) -> tuple[Pose, Twist]:
-    """Pose and twist that have these coordinates and rates."""
+    """Return pose and twist for coordinates and their rates."""
     return (
         Pose(at.position, exponential(at.rotation)),
         Twist(rates.position, left_jacobian(at.rotation, rates.rotation)),
@@ -125,17 +125,17 @@ def motion_of(at: Coordinates, rates: Coordinates) -> tuple[Pose, Twist]:
 
 
 def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
-    """The wrench moved from T's origin to C's: its power is that of the relative motion."""
+    """Return the wrench about C's origin; its product with the relative twist is the power."""
     return Wrench(wrench.force, wrench.moment - cross(pose.position, wrench.force))
 
 
 def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
-    """Power [W] of a wrench about C's origin on the relative motion."""
+    """Return the power [W] of a wrench about C's origin on the relative motion."""
     return dot(wrench_at_chaser.force, twist.linear) + dot(wrench_at_chaser.moment, twist.angular)
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """What a wrench does to target and chaser: equal and opposite, and at one point."""
+    """Return the loads of a wrench on target and chaser: equal and opposite, at one point."""
     force, moment = (rotate(target.attitude, part) for part in wrench)
 
     def about(state: State) -> Vector:
@@ -147,10 +147,10 @@ def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
 def advance(
     bodies: Pair, states: States, wrench: Wrench, period: Float[Array, "..."], share: Array | float
 ) -> States:
-    """The two bodies of the numerical model after a control `period` [s] under a wrench.
+    """Return the bodies of the numerical model after a control `period` [s] under a wrench.
 
-    Linear momentum is conserved for any wrench, and angular momentum where `share` is 1: else it changes by
-    (1 - share) T^2 (v_chaser - v_target) x f in a period.
+    Linear momentum is conserved for any wrench, angular momentum if `share` is 1. Otherwise the latter
+    changes by (1 - share) T^2 (v_chaser - v_target) x f per period.
     """
     target, chaser = loads(wrench, interface_frame(bodies.target, states.target), states)
     return States(
@@ -160,9 +160,9 @@ def advance(
 
 
 def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twist:
-    """M^-1 W_C: how fast the relative twist of bodies at rest changes under a wrench about C's origin.
+    """Return M^-1 W_C: the rate of the relative twist of bodies at rest under a wrench about C's origin.
 
-    M is the relative mass matrix. Each body adds to its inverse what the wrench makes of it alone.
+    M is the relative mass matrix; M^-1 is the sum of the bodies' contributions.
     """
     target = interface_frame(bodies.target, states.target)
     chaser = interface_frame(bodies.chaser, states.chaser)
@@ -177,11 +177,14 @@ def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twis
 
 
 def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
-    """Relative mass matrix M at the pose: M V' = W_C for bodies at rest, in kg, kg m and kg m^2."""
+    """Return the relative mass matrix M at the pose, in kg, kg m and kg m^2.
+
+    It satisfies M V' = W_C for bodies at rest.
+    """
     like = states.target.position.x
     unit = jnp.eye(6, dtype=like.dtype).reshape(6, 6, *[1] * like.ndim)
     unit = jnp.broadcast_to(unit, (6, 6, *like.shape))
-    # All six unit wrenches at once, along an axis before the batch.
+    # All six unit wrenches are computed at once, along an axis before the batch.
     bodies, states = jax.tree.map(lambda leaf: leaf[None], (bodies, states))
     twist = acceleration(bodies, states, Wrench(vector(unit[:3]), vector(unit[3:])))
     inverse = jnp.stack(jax.tree.leaves(twist))
@@ -189,8 +192,11 @@ def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
 
 
 def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) -> Float[Array, "..."]:
-    """Mass [kg] that a frictionless contact at `point` [m] meets along its unit `normal` (both in T axes):
-    1/m_n = sum 1/m_i + (a_i . J_i^-1 a_i), a_i = (point - r_i) x normal."""
+    """Return the mass [kg] that is effective in a frictionless contact.
+
+    It is 1/m_n = sum 1/m_i + (a_i . J_i^-1 a_i), a_i = (point - r_i) x normal, with `point` [m] and the unit
+    `normal` in T axes.
+    """
     target = interface_frame(bodies.target, states.target)
     total = jnp.zeros_like(normal.x)
     for body, state in zip(bodies, states, strict=True):
@@ -201,6 +207,6 @@ def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) 
 
 
 def _turning(body: Body, state: State, target: Frame, torque: Vector) -> Vector:
-    """J^-1 torque, both in T axes."""
-    own = rotate_back(state.attitude, rotate(target.attitude, torque))
-    return rotate_back(target.attitude, rotate(state.attitude, body.inverse_inertia @ own))
+    """Return J^-1 torque; both vectors are in T axes."""
+    in_body = rotate_back(state.attitude, rotate(target.attitude, torque))
+    return rotate_back(target.attitude, rotate(state.attitude, body.inverse_inertia @ in_body))

@@ -1,9 +1,9 @@
-"""A batch of runs on the rig: from the approach until the episodes that count are over.
+"""Rollout of a batch of runs on the rig, from the approach until the evaluated episodes are over.
 
-An episode is a contact with all its touches: it begins with the first one and is over when nothing has
-touched for as long as a reading takes, the numerical model is free, too, and its wrench has died out. Ticks
-run in short stretches; what begins and ends is looked at between them. The program ends with its slowest
-lane.
+An episode is a contact with all its touches. It begins with the first one. It is over when nothing has
+touched for the duration of a reading, the numerical model is free as well, and its wrench has decayed. Ticks
+run in short segments ("stretches"), between which begin and end of episodes are checked. The program ends
+with its slowest lane.
 """
 
 from typing import Any, NamedTuple
@@ -25,79 +25,78 @@ from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.space import choose
 from jaxhil.sixdof.vectors import dot, norm
 
-STRETCH = 16  # ticks between looks at what began and ended
-SLOW = 1e-3  # m/s: of what enters more slowly, growth is reckoned from here on
+STRETCH = 16  # ticks between checks of begin and end
+SLOW = 1e-3  # m/s; least approach speed to which the growth of the speed is related
 MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
 STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
 
 
 class Watch(NamedTuple):
-    """The episode under way."""
+    """Record of the current episode."""
 
     begun: Bool[Array, "*batch"]
-    entry: States  # of the numerical model: free, and without an episode
+    entry: States  # last states of the numerical model that are free and without an episode
     entry_tick: Int[Array, "*batch"]
-    entry_energy: Float[Array, "*batch"]  # of the relative motion then [J]
+    entry_energy: Float[Array, "*batch"]  # energy of the relative motion then [J]
     touching: tuple[Bool[Array, "candidates *batch"], ...]
-    touches: Int[Array, "*batch"]  # candidates that began to touch
-    touched: Int[Array, "*batch"]  # ticks at which something touched
-    quiet: Int[Array, "*batch"]  # ticks since anything touched
+    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
+    touched: Int[Array, "*batch"]  # ticks in touch
+    quiet: Int[Array, "*batch"]  # ticks since the last touch
     caught: Bool[Array, "*batch"]  # whether a latch holds
-    force: Peak  # of the real contact [N]
-    moment: Peak  # about T's origin [N m]
-    # Largest sizes of the force [N] and of the moment [N m] on the numerical model.
-    highest: tuple[Array, Array]
-    faded: Int[Array, "*batch"]  # ticks since it died out
-    end: States  # of the numerical model, at the tick since which nothing of it is left
-    penetration: Float[Array, "*batch"]  # largest depth, over the size of its shapes
-    beyond: Bool[Array, "*batch"]  # whether an axis was sent where it cannot be
+    force: Peak  # peak force of the real contact [N]
+    moment: Peak  # peak moment about T's origin [N m]
+    highest: tuple[Array, Array]  # largest force [N] and moment [N m] on the numerical model
+    faded: Int[Array, "*batch"]  # ticks since the wrench on the numerical model decayed
+    end: States  # numerical model at the tick from which on the contact is over
+    penetration: Float[Array, "*batch"]  # largest penetration, over the size of its shapes [1]
+    beyond: Bool[Array, "*batch"]  # whether an axis was commanded beyond its workspace
 
 
 class Episode(NamedTuple):
-    """What became of episodes, (episodes, *batch)."""
+    """Results of episodes, (episodes, *batch)."""
 
-    entry: States  # of the numerical model before
-    end: States  # of the numerical model at the end
+    entry: States  # numerical model before the episode
+    end: States  # numerical model at its end
     entry_time: Float[Array, "episodes *batch"]  # [s]
     end_time: Float[Array, "episodes *batch"]  # [s]
-    touches: Int[Array, "episodes *batch"]
-    duration: Float[Array, "episodes *batch"]  # in which something touched [s]
+    touches: Int[Array, "episodes *batch"]  # number of onsets of touch, over all candidates
+    duration: Float[Array, "episodes *batch"]  # time in touch [s]
     peak_force: Float[Array, "episodes *batch"]  # [N]
     peak_moment: Float[Array, "episodes *batch"]  # about T's origin [N m]
-    penetration: Float[Array, "episodes *batch"]  # largest depth, over the size of its shapes
+    penetration: Float[Array, "episodes *batch"]  # largest penetration, over the size of its shapes [1]
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
 
 
 class Progress(NamedTuple):
-    """Runs on their way."""
+    """State of a batch of runs."""
 
     run: RunState
     watch: Watch
     episodes: Episode
-    index: Int[Array, "*batch"]  # of the episode under way or ahead
+    index: Int[Array, "*batch"]  # index of the current or next episode
     active: Bool[Array, "*batch"]
-    lasted: Int[Array, "*batch"]  # ticks that each has run
+    lasted: Int[Array, "*batch"]  # number of ticks of each run so far
 
 
 class Outcome(NamedTuple):
-    """What became of runs."""
+    """Results of runs."""
 
     episodes: Episode
-    final: States  # of the numerical model, at the end of the run
+    final: States  # numerical model at the end of the run
     final_time: Float[Array, "*batch"]  # [s]
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
-    """The episodes of every lane; `gains` as for `jaxhil.sixdof.loop.build_rig`."""
+    """Return the episodes of every lane; `gains` are those of `jaxhil.sixdof.loop.build_rig`."""
     rig = build_rig(loop, gains, scenario)
     last = jnp.round(scenario.duration / rig.period).astype(jnp.int32)
 
-    def one(progress: Progress, _) -> tuple[Progress, Wrench | None]:
+    def one_tick(progress: Progress, _) -> tuple[Progress, Wrench | None]:
         after, command = _tick(loop, rig, last, progress)
         return after, command if loop.pushed else None
 
     def body(progress: Progress) -> Progress:
-        after, commands = lax.scan(one, progress, None, STRETCH)
+        after, commands = lax.scan(one_tick, progress, None, STRETCH)
         if commands is not None:
             after = _enter_late(loop, rig, progress, after, commands)
         return _turn_over(loop, rig, last, after)
@@ -109,9 +108,10 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
 
 
 def _start(loop: Loop, rig: Rig, states: States) -> Progress:
+    """Return the state at the start of the runs."""
     run = begin(loop, rig, states)
     like, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
-    _, energy = _look(rig, states)
+    _, energy = _freedom_and_energy(rig, states)
     watch = _fresh(rig, states, none, energy)
     slots: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (loop.episodes, *leaf.shape)), states)
     numbers = jnp.zeros((loop.episodes, *like.shape), like.dtype)
@@ -132,6 +132,7 @@ def _start(loop: Loop, rig: Rig, states: States) -> Progress:
 
 
 def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
+    """Return the record before an episode."""
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
     peak = no_peak(zero)
     touching = tuple(group.parameters.damping > jnp.inf for group in rig.groups)
@@ -156,59 +157,63 @@ def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
 
 
 def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> tuple[Progress, Wrench]:
-    """One tick, and the wrench that moved the model; where the run is over the bodies stand still."""
+    """Run one tick; return the state and the wrench that moved the model.
+
+    In lanes whose run is over the bodies stand still.
+    """
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
-    goes = progress.active & (progress.lasted < last) & ~watch.beyond
+    runs = progress.active & (progress.lasted < last) & ~watch.beyond
     beyond = ~rig.kinematics.reaches(after.hardware.commands[0])
     end = choose(_since(rig, watch) < 0, after.states, watch.end)
-    watched = choose(goes, _watch(rig, watch, seen)._replace(end=end, beyond=beyond), watch)
+    watched = choose(runs, _watch(rig, watch, seen)._replace(end=end, beyond=beyond), watch)
     moved = progress._replace(
-        run=after._replace(states=choose(goes, after.states, run.states)),
+        run=after._replace(states=choose(runs, after.states, run.states)),
         watch=watched,
-        lasted=progress.lasted + goes.astype(jnp.int32),
+        lasted=progress.lasted + runs.astype(jnp.int32),
     )
     return moved, seen.command
 
 
 def _enter_late(loop: Loop, rig: Rig, before: Progress, after: Progress, commands: Wrench) -> Progress:
-    """Where the model came into contact in a stretch, the entry is the last tick at which it was free.
+    """Set the entry to the last free tick of a model that came into contact within a segment.
 
-    Readings that are not 0 without a contact move it up to there.
+    Readings that are not 0 without a contact move the model until then.
     """
-    free, _ = _look(rig, after.run.states)
-    comes = after.active & ~free & (after.watch.entry_tick == before.lasted)
+    free, _ = _freedom_and_energy(rig, after.run.states)
+    enters = after.active & ~free & (after.watch.entry_tick == before.lasted)
 
     def follow(watch: Watch) -> Watch:
         def step(carry: tuple[States, Array, Array], command: Wrench):
-            states, ticks, still = carry
+            states, ticks, is_free = carry
             moved = advance(rig.bodies, states, command, rig.period, SHARES[loop.integrator])
-            still = still & (deepest(rig.groups, relative(rig.bodies, moved)[0]) < 0)
-            return (choose(still, moved, states), ticks + still.astype(ticks.dtype), still), None
+            is_free = is_free & (deepest(rig.groups, relative(rig.bodies, moved)[0]) < 0)
+            return (choose(is_free, moved, states), ticks + is_free.astype(ticks.dtype), is_free), None
 
-        start = watch.entry, watch.entry_tick, comes
+        start = watch.entry, watch.entry_tick, enters
         (entry, ticks, _), _ = lax.scan(step, start, commands)
         return watch._replace(entry=entry, entry_tick=ticks)
 
-    return after._replace(watch=lax.cond(jnp.any(comes), follow, lambda watch: watch, after.watch))
+    return after._replace(watch=lax.cond(jnp.any(enters), follow, lambda watch: watch, after.watch))
 
 
 def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
+    """Update the record with a tick."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = watch.caught
-    for held in seen.held:
-        caught = caught | jnp.any(held.caught, axis=0)
+    for latch in seen.held:
+        caught = caught | jnp.any(latch.caught, axis=0)
     now, touches = caught, watch.touches
-    for one, before in zip(touching, watch.touching, strict=True):
-        now = now | jnp.any(one, axis=0)
-        touches = touches + jnp.sum(one & ~before, axis=0, dtype=touches.dtype)
+    for flags, before in zip(touching, watch.touching, strict=True):
+        now = now | jnp.any(flags, axis=0)
+        touches = touches + jnp.sum(flags & ~before, axis=0, dtype=touches.dtype)
     penetration = watch.penetration
     for group, forces in zip(rig.groups, seen.forces, strict=True):
         share = jnp.max(forces.touch.depth / group.candidates.size, axis=0)
         penetration = jnp.maximum(penetration, share)
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
-    # No threshold depends on the noise: see `jaxhil.simulation.watch`.
+    # No threshold depends on the noise; `jaxhil.simulation.watch` gives the reason.
     faded = (command[0] <= FADED * highest[0]) & (command[1] <= FADED * highest[1])
     return watch._replace(
         begun=watch.begun | now,
@@ -225,51 +230,57 @@ def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
     )
 
 
-def _look(rig: Rig, states: States) -> tuple[Array, Array]:
-    """Whether the numerical model is free, and the energy of its relative motion [J], coupling left out."""
+def _freedom_and_energy(rig: Rig, states: States) -> tuple[Array, Array]:
+    """Return whether the numerical model is free, and the energy of its relative motion [J].
+
+    The energy neglects the coupling of translation and rotation.
+    """
     pose, (linear, angular) = relative(rig.bodies, states)
     energy = dot(linear, linear) / _share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
     return deepest(rig.groups, pose) < 0, energy
 
 
 def _share(rig: Rig) -> Array:
-    """One over the reduced mass [1/kg]."""
+    """Return the inverse of the reduced mass [1/kg]."""
     return 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
 
 
 def quiet_time(sensor: Sensor, period: Array) -> Array:
-    """Time [s] without a touch after which a contact is over: tau_f + 20 sensor time constants + 2 T."""
+    """Return the time [s] without a touch after which a contact is over.
+
+    It is tau_f + 20 sensor time constants + 2 T.
+    """
     return sensor.delay + 20 * sensor.time_constant + 2 * period
 
 
 def _still(rig: Rig) -> Array:
-    """Ticks without a touch after which a contact is over."""
+    """Return the number of ticks without a touch after which a contact is over."""
     return jnp.floor(quiet_time(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
 
 
 def _since(rig: Rig, watch: Watch) -> Array:
-    """For how many ticks nothing has been left of a contact on the hardware; negative as long as there is."""
+    """Return the number of ticks since the contact was over on the hardware; negative before."""
     still = _still(rig)
     patience = still + jnp.ceil(LONGEST_FADING / rig.period).astype(jnp.int32)
     return jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
 
 
 def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
-    """Enter the episodes that are over; where the model is free and none is under way, one may begin."""
+    """Write finished episodes; where the model is free and has no episode, move the entry to this tick."""
     watch, run, period = progress.watch, progress.run, rig.period
-    free, energy = _look(rig, run.states)
+    free, energy = _freedom_and_energy(rig, run.states)
     age = progress.lasted
     since = _since(rig, watch)
     over = watch.begun & free & (since >= 0) & progress.active
     status = _failure(rig, watch, energy)
     out = (age >= last) | (status != MISS)
-    held = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < _still(rig), JAMMED, TIMEOUT))
-    status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, held, MISS)))
+    cut = jnp.where(watch.caught, CAPTURED, jnp.where(watch.quiet < _still(rig), JAMMED, TIMEOUT))
+    status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, cut, MISS)))
     ends = progress.active & (over | out)
     entry_time, end_time = (
         ticks.astype(period.dtype) * period for ticks in (watch.entry_tick, age - jnp.where(over, since, 0))
     )
-    found = Episode(
+    episode = Episode(
         entry=watch.entry,
         end=choose(over, watch.end, run.states),
         entry_time=entry_time,
@@ -282,8 +293,8 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
         status=status,
     )
     slot = jnp.arange(loop.episodes, dtype=jnp.int32).reshape(-1, *[1] * period.ndim)
-    here = (slot == progress.index[None]) & (ends & (status != MISS))[None]
-    episodes = jax.tree.map(lambda one, all_: jnp.where(here, one[None], all_), found, progress.episodes)
+    mask = (slot == progress.index[None]) & (ends & (status != MISS))[None]
+    episodes = jax.tree.map(lambda new, old: jnp.where(mask, new[None], old), episode, progress.episodes)
     index = progress.index + (ends & (status != MISS)).astype(jnp.int32)
     active = progress.active & ~out
     if not loop.whole:
@@ -296,8 +307,8 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
 
 
 def _failure(rig: Rig, watch: Watch, energy: Array) -> Array:
-    """DIVERGED, NON_FINITE, or REACH where an axis is to be where it cannot be; else MISS."""
+    """Return DIVERGED, NON_FINITE, REACH for an axis commanded beyond its workspace, or else MISS."""
     entry = jnp.maximum(watch.entry_energy, SLOW**2 / _share(rig))
-    wild = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
-    wild = jnp.where(watch.beyond, REACH, wild)
-    return jnp.where(jnp.isfinite(energy), wild, NON_FINITE).astype(jnp.int32)
+    status = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
+    status = jnp.where(watch.beyond, REACH, status)
+    return jnp.where(jnp.isfinite(energy), status, NON_FINITE).astype(jnp.int32)

@@ -1,8 +1,8 @@
 """Rotations as unit quaternions, and rotation vectors: exponential, logarithm and left Jacobian.
 
 Quaternions q = (w, v) are Hamilton's; q and -q are the same rotation. A rotation vector theta is the axis
-times the angle t = |theta| [rad]. What depends on t is a power series in t^2, and near t = 0 that series is
-summed: values and derivatives of any order are right there too.
+times the angle t = |theta| [rad]. Functions of t are power series in t^2, which are summed near t = 0: thus
+values and derivatives of any order are accurate there.
 """
 
 from math import factorial
@@ -16,66 +16,66 @@ from jaxtyping import Array, Float
 from jaxhil.sixdof.vectors import Vector, cross, dot
 
 PI = 3.141592653589793, 1.2246467991473532e-16  # their sum has twice the digits
-NEAR = (PI[0] / 2) ** 2  # of t^2, up to where series are summed: eleven terms are exact to rounding
+NEAR = (PI[0] / 2) ** 2  # limit of t^2 for summing series; eleven terms give rounding accuracy
 
 
 class Quaternion(NamedTuple):
-    """A rotation w + v, of norm 1; from axes A to axes B it takes components in A to components in B."""
+    """Rotation w + v of norm 1; from axes A to axes B it maps components in A to components in B."""
 
     w: Float[Array, "..."]  # cos(t/2)
     v: Vector  # sin(t/2) times the axis
 
 
 def identity(like: Float[Array, "*batch"]) -> Quaternion:
-    """No rotation, for a batch shaped like `like`."""
+    """Return the identity rotation, for a batch shaped like `like`."""
     zero = jnp.zeros_like(like)
     return Quaternion(zero + 1, Vector(zero, zero, zero))
 
 
 @jax.jit
 def compose(second: Quaternion, first: Quaternion) -> Quaternion:
-    """The rotation `first`, then the rotation `second`: their product."""
+    """Return the rotation `first` followed by the rotation `second`: their product."""
     (a, u), (b, v) = second, first
     return Quaternion(a * b - dot(u, v), a * v + b * u + cross(u, v))
 
 
 def reverse(rotation: Quaternion) -> Quaternion:
-    """The rotation back."""
+    """Return the inverse rotation."""
     return Quaternion(rotation.w, -rotation.v)
 
 
 @jax.jit
 def rotate(rotation: Quaternion, vector: Vector) -> Vector:
-    """R vector."""
+    """Return R vector."""
     along = 2 * cross(rotation.v, vector)
     return vector + rotation.w * along + cross(rotation.v, along)
 
 
 def rotate_back(rotation: Quaternion, vector: Vector) -> Vector:
-    """R^T vector."""
+    """Return R^T vector."""
     return rotate(reverse(rotation), vector)
 
 
 @jax.jit
 def normalise(rotation: Quaternion) -> Quaternion:
-    """The same rotation, of norm 1 to rounding."""
+    """Return the same rotation with norm 1 to rounding."""
     share = 1 / jnp.sqrt(rotation.w**2 + dot(rotation.v, rotation.v))
     return Quaternion(share * rotation.w, share * rotation.v)
 
 
 @jax.jit
 def exponential(theta: Vector) -> Quaternion:
-    """The rotation whose rotation vector is theta [rad]."""
+    """Return the rotation with the rotation vector theta [rad]."""
     square = dot(theta, theta) / 4
     return Quaternion(_cosine(square), (_sine(square) / 2) * theta)
 
 
 @jax.jit
 def logarithm(rotation: Quaternion) -> Vector:
-    """Rotation vector [rad] of at most pi; of a half turn, either of its two."""
+    """Return the rotation vector [rad], with norm at most pi; for a half turn, either of the two."""
     sign = jnp.where(rotation.w < 0, -1, 1).astype(rotation.w.dtype)
     w, v = sign * rotation.w, sign * rotation.v
-    # From tan(t/2) to tan(t/8), which is less than 1/2, by tan(a/2) = tan(a)/(1 + sqrt(1 + tan(a)^2)).
+    # tan(a/2) = tan(a)/(1 + sqrt(1 + tan(a)^2)) reduces tan(t/2) to tan(t/8), which is less than 1/2.
     square = dot(v, v)
     share = 1 / (w + jnp.sqrt(w**2 + square))
     share = share / (1 + jnp.sqrt(1 + share**2 * square))
@@ -84,8 +84,10 @@ def logarithm(rotation: Quaternion) -> Vector:
 
 @jax.jit
 def left_jacobian(theta: Vector, rate: Vector) -> Vector:
-    """Jl(theta) rate: the angular velocity [rad/s], in the axes to which exp(theta) leads, of a rotation
-    vector that changes at `rate` [rad/s]."""
+    """Return Jl(theta) rate: the angular velocity [rad/s] of a rotation vector with a `rate` [rad/s].
+
+    The angular velocity is in the axes to which exp(theta) maps.
+    """
     square = dot(theta, theta)
     once = cross(theta, rate)
     return rate + _versine(square) * once + _cubic(square) * cross(theta, once)
@@ -93,13 +95,16 @@ def left_jacobian(theta: Vector, rate: Vector) -> Vector:
 
 @jax.jit
 def inverse_left_jacobian(theta: Vector, angular_velocity: Vector) -> Vector:
-    """Jl(theta)^-1 w: the rate [rad/s] of the rotation vector at the angular velocity w [rad/s]; |theta| is
-    less than a whole turn."""
+    """Return Jl(theta)^-1 w: the rate [rad/s] of the rotation vector at the angular velocity w [rad/s].
+
+    |theta| must be less than 2 pi.
+    """
     once = cross(theta, angular_velocity)
     return angular_velocity - 0.5 * once + _cotangent(dot(theta, theta)) * cross(theta, once)
 
 
 def _sum(coefficients, x):
+    """Return the power series of x."""
     total = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = coefficient + x * total
@@ -107,26 +112,26 @@ def _sum(coefficients, x):
 
 
 def _alternating(first: int) -> tuple[float, ...]:
-    """(-1)^k / (2k + first)!"""
+    """Return the coefficients (-1)^k / (2k + first)!."""
     return tuple((-1) ** k / factorial(2 * k + first) for k in range(11))
 
 
 def _cosine(square: Array) -> Array:
-    """cos t, of t^2."""
+    """Return cos t as a function of t^2."""
     _, turned, sign = _reduced(square)
     return sign * _sum(_COSINE, turned)
 
 
 def _sine(square: Array) -> Array:
-    """sin(t)/t, of t^2."""
+    """Return sin(t)/t as a function of t^2."""
     share, turned, sign = _reduced(square)
     return sign * share * _sum(_SINE, turned)
 
 
 def _reduced(square: Array) -> tuple[Array, Array, Array]:
-    """Of t = r + k pi with |r| <= pi/2: r/t, r^2 and (-1)^k.
+    """Return r/t, r^2 and (-1)^k for t = r + k pi with |r| <= pi/2.
 
-    Not the library's sine and cosine, which are called number by number.
+    The library's sine and cosine would be called separately for each number.
     """
     near = square <= NEAR
     safe = jnp.where(near, 1, square)
@@ -142,30 +147,30 @@ def _reduced(square: Array) -> tuple[Array, Array, Array]:
 
 
 def _versine(square: Array) -> Array:
-    """(1 - cos t)/t^2."""
+    """Return (1 - cos t)/t^2."""
     return _sine(square / 4) ** 2 / 2
 
 
 def _cubic(square: Array) -> Array:
-    """(t - sin t)/t^3."""
+    """Return (t - sin t)/t^3."""
     sine = _sine(square / 4) * _cosine(square / 4)
     return _near(_CUBIC, NEAR, square, 1 - sine)
 
 
 def _cotangent(square: Array) -> Array:
-    """(1 - t/2 cot(t/2))/t^2."""
+    """Return (1 - t/2 cot(t/2))/t^2."""
     return _near(_BERNOULLI, 0.25, square, 1 - _cosine(square / 4) / _sine(square / 4))
 
 
 def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Array) -> Array:
-    """A function of t^2: its series up to a limit, and t^-2 of what is `beyond`."""
+    """Return the series of t^2 up to a limit, and `beyond`/t^2 above it."""
     near = square <= limit
     return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond / jnp.where(near, 1, square))
 
 
 _COSINE, _SINE, _CUBIC = _alternating(0), _alternating(1), _alternating(3)
 _ARCTANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(20))
-# Bernoulli's numbers |B_2k| / (2k)!
+# Coefficients |B_2k| / (2k)! with Bernoulli numbers B_2k.
 _BERNOULLI = (
     1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160,
     691 / 1307674368000, 1 / 74724249600, 3617 / 10670622842880000,

@@ -1,4 +1,4 @@
-"""One run of a mechanism of six axes: what became of each episode, and every tick of the way there."""
+"""Run of a six-axis mechanism: results of each episode, and all ticks."""
 
 import math
 import os
@@ -29,76 +29,76 @@ from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import Vector, cross, direction, vector
 
-GOOD = ("rebounded", "captured")  # how an episode may end
-DEEP = 0.5  # penetration from which on shapes are said to go through each other
+GOOD = ("rebounded", "captured")  # statuses of good episodes
+DEEP = 0.5  # penetration over shapes' size above which there is a warning
 
 
 class Episode(NamedTuple):
-    """A contact with all its touches; NaN for what it does not have."""
+    """Results of a contact with all its touches; NaN for values that it does not have."""
 
-    energy_error: float  # excess of kinetic energy over that in space, over that of the approach [1]
-    twist_error: float  # deviation of the twist from that in space, over what the contact changes there [1]
-    normal_part: float  # of it along the reference's impulse [1]
-    lateral_part: float  # of the rest, in translation [1]
-    rotational_part: float  # and in rotation [1]
-    restitution: float  # e, of a single touch [1]
-    reference_restitution: float  # e* in space [1]
+    energy_error: float  # kinetic energy minus that of the ideal contact, over that of the approach [1]
+    twist_error: float  # deviation of the twist from that of the ideal contact, over the latter's change [1]
+    normal_part: float  # part of the twist error along the ideal impulse [1]
+    lateral_part: float  # translational part of the rest [1]
+    rotational_part: float  # rotational part of the rest [1]
+    restitution: float  # e; NaN unless there is a single touch [1]
+    reference_restitution: float  # e* of the ideal contact [1]
     effective_mass: float  # m_n at the first touch [kg]
-    approach_velocity: float  # along its normal [m/s]
-    point: tuple[float, ...]  # of the first touch, in T axes [m]
-    normal: tuple[float, ...]  # there, outward from the target
+    approach_velocity: float  # along the normal of the first touch [m/s]
+    point: tuple[float, ...]  # point of the first touch, in T axes [m]
+    normal: tuple[float, ...]  # normal there, outward from the target
     peak_force: float  # of the real contact [N]
-    reference_peak_force: float  # in space [N]
-    peak_moment: float  # of the real contact about T [N m]
-    reference_peak_moment: float  # in space [N m]
-    duration: float  # in touch [s]
-    reference_duration: float  # in space [s]
-    touches: int  # candidates that began to touch
-    reference_touches: int  # in space
-    penetration: float  # largest depth of the real contact, over the size of its shapes [1]
-    status: str  # how it ended
+    reference_peak_force: float  # of the ideal contact [N]
+    peak_moment: float  # of the real contact, about T's origin [N m]
+    reference_peak_moment: float  # of the ideal contact [N m]
+    duration: float  # time in touch [s]
+    reference_duration: float  # time in touch of the ideal contact [s]
+    touches: int  # number of onsets of touch, over all candidates
+    reference_touches: int  # likewise in the ideal contact
+    penetration: float  # largest penetration of the real contact, over the size of its shapes [1]
+    status: str  # one of `rollout.STATUS_NAMES`
 
 
 class Final(NamedTuple):
-    """The motion at the end."""
+    """Motion at the end of a run."""
 
     time: float  # [s]
     pose: tuple[float, ...]  # position and rotation vector of C against T, in T axes [m, rad]
     twist: tuple[float, ...]  # velocity and angular velocity, likewise [m/s, rad/s]
-    v1: tuple[float, ...]  # of the target's centre of mass, in world axes [m/s]
-    w1: tuple[float, ...]  # of the target, in body axes [rad/s]
-    v2: tuple[float, ...]  # of the chaser's centre of mass, in world axes [m/s]
-    w2: tuple[float, ...]  # of the chaser, in body axes [rad/s]
+    v1: tuple[float, ...]  # velocity of the target's centre of mass, in world axes [m/s]
+    w1: tuple[float, ...]  # angular velocity of the target, in body axes [rad/s]
+    v2: tuple[float, ...]  # velocity of the chaser's centre of mass, in world axes [m/s]
+    w2: tuple[float, ...]  # angular velocity of the chaser, in body axes [rad/s]
 
 
 @dataclass(frozen=True, eq=False)
 class SixAxisRun:
-    """The episodes of a mechanism of six axes under a compensator, run once."""
+    """One run of a six-axis mechanism's episodes under a compensator."""
 
     mechanism: SixAxisMechanism = field(repr=False)
-    compensator: str  # its name
-    gains: dict[str, float]  # by name, in SI units
-    seed: int  # of the sensor's noise
+    compensator: str  # name of the compensator
+    gains: dict[str, float]  # gains by name, in SI units
+    seed: int  # seed of the sensor's noise
     episodes: tuple[Episode, ...]
-    status: str  # of the first episode that did not rebound or was not captured, else of the last
-    final: Final  # of the numerical model
-    meaning: Meaning  # of the mechanism
+    status: str  # status of the first episode not in `GOOD`, else of the last episode
+    final: Final  # final motion of the numerical model
+    meaning: Meaning  # summary of the mechanism
 
     @cached_property
     def reference_final(self) -> Final:
-        """The motion of two free bodies in space, from the same start on, at the time of `final`."""
+        """Motion in the ideal contact with the same start, at the time of `final`."""
         return final_in_space(self.mechanism, self.final.time)
 
     @cached_property
     def ticks(self) -> Recorded:
-        """Every tick of the run."""
+        """All ticks of the run."""
         with computing():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the ticks, a line each, under a line of their names; numbers in SI units, to the last bit.
+        """Write the ticks as CSV, one line each after a line of names, in SI units with all digits.
 
-        Raises `InputError` when the file cannot be written.
+        Raise `InputError` if the file cannot be written.
         """
         write_csv(path, {name: column.tolist() for name, column in table(self.ticks).items()})
 
@@ -106,9 +106,10 @@ class SixAxisRun:
 def simulate_six_axes(
     mechanism: SixAxisMechanism, compensator: str = "none", gains: Any = None, *, seed: int = 0
 ) -> SixAxisRun:
-    """Run a mechanism of six axes once, as it is nominally: see `jaxhil.simulate`.
+    """Run a nominal six-axis mechanism once; the arguments are those of `jaxhil.simulate`.
 
-    `compensator` is "none" or "phase_lead", which leads each channel of the wrench by itself.
+    `compensator` is one of `SIX_AXES`; it acts on each channel of the wrench separately. Raise `InputError`
+    if an argument is invalid.
     """
     if compensator not in SIX_AXES:
         allowed = f"{', '.join(SIX_AXES)}: in six axes there are no others so far"
@@ -119,15 +120,16 @@ def simulate_six_axes(
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
         loop = loop_of(mechanism, name, scenario)
-        given = {key: jnp.asarray(one) for key, one in values.items()}
-        found = jax.device_get(_compiled()(loop, given, scenario))
-    return _result(mechanism, name, values, number, found)
+        arrays = {key: jnp.asarray(value) for key, value in values.items()}
+        outcome = jax.device_get(_compiled()(loop, arrays, scenario))
+    return _result(mechanism, name, values, number, outcome)
 
 
 def _result(
-    mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, found: Any
+    mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, outcome: Any
 ) -> SixAxisRun:
-    metrics, time, final, tangential = found
+    """Return the run from the metrics, final time, final motion and tangential mass."""
+    metrics, time, final, tangential = outcome
     check_followed(mechanism, metrics)
     episodes = tuple(
         _episode(metrics, slot)
@@ -136,16 +138,16 @@ def _result(
     )
     bad = [episode.status for episode in episodes if episode.status not in GOOD]
     first = episodes[0]
-    held = bool(metrics.reference_captured[0, 0])
-    means = meaning(
-        mechanism, first.effective_mass, float(tangential[0]), math.nan if held else first.reference_duration,
+    duration = math.nan if metrics.reference_captured[0, 0] else first.reference_duration
+    summary = meaning(
+        mechanism, first.effective_mass, float(tangential[0]), duration,
         first.reference_peak_force, first.reference_restitution,
     )  # fmt: skip
     deep = max(episode.penetration for episode in episodes)
     if deep > DEEP:
         expected = f"at most {DEEP:g}: shapes that are too soft, or meet too fast, go through each other"
         warning = f"contact: found a depth of {deep:.2g} of the size of its shapes, expected {expected}"
-        means = means._replace(warnings=(*means.warnings, warning))
+        summary = summary._replace(warnings=(*summary.warnings, warning))
     status = [*bad, episodes[-1].status][0]
     return SixAxisRun(
         mechanism=mechanism,
@@ -155,30 +157,30 @@ def _result(
         episodes=episodes,
         status=status,
         final=_final(float(time[0]), final),
-        meaning=means,
+        meaning=summary,
     )
 
 
 def final_in_space(mechanism: SixAxisMechanism, time: float) -> Final:
-    """The motion of two free bodies in space, from a mechanism's start on, at a time [s]."""
+    """Return the motion in the ideal contact at a time [s] after a mechanism's start."""
     with computing():
         scenario = build_scenarios(mechanism)
-        return _final(time, jax.device_get(_in_space(scenario, np.array([time]))))
+        return _final(time, jax.device_get(_ideal_motion(scenario, np.array([time]))))
 
 
 def check_followed(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
-    """The contact in space was followed to its end. Raises `InputError`."""
+    """Raise `InputError` if the ideal contact was not integrated to its end."""
     if not np.all(np.isfinite(metrics.reference_duration)):
         raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
 
 
 def _stiffest(mechanism: SixAxisMechanism) -> str:
-    """What to change where a contact in space takes too many steps."""
-    rubbing = {name: contact.friction for name, contact in mechanism.contact.items() if contact.friction}
-    slips = {name: one.slip / max(one.coefficient, 1e-9) for name, one in rubbing.items() if one.slip}
+    """Return advice for an ideal contact that takes too many steps."""
+    frictions = {name: contact.friction for name, contact in mechanism.contact.items() if contact.friction}
+    slips = {name: law.slip / max(law.coefficient, 1e-9) for name, law in frictions.items() if law.slip}
     if slips:
         name = min(slips, key=slips.__getitem__)
-        found = f"contact.{name}.friction.slip: found {rubbing[name].slip:g} m/s"
+        found = f"contact.{name}.friction.slip: found {frictions[name].slip:g} m/s"
         allowed = "a larger one, or friction = { law = 'bristle', ... }"
     else:
         name = next(iter(mechanism.contact))
@@ -187,40 +189,45 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:
+    """Return the results of one episode."""
+
     def value(name: str) -> Any:
-        found = np.asarray(getattr(metrics, name))[..., slot, 0]
+        entry = np.asarray(getattr(metrics, name))[..., slot, 0]
         if name == "status":
-            return STATUS_NAMES[int(found)]
-        return tuple(found.tolist()) if found.ndim else found.item()
+            return STATUS_NAMES[int(entry)]
+        return tuple(entry.tolist()) if entry.ndim else entry.item()
 
     return Episode(*map(value, Episode._fields))
 
 
 def _final(time: float, motion: Any) -> Final:
-    at, twist, *each = (tuple(np.asarray(one, float)[:, 0].tolist()) for one in motion)
-    return Final(time, at, twist, *each)
+    """Return the motion at the end of a run."""
+    pose, twist, *velocities = (tuple(np.asarray(part, float)[:, 0].tolist()) for part in motion)
+    return Final(time, pose, twist, *velocities)
 
 
 @cache
 def _compiled() -> Callable[..., Any]:
+    """Return the compiled function for runs."""
     return jax.jit(_run, static_argnums=0, compiler_options=known_options(ONCE))
 
 
 def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:
-    """Figures of the episodes, the time at the end, the motion then, and the mass along the surface."""
-    found = evaluate(loop, gains, scenario)
-    final = _motion(scenario.bodies, found.final)
-    return found.metrics, found.final_time, final, _tangential_mass(scenario, found.metrics)
+    """Return the metrics of the episodes, the final time, the final motion, and the tangential mass."""
+    result = evaluate(loop, gains, scenario)
+    final = _motion(scenario.bodies, result.final)
+    return result.metrics, result.final_time, final, _tangential_mass(scenario, result.metrics)
 
 
 @jax.jit
-def _in_space(scenario: Scenario, time: Any) -> tuple[Any, ...]:
+def _ideal_motion(scenario: Scenario, time: Any) -> tuple[Any, ...]:
+    """Return the motion in the ideal contact at a time [s]."""
     return _motion(scenario.bodies, reference_final(scenario, time))
 
 
 def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
-    """Mass [kg] that the first touch meets along the surface, where it is less of two directions."""
-    point, normal = (vector(one[:, 0]) for one in (metrics.point, metrics.normal))
+    """Return the effective mass [kg] of the first touch along the surface: the lesser of two directions."""
+    point, normal = (vector(part[:, 0]) for part in (metrics.point, metrics.normal))
     zero = jnp.zeros_like(normal.x)
     flat = jnp.abs(normal.x) < 0.9
     across = direction(cross(normal, Vector(jnp.where(flat, 1, zero), jnp.where(flat, zero, 1), zero)))
@@ -229,6 +236,6 @@ def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
 
 
 def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
-    """What `Final` says but the time, each along a leading axis."""
-    at, twist, *each = motion(bodies, states)
-    return at, twist, *(part for one in each for part in (one[7:10], one[10:]))
+    """Return the values of `Final` except the time, each along a leading axis."""
+    pose, twist, *motions = motion(bodies, states)
+    return pose, twist, *(part for rows in motions for part in (rows[7:10], rows[10:]))

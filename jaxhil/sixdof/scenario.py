@@ -1,4 +1,4 @@
-"""A run in six degrees of freedom as plain arrays: every number of it is a leaf.
+"""Scenario in six degrees of freedom as arrays: every number of a run is a leaf.
 
 The batch is the trailing axis; candidates, latches and the axes of the motion simulator come before it.
 """
@@ -16,15 +16,15 @@ from jaxhil.sixdof.sensor import Sensor
 
 
 class Scenario(NamedTuple):
-    """One run per lane."""
+    """Batch of scenarios, one run per lane."""
 
     bodies: Pair
-    start: States  # of the numerical model, at tick 0
-    groups: tuple[ContactGroup, ...]  # the contact
+    start: States  # numerical model at tick 0
+    groups: tuple[ContactGroup, ...]  # candidates of the contact
     latches: tuple[Latch, ...]
-    simulator: MotionSimulator  # of each axis, (..., axes, *batch), without limits
-    kinematics: Kinematics  # what the axes move
+    simulator: MotionSimulator  # model of each axis, (..., axes, *batch), without limits
+    kinematics: Kinematics  # relation of axes and coordinates
     sensor: Sensor
     control_period: Float[Array, "*batch"]  # T [s]
-    duration: Float[Array, "*batch"]  # after which the run ends at the latest, to the nearest tick [s]
-    key: UInt32[Array, "2 *batch"]  # of the sensor's noise
+    duration: Float[Array, "*batch"]  # longest duration of the run, rounded to ticks [s]
+    key: UInt32[Array, "2 *batch"]  # key of the sensor's noise

@@ -1,7 +1,7 @@
-"""Shapes in touch: signed distance of a point from a surface, and the surface's outward normal there.
+"""Shapes of contact candidates: signed distance of a point from a surface, and the outward normal there.
 
-Numbers of a shape are arrays of the candidates' shape, (candidates, *batch), in the axes of the frame in
-which it is fixed [m]. Distances are positive outside. Formulas: Quilez, "3D signed distance functions".
+Numbers of a shape are arrays (candidates, *batch), in the axes of the frame in which the shape is fixed [m].
+Distances are positive outside. Formulas: Quilez, "3D signed distance functions".
 """
 
 import abc
@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, direction, dot, norm, root
 
-NEAR_AXIS = 1e-12  # m: how far from its axis a surface of revolution begins to know a radial direction
+NEAR_AXIS = 1e-12  # m; distance from the axis below which the radial direction vanishes smoothly
 
 
 class Surface(NamedTuple):
-    """A surface as seen from a point."""
+    """Surface as seen from a point."""
 
-    distance: Float[Array, "..."]  # signed [m]
+    distance: Float[Array, "..."]  # signed distance [m]
     normal: Vector  # unit vector, outward
 
 
@@ -29,18 +29,18 @@ class Shape(eqx.Module):
 
     @abc.abstractmethod
     def surface(self, point: Vector) -> Surface:
-        """Distance of `point` [m] from the surface, and the normal."""
+        """Return the distance of `point` [m] from the surface, and the normal."""
 
     @property
     def thickness(self) -> Float[Array, "..."] | float:
-        """How far behind the surface [m] one is on the other side of the shape."""
+        """Depth behind the surface [m] at which a point has passed through the shape."""
         return jnp.inf
 
 
 class Plane(Shape):
-    """All that is behind a point, seen along a normal."""
+    """Half-space behind a point, with a normal."""
 
-    point: Vector  # on it [m]
+    point: Vector  # point on the plane [m]
     normal: Vector  # unit vector
 
     def surface(self, point):
@@ -48,7 +48,7 @@ class Plane(Shape):
 
 
 class Ball(Shape):
-    """A sphere from outside; at its very centre the normal is 0."""
+    """Sphere that is touched from outside; at its centre the normal is 0."""
 
     centre: Vector  # [m]
     radius: Float[Array, "..."]  # [m]
@@ -63,7 +63,7 @@ class Ball(Shape):
 
 
 class Cavity(Shape):
-    """A sphere from inside: with the point as end of a slack tether, the tether's limit."""
+    """Sphere that is touched from inside; with the end of a slack tether as point, the tether's limit."""
 
     centre: Vector  # [m]
     radius: Float[Array, "..."]  # [m]
@@ -74,13 +74,13 @@ class Cavity(Shape):
 
 
 class Drogue(Shape):
-    """A cone about z that opens along +z, from inside, on a bottom of a sphere tangent to it.
+    """Cone about z that opens along +z, touched from inside, with a tangent sphere as bottom.
 
-    A sphere in it must be smaller than its bottom: it never touches the wall from the axis.
+    A sphere in it must be smaller than its bottom sphere, since it cannot touch the wall from the axis.
     """
 
-    half_angle: Float[Array, "..."]  # of the cone [rad]
-    bottom_radius: Float[Array, "..."]  # [m]
+    half_angle: Float[Array, "..."]  # half angle of the cone [rad]
+    bottom_radius: Float[Array, "..."]  # radius of the bottom sphere [m]
     bottom: Float[Array, "..."]  # z of the bottom sphere's centre [m]
 
     def surface(self, point):
@@ -97,12 +97,12 @@ class Drogue(Shape):
 
 
 class Shell(Drogue):
-    """A drogue that ends at its mouth: a thin shell, which is touched from outside as from inside.
+    """Drogue that ends at its mouth: a thin shell, which is touched from both sides.
 
-    A sphere that meets it needs a radius.
+    A sphere that touches it must have a radius greater than 0.
     """
 
-    mouth_radius: Float[Array, "..."]  # of the wall's edge [m]
+    mouth_radius: Float[Array, "..."]  # radius of the wall's edge [m]
 
     def surface(self, point):
         signed, inward = super().surface(point)
@@ -111,7 +111,7 @@ class Shell(Drogue):
         height = self.bottom + (self.mouth_radius * cosine - self.bottom_radius) / sine
         edge = Rim(self.mouth_radius, height, jnp.zeros_like(height)).surface(point)
         radius, _ = _radial(point)
-        # Where the foot on the wall would be: beyond the mouth the edge is nearest.
+        # If the nearest point of the extended wall is beyond the mouth, the edge is nearest.
         on_wall = radius * sine + (point.z - self.bottom) * cosine > 0
         beyond = on_wall & (radius + signed * cosine > self.mouth_radius)
         distance = jnp.where(beyond, edge.distance, side * signed)
@@ -123,11 +123,11 @@ class Shell(Drogue):
 
 
 class Rim(Shape):
-    """A ring about z, of round section: the rim of a drogue's mouth."""
+    """Ring about z with a round section: the rim of a drogue's mouth."""
 
-    ring_radius: Float[Array, "..."]  # of the section's centres [m]
-    height: Float[Array, "..."]  # z of them [m]
-    radius: Float[Array, "..."]  # of the section [m]
+    ring_radius: Float[Array, "..."]  # radius of the circle of section centres [m]
+    height: Float[Array, "..."]  # z of this circle [m]
+    radius: Float[Array, "..."]  # radius of the section [m]
 
     def surface(self, point):
         radius, outward = _radial(point)
@@ -144,10 +144,10 @@ class Rim(Shape):
 
 
 class Capsule(Shape):
-    """All that is nearer to a segment than a radius."""
+    """Set of points nearer to a segment than a radius."""
 
-    start: Vector  # of the segment [m]
-    end: Vector  # [m]
+    start: Vector  # start of the segment [m]
+    end: Vector  # end of the segment [m]
     radius: Float[Array, "..."]  # [m]
 
     def surface(self, point):
@@ -155,11 +155,11 @@ class Capsule(Shape):
         return Surface(norm(apart) - self.radius, direction(apart))
 
     def at(self, s: Float[Array, "..."]) -> Vector:
-        """The point at the fraction s of the segment."""
+        """Return the point at the fraction s of the segment."""
         return self.start + s * (self.end - self.start)
 
     def nearest(self, point: Vector) -> Float[Array, "..."]:
-        """The fraction of the segment that is nearest to a point."""
+        """Return the fraction of the segment that is nearest to a point."""
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)
@@ -170,21 +170,21 @@ class Capsule(Shape):
 
 
 class Box(Shape):
-    """A box with rounded edges; as a thin one, a face with a border."""
+    """Box with rounded edges; a thin box is a face with a border."""
 
     centre: Vector  # [m]
-    attitude: Quaternion  # from the box's axes
-    half_lengths: Vector  # of its edges, rounding included [m]
+    attitude: Quaternion  # from the box's axes to the frame's axes
+    half_lengths: Vector  # half lengths of its edges, rounding included [m]
     rounding: Float[Array, "..."]  # radius of the edges [m], positive
 
     def surface(self, point):
-        own = rotate_back(self.attitude, point - self.centre)
-        sign = Vector(*(jnp.where(part < 0, -1, 1).astype(part.dtype) for part in _parts(own)))
+        in_box = rotate_back(self.attitude, point - self.centre)
+        sign = Vector(*(jnp.where(part < 0, -1, 1).astype(part.dtype) for part in _parts(in_box)))
         core = [half - self.rounding for half in _parts(self.half_lengths)]
-        beyond = [s * part - half for s, part, half in zip(_parts(sign), _parts(own), core, strict=True)]
+        beyond = [s * part - half for s, part, half in zip(_parts(sign), _parts(in_box), core, strict=True)]
         outside = Vector(*(jnp.where(part > 0, part, 0) for part in beyond))
         apart = norm(outside)
-        # Deeper than the rounding, the nearest face counts.
+        # Inside the core box, the nearest face determines distance and normal.
         x, y, z = beyond
         first, second = (x >= y) & (x >= z), y >= z
         faces = first, ~first & second, ~first & ~second
@@ -201,15 +201,16 @@ class Box(Shape):
 
 
 def _parts(vector: Vector) -> tuple[Array, Array, Array]:
+    """Return the components of a vector."""
     return vector.x, vector.y, vector.z
 
 
 def _either(condition: Array, a: Vector, b: Vector) -> Vector:
-    """Of two vectors the first where the condition holds."""
+    """Return the first of two vectors where the condition holds, else the second."""
     return Vector(*(jnp.where(condition, u, v) for u, v in zip(_parts(a), _parts(b), strict=True)))
 
 
 def _radial(point: Vector) -> tuple[Array, Vector]:
-    """Distance from the z axis [m], and the direction away from it: 0 on the axis, and smooth."""
+    """Return the distance from the z axis [m] and the radial direction, which is 0 on the axis and smooth."""
     radius = jnp.sqrt(point.x**2 + point.y**2 + NEAR_AXIS**2)
     return radius, Vector(point.x / radius, point.y / radius, jnp.zeros_like(radius))

@@ -25,7 +25,7 @@ from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
 from jaxhil.sixdof.scenario import Scenario
 
-# What a status is on one axis; whatever is not here diverged.
+# Corresponding statuses on one axis; other statuses become "diverged".
 STATUSES = {
     MISS: one_axis.NOT_REACHED,
     REBOUNDED: one_axis.OK,
@@ -56,11 +56,11 @@ class SixAxes(RigModel):
         return jax.tree.map(np.asarray, building.build_scenarios(mechanism, draws, seed, first))
 
     def loop(self, mechanism: SixAxisMechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Return the loop that runs all the scenarios; the `parts` of one axis are ignored."""
+        """Return the loop that runs all the scenarios; the one-axis options `parts` are ignored."""
         return building.loop_of(mechanism, compensator, scenarios)
 
     def runs(self, mechanism: SixAxisMechanism) -> int:
-        """Return how many episodes a scenario has."""
+        """Return the number of episodes of a scenario."""
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
@@ -68,20 +68,20 @@ class SixAxes(RigModel):
         return outcome_of(evaluate(loop, gains, scenario).metrics, scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return scenarios of which the `idle` lanes end at once."""
+        """Return scenarios in which the `idle` lanes end at once."""
         duration: Any = np.where(idle, 0.0, scenarios.duration).astype(np.asarray(scenarios.duration).dtype)
         return scenarios._replace(duration=duration)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros: nothing is known before a run."""
+        """Return zeros, since durations are unknown before a run."""
         return np.zeros(np.shape(scenarios.duration))
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros: lanes are read one by one."""
+        """Return zeros, since delay lines are read lane by lane."""
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return the scenarios with a force sensor that has no noise."""
+        """Return the scenarios with a noise-free force sensor."""
         sensor = scenarios.sensor
         return scenarios._replace(sensor=sensor._replace(noise_std=np.zeros_like(sensor.noise_std)))
 
@@ -98,15 +98,18 @@ SIX_AXES = SixAxes()
 
 
 def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
-    """Return the metrics of episodes as an outcome; its peaks are of the real force, its chatter is 0."""
-    # A draw that goes past the target, or never comes, has no contact to judge.
+    """Return the metrics of episodes as an outcome.
+
+    Its peak command is the peak of the real force, and its chatter is 0.
+    """
+    # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)
     wanted = (found.status != MISS) & begins[None]
-    known = jnp.isfinite(found.energy_error) & jnp.isfinite(found.twist_error)
+    is_finite = jnp.isfinite(found.energy_error) & jnp.isfinite(found.twist_error)
     status = jnp.full_like(found.status, one_axis.DIVERGED)
-    for own, meant in STATUSES.items():
-        status = jnp.where(found.status == own, meant, status)
-    status = jnp.where(wanted, jnp.where((status == one_axis.OK) & ~known, one_axis.NON_FINITE, status),
+    for code, one_axis_code in STATUSES.items():
+        status = jnp.where(found.status == code, one_axis_code, status)
+    status = jnp.where(wanted, jnp.where((status == one_axis.OK) & ~is_finite, one_axis.NON_FINITE, status),
                        one_axis.NOT_REACHED)  # fmt: skip
     zero = jnp.zeros_like(found.energy_error)
     metrics = one_axis.Metrics(

@@ -1,9 +1,9 @@
-"""Contact in space, without a rig: continuous and undelayed, which is what a rig is judged against.
+"""Ideal contact without a rig: continuous and undelayed, the reference for the evaluation of a rig.
 
-The two bodies are followed by Dormand and Prince's pair of order 5(4), in steps whose error is held small: a
-step in which something begins or ceases to touch is made again, down to 1 us: derivatives by what moves that
-time are then right, too. Each lane has its own steps. Within a step each stage sees what the laws remember
-from the step's start: laws with a memory are of first order, and have shorter steps.
+The two bodies are integrated with the Dormand-Prince pair of order 5(4) and error control. A step in which a
+touch begins or ends is repeated down to 1 us, so that derivatives through the time of this event are accurate
+too. Each lane has its own steps. Within a step each stage uses the laws' state at the step's start: laws with
+memory are therefore of first order and have shorter steps.
 """
 
 from typing import Any, NamedTuple
@@ -30,60 +30,60 @@ from jaxhil.sixdof.relative import (
 from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
-TOLERANCE = 1e-10  # of a step's error, per the relative speed
-SHORTEST = 1e-9  # s: a step that is accepted whatever its error
-EVENT = 1e-6  # s: within which the time is found at which something begins or ceases to touch, or is caught
-REMEMBERING = 1e-4  # s: longest step of laws with a memory
-MOST_STEPS = 200_000  # of a motion, unless its steps are long
-SMALLEST, LARGEST = 0.1, 4.0  # change of the length from one step to the next
+TOLERANCE = 1e-10  # of a step's error, relative to the relative speed
+SHORTEST = 1e-9  # s; a step as short as this is accepted whatever its error
+EVENT = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
+REMEMBERING = 1e-4  # s; longest step of laws with memory
+MOST_STEPS = 200_000  # limit on the steps of a motion, unless they are long
+SMALLEST, LARGEST = 0.1, 4.0  # limits of the change of the step length
 
 
 class Space(NamedTuple):
-    """What stays constant."""
+    """Constants of an ideal contact."""
 
     bodies: Pair
-    groups: tuple[ContactGroup, ...]  # the contact
+    groups: tuple[ContactGroup, ...]  # candidates of the contact
     latches: tuple[Latch, ...]
 
 
 class Memories(NamedTuple):
-    """What a contact remembers."""
+    """State of the contact's laws and latches."""
 
     laws: tuple[Memory, ...]
-    held: tuple[Held, ...]  # by the latches
+    held: tuple[Held, ...]  # states of the latches
 
 
 class Instant(NamedTuple):
-    """Two bodies in contact, at a time."""
+    """Two bodies in contact at an instant."""
 
-    states: States  # of the bodies
+    states: States  # states of the bodies
     pose: Pose
     twist: Twist
     wrench: Wrench  # on the chaser, about T's origin
-    forces: tuple[Forces, ...]  # of the candidates
+    forces: tuple[Forces, ...]  # forces of the candidates
 
 
 class Flight(NamedTuple):
-    """A motion on its way."""
+    """State of a motion's integration."""
 
-    time: Float[Array, "*batch"]  # since its start [s]
-    length: Float[Array, "*batch"]  # of the next step [s]
-    touching: tuple[Bool[Array, "candidates *batch"], ...]  # now, of each group
+    time: Float[Array, "*batch"]  # time since its start [s]
+    length: Float[Array, "*batch"]  # length of the next step [s]
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch now
     memories: Memories
-    states: States  # of the bodies
-    tries: Int[Array, "*batch"]  # of steps so far
+    states: States  # states of the bodies
+    tries: Int[Array, "*batch"]  # number of tried steps so far
 
 
 class Step(NamedTuple):
-    """A step that was tried."""
+    """Tried step."""
 
-    now: Instant  # at its end
+    now: Instant  # bodies at its end
     memories: Memories
     accepted: Bool[Array, "*batch"]
 
 
 def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -> Flight:
-    """A motion at its start; its first step is `length` [s]."""
+    """Return a motion at its start; its first step has a `length` [s]."""
     memories = Memories(tuple(group.init() for group in space.groups), ())
     if space.latches:
         pose, _ = relative(space.bodies, states)
@@ -95,38 +95,40 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
 def instant(
     space: Space, states: States, memories: Memories, duration: Float[Array, "*batch"]
 ) -> tuple[Instant, Memories]:
-    """What happens at the states, `duration` [s] after the laws were evaluated last."""
+    """Return the forces for the states, `duration` [s] after the laws' last evaluation."""
     pose, twist = relative(space.bodies, states)
     wrench, forces, laws = contact_wrench(space.groups, memories.laws, pose, twist, duration)
-    held = []
+    latched = []
     for latch, before in zip(space.latches, memories.held, strict=True):
         pull, now = latch_wrench(latch, before, pose, twist)
         wrench = jax.tree.map(jnp.add, wrench, pull)
-        held.append(now)
-    return Instant(states, pose, twist, wrench, forces), Memories(laws, tuple(held))
+        latched.append(now)
+    return Instant(states, pose, twist, wrench, forces), Memories(laws, tuple(latched))
 
 
 def advance_flight(
     space: Space, flight: Flight, longest: Float[Array, "*batch"], speed: Float[Array, "*batch"]
 ) -> tuple[Flight, Step]:
-    """One try of a step no longer than `longest` [s], at a relative speed [m/s] that scales its error: the
-    motion at its end or, where it was not accepted, at its start, with a shorter step ahead. What is not a
-    number, or takes too many steps, has no more to come: its time is infinite."""
+    """Try a step no longer than `longest` [s]; the relative speed [m/s] scales its error.
+
+    Return the motion at its end or, if the step was rejected, at its start with a shorter next step. If a
+    number is not finite or there are too many steps, the motion's time becomes infinite.
+    """
     if _remembers(space):
         longest = jnp.minimum(longest, REMEMBERING)
     length = lax.stop_gradient(jnp.minimum(flight.length, longest))
     now, memories, error = _try(space, flight, length, speed)
     touching = tuple(forces.touch.depth > 0 for forces in now.forces)
-    before = (*flight.touching, *(held.caught for held in flight.memories.held))
+    before = (*flight.touching, *(latch.caught for latch in flight.memories.held))
     happens = jnp.zeros(length.shape, bool)
-    for old, new in zip(before, (*touching, *(held.caught for held in memories.held)), strict=True):
+    for old, new in zip(before, (*touching, *(latch.caught for latch in memories.held)), strict=True):
         happens = happens | jnp.any(old != new, axis=0)
     late = happens & (length > EVENT)
     accepted = ((error <= 1) | (length <= SHORTEST)) & ~late
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
     change = jnp.clip(0.9 * safe**-0.2, SMALLEST, jnp.where(accepted, LARGEST, 0.9))
     proposed = length * change
-    # A step cut short by its limit says little of the next.
+    # A step shortened by its limit does not determine the next length.
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
@@ -134,7 +136,7 @@ def advance_flight(
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
     moved = Flight(time, ahead, touching, memories, now.states, tries)
     after: Flight = choose(accepted, moved, flight._replace(length=ahead, tries=tries))
-    # So many steps of less than a thousandth of the longest, on the mean, have no end in sight.
+    # The integration stops after many steps with a mean below a thousandth of the longest step.
     endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
     time = jnp.where(endless, jnp.inf, after.time)
     return after._replace(time=time), Step(now, memories, accepted | endless)
@@ -143,7 +145,7 @@ def advance_flight(
 def _try(
     space: Space, flight: Flight, length: Float[Array, "*batch"], speed: Array
 ) -> tuple[Instant, Memories, Array]:
-    """Return what is at the end of a step of `length` [s], and its error over what is allowed."""
+    """Return the end of a step of `length` [s], and its error relative to the tolerance."""
 
     def slope(offset, states):
         now, memories = instant(space, states, flight.memories, offset)
@@ -151,12 +153,12 @@ def _try(
 
     step = take_rolled_step(slope, flight.states, length)
     now, memories = step.found
-    level: Any = States(*(one._replace(attitude=normalise(one.attitude)) for one in step.end))
+    level: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
     return now._replace(states=level), memories, _size(space, step.error, speed) / TOLERANCE
 
 
 def slope_at(space: Space, now: Instant) -> States:
-    """Rates of the states."""
+    """Return the time derivatives of the states."""
     states = now.states
     target, chaser = loads(now.wrench, interface_frame(space.bodies.target, states.target), states)
     return States(
@@ -171,8 +173,10 @@ def follow(
     periods: int,
     longest: Float[Array, "*batch"],
 ) -> tuple[Flight, Instant]:
-    """The motion after so many periods [s], and each period's start, (periods, ...); steps are no longer than
-    `longest` [s]."""
+    """Return the motion after so many periods [s], and each period's start, (periods, ...).
+
+    Steps are no longer than `longest` [s].
+    """
     speed = scale(space, states)
 
     def body(flight, _):
@@ -185,7 +189,7 @@ def follow(
 
 
 def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array) -> Flight:
-    """The motion at a time [s] since its start."""
+    """Return the motion at the time `until` [s] since its start."""
 
     def body(flight):
         left = until - flight.time
@@ -199,8 +203,11 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
 
 
 def scale(space: Space, states: States) -> Float[Array, "*batch"]:
-    """A speed [m/s] to hold errors against: that of the centres of mass against each other, and that of a
-    point 1 m off. It is the same wherever the interface frames are."""
+    """Return a speed [m/s] to which errors are related, which does not depend on the interface frames.
+
+    It is the relative speed of the centres of mass plus that of a point at a distance of 1 m due to the
+    relative rotation.
+    """
     target, chaser = (
         rotate(state.attitude, angular_velocity(body, state))
         for body, state in zip(space.bodies, states, strict=True)
@@ -210,7 +217,7 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
 
 
 def choose(condition: Array, one: Any, other: Any) -> Any:
-    """Lane by lane, one or the other; lanes are the last axes."""
+    """Select lane by lane; lanes are the last axes."""
 
     def either(a: Array, b: Array) -> Array:
         return lax.select(jnp.broadcast_to(condition, a.shape), a, b)
@@ -219,28 +226,32 @@ def choose(condition: Array, one: Any, other: Any) -> Any:
 
 
 def _nothing(until: Array) -> Array:
-    """What is left of a time for rounding [s]."""
+    """Return the rest of a time [s] that counts as rounding."""
     return 1e-14 + 1e-13 * until
 
 
 def _remembers(space: Space) -> bool:
+    """Return whether a law has memory."""
     memories = jax.eval_shape(lambda: [group.init() for group in space.groups])
     return bool(jax.tree.leaves(memories))
 
 
 def _size(space: Space, error: States, speed: Array) -> Array:
-    """Of an error, relative: velocities against the speed, positions against its way in 0.1 s."""
+    """Return the relative size of an error.
+
+    Velocities are related to the speed, positions to its distance in 0.1 s.
+    """
     largest = jnp.zeros_like(speed)
-    for body, one in zip(space.bodies, error, strict=True):
-        turning = norm(body.inverse_inertia @ one.spin)
-        tilt = 2 * norm(one.attitude.v)
-        for part in (norm(one.velocity), turning, 10 * norm(one.position), 10 * tilt):
+    for body, state in zip(space.bodies, error, strict=True):
+        turning = norm(body.inverse_inertia @ state.spin)
+        tilt = 2 * norm(state.attitude.v)
+        for part in (norm(state.velocity), turning, 10 * norm(state.position), 10 * tilt):
             largest = jnp.maximum(largest, part / speed)
     return lax.stop_gradient(largest)
 
 
 def _slope(body: Body, state: State, load: Load) -> State:
-    """Rates of a state."""
+    """Return the time derivative of a state."""
     angular = angular_velocity(body, state)
     turning = compose(state.attitude, Quaternion(0 * state.attitude.w, 0.5 * angular))
     return State(state.velocity, (1 / body.mass) * load.force, turning, load.torque)

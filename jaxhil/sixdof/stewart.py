@@ -1,7 +1,7 @@
-"""The hexapod of Stewart and Gough: a platform on six legs, each of them an axis.
+"""Stewart-Gough hexapod: a platform on six legs, each of them an axis.
 
-A leg's length is that of the line from its joint on the base to its joint on the platform. The pose that has
-given lengths is found by Newton's method, from a pose that is near.
+A leg's length is the distance from its joint on the base to its joint on the platform. Newton's method finds
+the pose for given lengths from a pose nearby.
 """
 
 import jax
@@ -15,16 +15,16 @@ from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.rotations import exponential, left_jacobian, rotate
 from jaxhil.sixdof.vectors import Vector, cross, direction, norm, vector
 
-NEWTON_STEPS = 3  # squared each: from 1e-3 to rounding
+NEWTON_STEPS = 3  # quadratic convergence from an error of 1e-3 to rounding
 
 
 class Stewart(Kinematics):
-    """A platform that carries C, on a base that carries T."""
+    """Platform that carries C, on a base that carries T."""
 
-    base: Vector  # joints on the base, (6, *batch) each, in T axes [m]
-    platform: Vector  # joints on the platform, (6, *batch) each, in C axes [m]
-    height: Vector  # of the platform's origin over the base's where C is T [m]
-    stroke: Float[Array, "2 *batch"] | None = None  # shortest and longest leg [m]; None for any
+    base: Vector  # joints on the base, components (6, *batch), in T axes [m]
+    platform: Vector  # joints on the platform, components (6, *batch), in C axes [m]
+    height: Vector  # position of the platform's origin relative to the base's if C is at T [m]
+    stroke: Float[Array, "2 *batch"] | None = None  # shortest and longest leg [m]; None for no limit
 
     @property
     def is_linear(self):
@@ -46,7 +46,7 @@ class Stewart(Kinematics):
 
         lengths, near = lax.stop_gradient((motion.position, near))
         at = lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, at: newton(at, lengths), near)
-        # The last step alone is differentiated: derivatives of the pose, not of the way to it.
+        # Only the last step is differentiated, which gives the derivatives of the pose.
         at = newton(at, motion.position)
         slopes = jacobian(self, at)
         rate = solve(slopes, motion.rate[:, None])[:, 0]
@@ -61,8 +61,11 @@ class Stewart(Kinematics):
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
-    """How fast each leg (row) grows with each coordinate [m, rad] at coordinates: with p as its direction u,
-    with theta as Jl(theta)^T (R b x u), b the joint on the platform."""
+    """Return the derivative of each leg (row) with respect to each coordinate [m, rad].
+
+    It is u for p, where u is the leg's direction, and Jl(theta)^T (R b x u) for theta, where b is the joint
+    on the platform.
+    """
     leg, arm, theta = _legs(hexapod, at)
     along = direction(leg)
     turning = left_jacobian(-theta, cross(arm, along))
@@ -70,12 +73,15 @@ def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 
 
 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-    """Condition number of the legs' Jacobian, lengths in m: large where a pose is hardly held."""
+    """Return the condition number of the legs' Jacobian, lengths in m: large near singular poses."""
     return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
 
 
 def _legs(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> tuple[Vector, Vector, Vector]:
-    """The legs and the joints from the platform's origin, (6, *batch) each, in T axes [m]; theta [rad]."""
+    """Return the legs, the joints from the platform's origin, and theta [rad].
+
+    Legs and joints are vectors of components (6, *batch), in T axes [m].
+    """
     position, theta = (vector(part[:, None]) for part in (at[:3], at[3:]))
     height = jax.tree.map(lambda part: part[None], hexapod.height)
     arm = rotate(exponential(theta), hexapod.platform)

@@ -1,4 +1,4 @@
-"""Numbers of a mechanism file of six axes that can hardly be meant: most are in another unit than asked."""
+"""Warnings about implausible numbers of a six-axis mechanism file, most of which have a wrong unit."""
 
 from collections.abc import Iterator
 
@@ -7,21 +7,22 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rules import inertia_matrix
 
-LARGEST_VELOCITY = 1.0  # m/s, of an approach
-LARGEST_ANGLE = 0.3  # rad, of a docking: that of C against T at the first touch
-LARGEST_RATE = 0.1  # rad/s, of the chaser against the target
-GRAVITY = 10.0  # m/s^2, on the ground
-LONGEST_TOOL = 2.0  # m, from C to the tool's centre of mass
-FAR = 20.0  # of the radius of gyration, from a centre of mass to the interface
-WIDE = 10.0  # of the interface's distance, or of 1 m: a radius of gyration
+LARGEST_VELOCITY = 1.0  # m/s; greatest approach velocity
+LARGEST_ANGLE = 0.3  # rad; greatest angle of C against T at the first touch
+LARGEST_RATE = 0.1  # rad/s; greatest angular velocity of the chaser against the target
+GRAVITY = 10.0  # m/s^2; greatest gravity on the ground
+LONGEST_TOOL = 2.0  # m; greatest distance from C to the tool's centre of mass
+FAR = 20.0  # greatest distance of the interface from the centre of mass, over the radius of gyration
+WIDE = 10.0  # greatest radius of gyration, over the interface's distance or 1 m
 
 
 def unit_warnings(mechanism: SixAxisMechanism) -> tuple[str, ...]:
-    """What is far from any docking mechanism: key, what was found, what is expected, with the unit."""
-    return tuple(_found(mechanism))
+    """Return warnings about implausible numbers: key, found value, expected value, with the unit."""
+    return tuple(_warnings(mechanism))
 
 
-def _found(mechanism: SixAxisMechanism) -> Iterator[str]:
+def _warnings(mechanism: SixAxisMechanism) -> Iterator[str]:
+    """Yield the warnings."""
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         moment = float(np.linalg.eigvalsh(inertia_matrix(body.inertia))[-1])
         radius, distance = (moment / body.mass) ** 0.5, float(np.linalg.norm(body.interface))

@@ -1,6 +1,7 @@
-"""The numbers of a mechanism of six axes by dotted path, drawn or nominal, one per lane.
+"""Numbers of a six-axis mechanism by dotted path, drawn or nominal, one per lane.
 
-What is worked out of them is NumPy's, as long as nothing drawn is jax's; what is put together is jax's.
+Computed numbers are NumPy arrays unless draws are JAX arrays; vectors, matrices and rotations consist of JAX
+arrays.
 """
 
 from collections.abc import Mapping
@@ -17,16 +18,16 @@ from jaxhil.sixdof.vectors import Matrix, Vector
 
 
 class Values:
-    """Arrays of shape (*entries, number): NumPy's, or jax's where what is drawn is."""
+    """Arrays of shape (*entries, number): of NumPy, or of JAX if draws are."""
 
     def __init__(self, mechanism: SixAxisMechanism, draws: Mapping[str, Any]) -> None:
-        # The namespace of the arrays.
+        # Namespace of the arrays: JAX or NumPy.
         self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
         self.number = len(next(iter(draws.values()))) if draws else 1
         self._mechanism, self._draws = mechanism, draws
 
     def __call__(self, path: str, default: Any = None) -> Any:
-        """What was drawn, else the nominal value or, where the file has none, the `default`."""
+        """Return the drawn value, else the nominal one or, without one in the file, the `default`."""
         value = self._draws.get(path)
         if value is None:
             nominal = value_at(self._mechanism, path)
@@ -35,47 +36,47 @@ class Values:
         return self.np.moveaxis(self.np.asarray(value, float), 0, -1)
 
     def has(self, path: str) -> bool:
-        """Whether the file says it."""
+        """Return whether the file has a value."""
         return value_at(self._mechanism, path) is not None
 
     def drawn(self, path: str) -> bool:
-        """Whether lanes have values of their own."""
+        """Return whether the value is drawn."""
         return path in self._draws
 
     def nothing(self, path: str) -> bool:
-        """Whether it is 0 in every lane."""
+        """Return whether the value is 0 in every lane."""
         return not self.drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
 
     def constant(self, value: float) -> Any:
-        """The same number in every lane."""
+        """Return the same number in every lane."""
         return np.full(self.number, value)
 
     def inertia(self, path: str, default: Any = None) -> Any:
-        """Three moments, or three rows, as (3, 3, number)."""
-        given = self(path, default)
-        return given if given.ndim == 3 else np.eye(3)[:, :, None] * given[None]
+        """Return three moments, or three rows, as (3, 3, number)."""
+        value = self(path, default)
+        return value if value.ndim == 3 else np.eye(3)[:, :, None] * value[None]
 
     def rotation(self, theta: Any) -> Quaternion:
-        """Of rotation vectors (3, number)."""
+        """Return the rotation for rotation vectors (3, number)."""
         if self.np is jnp:
             return exponential(self.vector(theta))
         half = np.sqrt((theta**2).sum(axis=0)) / 2
         return Quaternion(jnp.asarray(np.cos(half)), self.vector(np.sinc(half / np.pi) / 2 * theta))
 
     def vector(self, given: Any) -> Vector:
-        """Of components (3, number)."""
+        """Return a vector of components (3, number)."""
         return Vector(*(jnp.asarray(part) for part in given))
 
     def matrix(self, given: Any) -> Matrix:
-        """Of rows (3, 3, number)."""
+        """Return a matrix of rows (3, 3, number)."""
         return Matrix(*(self.vector(row) for row in given))
 
     def turned(self, angle: Any, place: Any) -> Any:
-        """(3, number), turned about z by an angle [rad]."""
+        """Return points (3, number), rotated about z by an angle [rad]."""
         cosine, sine = self.np.cos(angle), self.np.sin(angle)
         x, y, z = place
         return self.np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
 
     def direction(self, given: Any) -> Vector:
-        """Unit vector along (3, number)."""
+        """Return the unit vector along (3, number)."""
         return self.vector(given / self.np.sqrt((given**2).sum(axis=0)))

@@ -1,6 +1,6 @@
-"""Vectors and matrices in space, component by component.
+"""Vectors and matrices in three dimensions, component by component.
 
-Each component is an array of the batch shape: an axis of three would be taken apart and put together again at
+Each component is an array of the batch shape; an axis for the components would have to be split and joined at
 every tick.
 """
 
@@ -14,52 +14,60 @@ from jaxtyping import Array, Float
 
 
 class Vector(eqx.Module):
-    """Three components; `number * vector`, sums, differences."""
+    """Three components, with sums, differences and `number * vector`."""
 
     x: Float[Array, "..."]
     y: Float[Array, "..."]
     z: Float[Array, "..."]
 
-    # NumPy's numbers leave `number * vector` to this class.
+    # This lets NumPy's numbers use `__rmul__` of this class for `number * vector`.
     __array_ufunc__ = None
 
     def __add__(self, other: "Vector") -> "Vector":
+        """Return the sum."""
         return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
 
     def __sub__(self, other: "Vector") -> "Vector":
+        """Return the difference."""
         return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __neg__(self) -> "Vector":
+        """Return the negative vector."""
         return Vector(-self.x, -self.y, -self.z)
 
     def __rmul__(self, number: Array | float | int) -> "Vector":
+        """Return the product with a number."""
         return Vector(number * self.x, number * self.y, number * self.z)
 
 
 class Matrix(eqx.Module):
-    """Three rows; `matrix @ vector`."""
+    """Three rows, with `matrix @ vector`."""
 
     x: Vector
     y: Vector
     z: Vector
 
     def __matmul__(self, vector: Vector) -> Vector:
+        """Return the product with a vector."""
         return Vector(dot(self.x, vector), dot(self.y, vector), dot(self.z, vector))
 
 
 def vector(components: Float[Array, "3 *batch"]) -> Vector:
-    """The components along the leading axis as a vector."""
+    """Return the components along the leading axis as a vector."""
     return Vector(components[0], components[1], components[2])
 
 
 def components(vector: Vector) -> Float[Array, "3 *batch"]:
-    """The components of a vector along a leading axis."""
+    """Return the components of a vector along a leading axis."""
     return jnp.stack([vector.x, vector.y, vector.z])
 
 
 def assembled(parts: Any) -> Float[Array, "components *batch"]:
-    """The leaves of `parts` along a leading axis, written one after the other: a stack of them the compiler
-    would work out number by number, together with what they come from."""
+    """Return the leaves of `parts` along a leading axis.
+
+    They are written one after the other, since the compiler would compute a stack number by number, together
+    with its inputs.
+    """
     leaves = jax.tree.leaves(parts)
     whole = jnp.zeros((len(leaves), *leaves[0].shape), leaves[0].dtype)
     for index, leaf in enumerate(leaves):
@@ -68,41 +76,41 @@ def assembled(parts: Any) -> Float[Array, "components *batch"]:
 
 
 def matrix(entries: Float[Array, "3 3 *batch"]) -> Matrix:
-    """The entries along the two leading axes, rows first, as a matrix."""
+    """Return the entries along the two leading axes, rows first, as a matrix."""
     return Matrix(vector(entries[0]), vector(entries[1]), vector(entries[2]))
 
 
 def dot(a: Vector, b: Vector) -> Float[Array, "..."]:
-    """Scalar product."""
+    """Return the scalar product."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Vector product a x b."""
+    """Return the vector product a x b."""
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
 def norm(a: Vector) -> Float[Array, "..."]:
-    """Length; its derivative at 0 is 0."""
+    """Return the length; its derivative at 0 is 0."""
     return root(dot(a, a))
 
 
 def direction(a: Vector) -> Vector:
-    """Unit vector along a; 0 where a is 0."""
+    """Return the unit vector along a; 0 if a is 0."""
     length = norm(a)
     return (1 / jnp.where(length > 0, length, 1)) * a
 
 
 def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root of a number that is not negative; its derivative at 0 is 0."""
+    """Return the square root of a number >= 0; its derivative at 0 is 0."""
     positive = square > 0
-    # Not sqrt of 0 in a branch that is not taken: its derivative would be 0 times infinity.
+    # The branch that is not selected must not be sqrt(0): its derivative would be 0 times infinity.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
 
 
 @jax.jit
 def inverse(a: Matrix) -> Matrix:
-    """Inverse of a regular matrix, by its cofactors."""
+    """Return the inverse of a regular matrix, by its cofactors."""
     columns = cross(a.y, a.z), cross(a.z, a.x), cross(a.x, a.y)
     share = 1 / dot(a.x, columns[0])
     i, j, k = (share * column for column in columns)
