@@ -1,8 +1,8 @@
-"""Gain files: what tuning writes and what every later command and the rig read (`schema = "jaxhil/gains/1"`).
+"""Writing of gain files (`schema = "jaxhil/gains/1"`), which later commands and the rig read.
 
-A gain file holds a compensator's gains with units and bounds, the whole mechanism that they were tuned for,
-what they were tuned over and what they reach. `build_document` makes one, `write_gain_file` signs and writes
-it; `load_gain_file`, of `jaxhil.simulation.gain_file`, reads it back.
+A gain file holds a compensator's gains with units and bounds, the mechanism that they were tuned for, the
+range of the scenarios and the metrics reached. `build_document` builds its content, `write_gain_file` writes
+it with a checksum, and `jaxhil.simulation.gain_file.load_gain_file` reads it.
 """
 
 import json
@@ -42,11 +42,11 @@ def build_document(
     seed: int,
     timings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of a gain file, signed: plain data that JSON can express, what is not finite as null.
+    """Return the content of a gain file with its checksum, as JSON data with null for non-finite numbers.
 
-    Units and bounds come from the registry of compensators; a gain that rounding put beyond a bound is put
-    on it. Raises `InputError` for an unknown compensator, gains that are not its own, a gain that is not
-    finite or not within its bounds.
+    Units and bounds come from the registry of compensators. A gain that exceeds a bound by rounding is set to
+    the bound. Raise `InputError` for an unknown compensator, gains of another compensator, or a gain that is
+    not finite or not within its bounds.
     """
     source = "gains"
     law = look_up(compensator, source).gains
@@ -70,9 +70,9 @@ def build_document(
 
 
 def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -> None:
-    """Sign the document and write it: the file is there as a whole or, after an error, as it was.
+    """Write the document with its checksum; after an error an existing file is unchanged.
 
-    Raises `InputError` when the file cannot be written, ValueError or TypeError for what JSON cannot express.
+    Raise `InputError` if the file cannot be written, ValueError or TypeError for values that JSON lacks.
     """
     target = Path(path)
     signed = {**document, "sha256": digest(document)}
@@ -82,12 +82,12 @@ def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -
 
 
 def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, dict[str, Any]]:
-    """What a batch of scenarios spans, as {"low", "high", "unit"} of each of four quantities.
+    """Return the range {"low", "high", "unit"} of four quantities over a batch of scenarios.
 
-    contact_frequency sqrt(k/M)/(2 pi) [Hz], delay of force sensor and motion simulator together [s],
-    approach_velocity of the first contact [m/s], force v sqrt(k M) [N]. k is the stiffness of the linear
-    contact with the same peak force, entered undamped at the same speed v: k = (F_peak/v)^2/M, with F_peak
-    from the energy M v^2/2 = integral of F. Scenario arrays are NumPy's, batch of one axis.
+    The quantities are contact_frequency sqrt(k/M)/(2 pi) [Hz], delay of force sensor plus motion simulator
+    [s], approach_velocity of the first contact [m/s], and force v sqrt(k M) [N]. k is the stiffness of the
+    undamped linear contact with the same peak force at the same approach speed v: k = (F_peak/v)^2/M, with
+    F_peak from the energy M v^2/2 = integral of F. `scenarios` holds NumPy arrays with one batch axis.
     """
     peak = _peak_forces(mechanism, scenarios)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
@@ -105,24 +105,27 @@ def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, di
 
 
 def envelope_in_space(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]:
-    """What a batch of scenarios of six axes spans, likewise: contact frequency 1/(2 duration) [Hz] and
-    approach velocity [m/s] at the first touches, delay of force sensor and axes together [s], peak force in
-    space [N]; of the contacts of an outcome that ended."""
+    """Return the range {"low", "high", "unit"} of four quantities over a batch of six-axis scenarios.
+
+    The quantities are the contact frequency 1/(2 duration) [Hz] and approach velocity [m/s] at the first
+    touches, the delay of force sensor plus axes [s], and the peak force of the ideal contact [N]. Only the
+    contacts of `outcome` that ended count.
+    """
     ended = outcome.good
-    known = {
+    quantities = {
         "contact_frequency": (1 / (2 * np.maximum(outcome.metrics.duration, 1e-9)), "Hz"),
         "approach_velocity": (outcome.metrics.approach_velocity, "m/s"),
         "force": (outcome.reference_peak_force, "N"),
     }
     delay = np.asarray(scenarios.sensor.delay) + np.asarray(scenarios.simulator.delay)
-    spans = {name: _span(values[ended], unit) for name, (values, unit) in known.items() if np.any(ended)}
+    spans = {name: _span(values[ended], unit) for name, (values, unit) in quantities.items() if np.any(ended)}
     return {**spans, "delay": _span(delay, "s")}
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can express it: mappings, lists, numbers; null for what is not finite.
+    """Convert `value` to JSON data: mappings, lists and numbers, with null for non-finite numbers.
 
-    Takes arrays and scalars of NumPy and jax and named tuples too; raises TypeError for anything else.
+    Accept NumPy and JAX arrays and scalars, and named tuples; raise TypeError for any other type.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}

@@ -1,1 +1,1 @@
-"""Gains: what tuning minimises, how it searches, and how the result is judged."""
+"""Tuning of gains: objective, search and evaluation of the result."""

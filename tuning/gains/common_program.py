@@ -1,7 +1,8 @@
-"""One compiled program for unlike mechanisms: contact law, segments and number of contacts become numbers.
+"""Common compiled program of mechanisms with different contact laws, segments and numbers of contacts.
 
-What shapes the program is then common to all, and optional parts of the loop that one of the mechanisms has
-are inert where a lane's numbers say so. A second surface, which costs every lane time, stays apart.
+These properties become array values of each lane. An optional part of the loop that any of the mechanisms
+has is in the program; the values of the other mechanisms make it inert. Mechanisms with a second surface,
+which costs time in every lane, have a program of their own.
 """
 
 import dataclasses
@@ -37,28 +38,28 @@ _APART = ("integrator", "hold", "latency", "is_two_sided")
 
 @dataclass(frozen=True)
 class CommonProgram:
-    """What mechanisms that share a program have in common."""
+    """Static properties of a compiled program that several mechanisms share."""
 
-    laws: tuple[str, ...]  # contact laws by name
-    segments: int  # of a contact law, at most
+    laws: tuple[str, ...]  # names of the contact laws
+    segments: int  # largest number of segments of a contact law
     slots: int  # result slots
-    parts: tuple[str, ...]  # names of the optional parts of the loop that some mechanism has
-    first_break: int  # the first derivative that breaks at a tick
+    parts: tuple[str, ...]  # names of the optional parts of the loop that any of the mechanisms has
+    first_break: int  # order of the lowest derivative that is discontinuous at a tick
     ring: int  # samples in the delay lines
-    cells: CellCounts  # of a sampling interval
-    beforehand: bool  # whether integrated references are computed beforehand, as every first contact's can be
+    cells: CellCounts  # numbers of cells of a sampling interval
+    beforehand: bool  # whether integrated ideal contacts are computed before the simulation
 
     def law(self, beforehand: bool | None = None) -> AnyOf:
-        """The laws' mixture; with references that are integrated, unless they come `beforehand`."""
+        """Return the mixture of the laws, which integrates ideal contacts unless they come `beforehand`."""
         return AnyOf(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
-        """Laws of two names may be of one kind."""
+        """Return the different simulated laws; two names may share one."""
         return tuple(dict.fromkeys(contact_law(name).simulated for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
-        """The loop of one mechanism, as this program takes it."""
+        """Return the loop of one mechanism in the form that this program takes."""
         parts = {name: name in self.parts for name in _PARTS}
         return dataclasses.replace(
             loop,
@@ -70,7 +71,7 @@ class CommonProgram:
         )
 
     def scenarios(self, mechanism: Mechanism, batch: Scenario) -> Scenario:
-        """The scenarios of one mechanism, as this program takes them."""
+        """Return the scenarios of one mechanism in the form that this program takes."""
         slots, number = batch.phase.shape
         chosen = np.minimum(np.arange(self.slots), slots - 1)
 
@@ -82,7 +83,7 @@ class CommonProgram:
         if stiffness.ndim == 2:
             stiffness = stiffness[:, None]
         missing = self.segments - stiffness.shape[1]
-        # Beyond the last depth the last slope goes on.
+        # The added segments repeat the last slope, so that the contact model is unchanged.
         stiffness = np.concatenate([stiffness, np.repeat(stiffness[:, -1:], missing, axis=1)], axis=1)
         deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
@@ -97,13 +98,13 @@ class CommonProgram:
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
-        """The first contact of every scenario in space, in every slot."""
+        """Return the ideal first contact of every scenario, repeated in every slot."""
         contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
-        found = jax.device_get(_reference(law, contact, batch.equivalent_mass, batch.velocity))
-        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), found)
+        reference = jax.device_get(_reference(law, contact, batch.equivalent_mass, batch.velocity))
+        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), reference)
 
 
-UNREACHED = 1.0  # m: no mechanism is that deep
+UNREACHED = 1.0  # m; larger than the penetration of any mechanism
 
 
 @partial(jax.jit, static_argnums=0)
@@ -112,9 +113,9 @@ def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocit
 
 
 def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
-    """Indices of the mechanisms that share a program, and the program; in the order in which they come."""
-    # Every uncertain number at either end: what a draw may bring into the loop is seen.
-    batches = [build_scenarios(one, extremes(one)) for one in mechanisms]
+    """Return the indices of the mechanisms that share a program, and the program, in order of first index."""
+    # Scenarios with every uncertain number at either end show each part of the loop that a draw may need.
+    batches = [build_scenarios(mechanism, extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, batches, strict=True)):
@@ -130,14 +131,14 @@ def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
 
 
 def _later(mechanism: Mechanism) -> bool:
-    """Whether there are contacts whose reference has to be integrated at a speed not known beforehand."""
+    """Return whether ideal contacts must be integrated at speeds that only the simulation yields."""
     return mechanism.approach.contacts > 1 and not contact_law(mechanism.contact.law).closed_form
 
 
 def _common(mechanisms, group, loops, batches) -> CommonProgram:
     segments = [b.contact.stiffness.shape[1] if b.contact.stiffness.ndim == 3 else 1 for b in batches]
     return CommonProgram(
-        laws=tuple(dict.fromkeys(one.contact.law for one in mechanisms)),
+        laws=tuple(dict.fromkeys(mechanism.contact.law for mechanism in mechanisms)),
         segments=max(segments[i] for i in group),
         slots=max(batches[i].phase.shape[0] for i in group),
         parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
@@ -149,7 +150,7 @@ def _common(mechanisms, group, loops, batches) -> CommonProgram:
 
 
 def _cells(mechanisms, loops, batches) -> CellCounts:
-    """Cells that serve every mechanism, if any needs them."""
+    """Return cell counts that suffice for every mechanism, `NO_CELLS` if no loop has cells."""
     if not any(loop.has_cells for loop in loops):
         return NO_CELLS
     exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]

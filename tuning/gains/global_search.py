@@ -1,6 +1,7 @@
-"""How much better gains could be: the whole box is searched on the same objective, and the best compared.
+"""Comparison of tuned gains with the best gains of a global search on the same objective.
 
-The search knows nothing of what tuning found, and takes `FACTOR` times as many evaluations.
+The search covers the whole box, does not start from the tuned gains and takes `FACTOR` times as many
+evaluations as tuning.
 """
 
 from typing import NamedTuple
@@ -13,18 +14,18 @@ from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
 FACTOR = 50
-LANES = 8192  # side by side, which is quicker than few at a time
+LANES = 8192  # least number of lanes per call; many lanes are faster than few
 
 
 class GlobalComparison(NamedTuple):
-    """Tuned gains beside the best found anywhere."""
+    """Objective of the tuned gains and of the best gains of a global search."""
 
-    tuned: float  # value of the objective [1]
-    best: float  # that of the best [1]
-    above: float  # by what share of the best value the tuned one lies above it; negative: below
+    tuned: float  # objective of the tuned gains [1]
+    best: float  # objective of the best gains of the search [1]
+    above: float  # tuned / best - 1 [1]
     spent: int  # evaluations of tuning, a Jacobian over P gains counted as 1 + P
-    evaluations: int  # those of the search
-    gains: dict[str, float]  # the best ones
+    evaluations: int  # evaluations of the search
+    gains: dict[str, float]  # best gains of the search
 
 
 def compare_with_global_search(
@@ -34,8 +35,7 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = FACTOR,
 ) -> GlobalComparison | None:
-    """Search the box of one task with `factor` times the evaluations that tuning took; none where all starts
-    failed."""
+    """Search the box of one task with `factor` times the evaluations of tuning; None if all starts failed."""
     if found.best is None:
         return None
 
@@ -43,9 +43,9 @@ def compare_with_global_search(
         return validation.losses(found.quiet or settings.objective, [task], points[None], lanes=LANES)[0]
 
     budget = factor * found.evaluations
-    everywhere = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)
+    search = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)
     tuned = float(losses(found.best.coordinates[None])[0])
-    gains = validation.gains(task, everywhere.point)
-    best = float(everywhere.loss)
+    gains = validation.gains(task, search.point)
+    best = float(search.loss)
     above = tuned / best - 1 if best > 0 else np.inf
-    return GlobalComparison(tuned, best, above, found.evaluations, everywhere.evaluations, gains)
+    return GlobalComparison(tuned, best, above, found.evaluations, search.evaluations, gains)

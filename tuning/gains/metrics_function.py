@@ -1,7 +1,7 @@
-"""An objective of the user's own: a function of the metrics of all contacts in all scenarios.
+"""User-defined objective, a function of the metrics of all contacts in all scenarios.
 
-It gets `ScenarioMetrics` and has to return one number that is to be made small, at least 0. It must be
-traceable: it is compiled, and the solver differentiates it together with the simulation.
+The function gets `ScenarioMetrics` and returns one number >= 0, which tuning minimises. It must be traceable
+by JAX: it is compiled, and the solver differentiates it together with the simulation.
 """
 
 from collections.abc import Callable
@@ -19,70 +19,71 @@ ALLOWED = "a function of metrics that returns a finite number >= 0"
 
 
 class ScenarioMetrics(NamedTuple):
-    """What the function gets: jax arrays, a contact a row, a scenario a column.
+    """Argument of a user's function: JAX arrays with one row per contact and one column per scenario.
 
-    Of a contact that does not end, error and restitution are those of a wild divergence (an error of 3), and
-    the command peaks at four times the force in space; the rest is as far as it got."""
+    A contact that does not end has an error of 3, the matching restitution and a peak command of four times
+    the ideal contact's peak force; its other metrics are those until the run stopped.
+    """
 
     error: Float[Array, "contacts scenarios"]  # restitution error e - e* [1]
     restitution: Float[Array, "contacts scenarios"]  # rebound speed over approach speed, e [1]
-    # the same in space, entered at the same speed, e* [1]
+    # restitution e* of the ideal contact with the same approach speed [1]
     reference_restitution: Float[Array, "contacts scenarios"]
     peak_command: Float[Array, "contacts scenarios"]  # largest magnitude of the commanded force F_c [N]
     peak_force: Float[Array, "contacts scenarios"]  # largest magnitude of the real contact force [N]
     duration: Float[Array, "contacts scenarios"]  # from a contact's beginning to its end [s]
-    approach_velocity: Float[Array, "contacts scenarios"]  # with which the contact is entered [m/s]
-    # 0 for a contact that ended, else why not (`jaxhil.simulation.metrics.STATUS_NAMES`)
+    approach_velocity: Float[Array, "contacts scenarios"]  # speed at the onset of the contact [m/s]
+    # 0 for a contact that ended, else the reason (index into `jaxhil.simulation.metrics.STATUS_NAMES`)
     status: Int[Array, "contacts scenarios"]
 
 
 class MetricsFunction:
-    """A user's function as an objective. It is equal to itself alone: no other's program stands in for it."""
+    """User's function as an objective; equal only to itself, so that no other function uses its program."""
 
     def __init__(self, function: Callable[[ScenarioMetrics], Any]):
         self.function = function
         self._several = jax.jit(jax.vmap(self._value))
 
     def check(self, contacts: int, scenarios: int) -> None:
-        """It returns one number for so many contacts and scenarios. Raises `InputError`."""
+        """Raise `InputError` if the function does not return one number for (contacts, scenarios) metrics."""
         like: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.result_type(float))
         count: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.int32)
         metrics = ScenarioMetrics(*[like] * 7, status=count)
         try:
-            found = jax.eval_shape(self.function, metrics)
+            result = jax.eval_shape(self.function, metrics)
         except Exception as error:
             reason = one_line(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", 160)
             raise InputError(f"objective: found one that raises {reason}, allowed {ALLOWED}") from None
-        if not isinstance(found, jax.ShapeDtypeStruct) or not jnp.issubdtype(found.dtype, jnp.floating):
-            name = getattr(found, "dtype", type(found).__name__)
+        if not isinstance(result, jax.ShapeDtypeStruct) or not jnp.issubdtype(result.dtype, jnp.floating):
+            name = getattr(result, "dtype", type(result).__name__)
             raise InputError(f"objective: found one that returns {shown(str(name))}, allowed {ALLOWED}")
-        if found.shape != ():
-            raise InputError(f"objective: found one that returns shape {found.shape}, allowed {ALLOWED}")
+        if result.shape != ():
+            raise InputError(f"objective: found one that returns shape {result.shape}, allowed {ALLOWED}")
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Of several sets of metrics, each leaf (several, contacts, scenarios); traceable."""
+        """Return the values of several sets of metrics, leaves (several, contacts, scenarios); traceable."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
-        """The same as NumPy numbers, NaN where one is not finite. Raises `InputError` for a negative one."""
-        found = np.asarray(self._several(metrics), float)
-        if np.any(found < 0):
-            raise InputError(f"objective: found {float(np.nanmin(found)):.6g}, allowed {ALLOWED}")
-        return np.where(np.isfinite(found), found, np.nan)
+        """Return `values` in NumPy, NaN for non-finite ones; raise `InputError` if one is negative."""
+        values = np.asarray(self._several(metrics), float)
+        if np.any(values < 0):
+            raise InputError(f"objective: found {float(np.nanmin(values)):.6g}, allowed {ALLOWED}")
+        return np.where(np.isfinite(values), values, np.nan)
 
     def _value(self, metrics: ScenarioMetrics) -> Float[Array, ""]:
         return jnp.asarray(self.function(metrics), metrics.error.dtype)
 
 
 def scenario_metrics(outcome: Outcome, failed: float) -> ScenarioMetrics:
-    """Metrics of an outcome, each leaf (contacts, *batch); contacts that failed have so large an error."""
+    """Return the metrics of an outcome, leaves (contacts, *batch); failed contacts have error `failed`."""
     metrics = outcome.metrics
-    # The inner `where` keeps what a failed contact leaves behind out of the derivative.
+    # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
     usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)
     error = jnp.where(usable, outcome.error, failed)
     reference = outcome.reference_restitution
     command = jnp.where(usable, metrics.peak_command, (1 + failed) * outcome.reference_peak_force)
-    found = (
+    leaves = (
         error,
         jnp.where(usable, metrics.restitution, reference + failed),
         reference,
@@ -91,5 +92,5 @@ def scenario_metrics(outcome: Outcome, failed: float) -> ScenarioMetrics:
         metrics.duration,
         metrics.approach_velocity,
     )
-    finite = [jnp.where(jnp.isfinite(leaf), leaf, 0) for leaf in found]
+    finite = [jnp.where(jnp.isfinite(leaf), leaf, 0) for leaf in leaves]
     return ScenarioMetrics(*finite, status=jnp.asarray(metrics.status))

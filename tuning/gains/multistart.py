@@ -1,10 +1,10 @@
-"""The best gains of many tasks: scan, descend by derivatives from several starts, go on where they disagree.
+"""Multistart search for the best gains of many tasks.
 
-The first batch of starts holds the literature's gains and the best points of a scan. Where its starts do not
-end at the same value there may be something better: further batches start at the best points of other scans,
-until several starts agree on the best. How many minima there are is not known; that the best one was met
-again and again is the sign that few are left. Contacts begin and end at ticks: the objective has kinks, on
-which a descent may stop, so that the best is then improved without derivatives.
+The first batch of starts holds the literature's gains and the best points of a scan; the solver descends
+from each by derivatives. If they do not end at the same value, further batches start at the best points of
+other scans, until several starts agree on the best value. The number of minima is unknown; repeated
+convergence to the best one indicates that few better ones are left. Since contacts begin and end at ticks,
+the objective has kinks at which a descent may stop; the best point is then improved without derivatives.
 
 Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
 global optimization methods" (1987).
@@ -30,33 +30,36 @@ from tuning.gains.tasks import TuneTask, tuned_names
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-KINKED = 3  # times as many evaluations without derivatives for a user's function
-BATCHES = 4  # of starts, at most
-SURE = 3  # starts that have to agree: two may have met in a poor basin
+KINKED = 3  # factor on the evaluations without derivatives for a user's function
+BATCHES = 4  # largest number of batches of starts
+SURE = 3  # starts that must agree; two may converge to the same poor minimum
 AGREED = 0.005  # relative difference of values that count as the same minimum
-# The same where scenarios have probes: another draw of the scenarios would change the value by more.
+# The same with probes: another draw of the scenarios would change the value by more.
 PROBED_AGREED = 0.02
-FREEING, FREEING_REACH = 24, 0.2  # generations of the search from a start that is stuck, its first reach
-REACH, CANDIDATES = 0.1, 16  # of the search without derivatives: first standard deviation, points at a time
+FREEING, FREEING_REACH = 24, 0.2  # search from a stuck start: generations, first standard deviation
+REACH, CANDIDATES = (
+    0.1,
+    16,
+)  # final search without derivatives: first standard deviation, points per generation
 
-Objectives = Objective | Sequence[Objective]  # that of all tasks, or one of each
+Objectives = Objective | Sequence[Objective]  # one of all tasks, or one per task
 
 
 class MultistartResult(NamedTuple):
-    """What was found for a task."""
+    """Result of the search for one task."""
 
-    best: Start | None  # the best of its starts, improved without derivatives; None if all failed
-    starts: list[Start]  # all of them, batch by batch
-    # of the objective, that it took. A Jacobian over P gains counts as 1 + P of them, a point of a scan as
-    # the share of the scenarios it may be tried on.
+    best: Start | None  # best start, improved without derivatives; None if all failed
+    starts: list[Start]  # all starts, batch by batch
+    # Evaluations of the objective. A Jacobian over P gains counts as 1 + P, a point of a scan as the share of
+    # the scenarios on which it may be evaluated.
     evaluations: int
-    # of the search for quieter gains, whose value the best start has; None where there was none
+    # objective of the search for quieter gains, which is that of `best`; None without such a search
     quiet: Objective | None = None
 
 
 @dataclass
 class _Search:
-    """The starts of one task so far, and the evaluations they took."""
+    """Starts of one task so far, and their evaluations of the objective."""
 
     starts: list[Start] = field(default_factory=list)
     evaluations: int = 0
@@ -68,11 +71,11 @@ def find_gains(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> list[MultistartResult]:
-    """The best gains of every task of `validation`.
+    """Search the best gains of every task of `validation`.
 
-    `first` has, of each task, gains to start at, in the places of the last starts of its first batch, never
-    of the literature's. One start alone is the literature's, and the only batch. `meanwhile` is done while
-    the solver's program compiles.
+    `first` holds, per task, gains that replace the last starts of its first batch, never the literature's. A
+    single start is the literature's, in the only batch. `meanwhile` is called while the solver's program
+    compiles.
     """
     tasks, quiet = validation.tasks, is_quiet(validation.tasks[0], settings)
     objective = least_error(settings.objective) if quiet else settings.objective
@@ -83,18 +86,18 @@ def find_gains(
     _check_function(validation, objective)
     going = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
     if probed or objective.function is not None:
-        for i, own in enumerate(searches):
-            own.starts, more = _freed(validation, i, own.starts, agreed, settings.seed, objective)
-            own.evaluations += more
-    # Where starts agree to that, the rest of the way down is within what scenarios decide.
+        for i, search in enumerate(searches):
+            search.starts, more = _freed(validation, i, search.starts, agreed, settings.seed, objective)
+            search.evaluations += more
+    # Where starts agree within PROBED_AGREED, the draw of the scenarios matters more than a further descent.
     polishing = 0 if probed and not going else settings.polish * len(validation.names)
     if objective.function is not None:
-        # It may have kinks everywhere, as a largest magnitude has.
+        # A user's function may have many kinks, as a maximum has.
         polishing *= KINKED
-    objectives, ends = one_each(objective, len(tasks)), [own.starts for own in searches]
+    objectives, ends = one_each(objective, len(tasks)), [search.starts for search in searches]
     quieter = _quieten(validation, settings, first, searches) if quiet else {}
-    for i, (own, found) in quieter.items():
-        objectives[i], ends[i] = own, found
+    for i, (search, found) in quieter.items():
+        objectives[i], ends[i] = search, found
     if polishing:
         runs = polishing * len(tasks) * tasks[0].lanes
         validation.work.begin("searching on without derivatives", runs)
@@ -102,11 +105,11 @@ def find_gains(
     return [
         MultistartResult(
             top,
-            own.starts,
-            own.evaluations + (polishing if top else 0),
+            search.starts,
+            search.evaluations + (polishing if top else 0),
             objectives[i] if i in quieter else None,
         )
-        for i, (top, own) in enumerate(zip(best, searches, strict=True))
+        for i, (top, search) in enumerate(zip(best, searches, strict=True))
     ]
 
 
@@ -116,13 +119,13 @@ def _quieten(
     first: Sequence[Sequence[Mapping[str, float]]] | None,
     searches: list[_Search],
 ) -> dict[int, tuple[Objective, list[Start]]]:
-    """Search from the gains of least error for quieter ones, of every task whose error is within the limit;
-    the objective of each such task, and the ends of its starts.
+    """Search for quieter gains from those of least error; return objective and final starts by task index.
 
-    As many starts as in the first batch of the first search, so that its program serves.
+    Only tasks whose error is within the limit take part. The number of starts is that of the first batch, so
+    that the same program is used.
     """
     tasks, objective = validation.tasks, settings.objective
-    best = [ranked[0] if (ranked := _ranked(own.starts)) else None for own in searches]
+    best = [ranked[0] if (ranked := _ranked(search.starts)) else None for search in searches]
     tolerance = tolerance_of(objective.limit, tasks[0].number)
     accurate = {i: top for i, top in enumerate(best) if top and top.rms <= tolerance}
     if not accurate:
@@ -142,12 +145,12 @@ def _quieten(
 
 
 def _starts_of_batch(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
-    """Return the number of starts of a batch: as asked for, and the literature's beside those given."""
+    """Return the number of starts of a batch, at least one more than the largest number in `first`."""
     return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
 def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Simulated runs that a search takes, of tasks that are alike, where starts agree and none ends early."""
+    """Return the simulated runs of a search of like tasks if starts agree and none ends early."""
     names, lanes = tuned_names(tasks), tasks[0].lanes
     scanning = settings.scanned * min(SCENARIOS, lanes) if settings.starts > 1 else 0
     solve = settings.starts * settings.steps * step_runs(tasks, names)
@@ -157,9 +160,9 @@ def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 def _solve_batches(
     validation, settings, first, agreed, searches: list[_Search], meanwhile: Callable[[], object]
 ) -> list[int]:
-    """Solve batch after batch of starts; the tasks whose starts do not agree even so."""
+    """Solve batches of starts; return the tasks whose starts still do not agree."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
-    given = [len(own) for own in first] if first else [0 for _ in tasks]
+    numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
     number = _starts_of_batch(settings, first)
     chosen = _while_compiling(
         validation,
@@ -180,11 +183,11 @@ def _solve_batches(
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, settings.steps, objective, work)
         for i in going:
-            own = searches[i]
-            own.starts += _exactly(validation, i, ended[i], objective)
-            own.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
-            if batch > 0 or number > 1 + given[i]:
-                own.evaluations += scan_evaluations(validation, number, settings.scanned)
+            search = searches[i]
+            search.starts += _exactly(validation, i, ended[i], objective)
+            search.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
+            if batch > 0 or number > 1 + numbers[i]:
+                search.evaluations += scan_evaluations(validation, number, settings.scanned)
         going = [i for i in going if not _agree(searches[i].starts, agreed)]
         if not going:
             break
@@ -199,17 +202,18 @@ def choose_starts(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     scanned: int = TuneSettings.scanned,
 ) -> list[Float[np.ndarray, "starts gains"]]:
-    """Points of the unit box to start from, of every task: the literature's gains, then the best of a scan
-    that lie apart from each other. `first` has, of each task, gains that take the places of the last of
-    these, never of the literature's."""
+    """Return the starts of every task: the literature's gains, then the best separated points of a scan.
+
+    `first` holds, per task, gains that replace the last of these, but never the literature's.
+    """
     tasks = range(len(validation.tasks))
-    given = [validation.coordinates(i, first[i] if first else ()) for i in tasks]
-    usual = [max(starts - len(own), 1) for own in given]
+    prior = [validation.coordinates(i, first[i] if first else ()) for i in tasks]
+    usual = [max(starts - len(points), 1) for points in prior]
     literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
         further = scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
-    return [np.concatenate([literature[i][: usual[i]], given[i]]) for i in tasks]
+    return [np.concatenate([literature[i][: usual[i]], prior[i]]) for i in tasks]
 
 
 def finish(
@@ -219,15 +223,17 @@ def finish(
     seed: int,
     objective: Objectives = RMS,
 ) -> list[Start | None]:
-    """The best start of every task, none if all failed, improved without derivatives
-    (`tuning.optimisation.derivative_free.polish`) by so many evaluations each."""
-    best = [ranked[0] if (ranked := _ranked(own)) else None for own in solved]
-    some = [i for i, top in enumerate(best) if top]
-    if not some or evaluations == 0:
+    """Improve the best start of every task without derivatives by so many evaluations; None if all failed.
+
+    The search is `tuning.optimisation.derivative_free.polish`.
+    """
+    best = [ranked[0] if (ranked := _ranked(starts)) else None for starts in solved]
+    indices = [i for i, top in enumerate(best) if top]
+    if not indices or evaluations == 0:
         return best
     tops = [top for top in best if top]
-    found = polish(
-        lambda points: validation.losses(objective, some, points),
+    polished = polish(
+        lambda points: validation.losses(objective, indices, points),
         np.stack([top.coordinates for top in tops]),
         evaluations,
         candidates=CANDIDATES,
@@ -235,13 +241,13 @@ def finish(
         covariance=np.stack([inverse_hessian(top.curvature, top.rms) for top in tops]),
         seed=seed,
     )
-    for i, top, point, loss in zip(some, tops, found.point, found.loss, strict=True):
+    for i, top, point, loss in zip(indices, tops, polished.point, polished.loss, strict=True):
         best[i] = _moved(validation, i, top, point, loss)
     return best
 
 
 def _check_function(validation: Validation, objective: Objective) -> None:
-    """The user's function, if there is one, is a number for the literature's gains. Raises `InputError`."""
+    """Raise `InputError` if the user's function, if any, is not finite for the literature's gains."""
     if objective.function is None:
         return
     tasks = range(len(validation.tasks))
@@ -255,10 +261,9 @@ def _check_function(validation: Validation, objective: Objective) -> None:
 def _freed(
     validation: Validation, task: int, starts: list[Start], agreed: float, seed: int, objective: Objectives
 ) -> tuple[list[Start], int]:
-    """The starts, those that ended further above the best searched on from there without derivatives, and the
-    evaluations that took.
+    """Search on without derivatives from the starts that ended above the best; return starts and evaluations.
 
-    Where the correction's limit begins to bind the objective has a kink, and the solver stays there.
+    The solver can get stuck at the kink of the objective where the correction's limit begins to bind.
     """
     ranked = _ranked(starts)
     stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
@@ -271,15 +276,15 @@ def _freed(
         return validation.losses(objective, [task], flat)[0].reshape(points.shape[:-1])
 
     at = np.stack([starts[i].coordinates for i in stuck])
-    found = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
+    polished = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
     freed = list(starts)
-    for i, point, loss in zip(stuck, found.point, found.loss, strict=True):
+    for i, point, loss in zip(stuck, polished.point, polished.loss, strict=True):
         freed[i] = _moved(validation, task, starts[i], point, loss)
     return freed, number * len(stuck)
 
 
 def _exactly(validation: Validation, task: int, starts: list[Start], objective: Objective) -> list[Start]:
-    """Starts with the value of the objective itself where the solver lowered a norm in its place."""
+    """Replace the values of starts by the exact objective, for which the solver minimised a smooth norm."""
     if objective.name == "rms" or not starts:
         return starts
     values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]
@@ -289,26 +294,28 @@ def _exactly(validation: Validation, task: int, starts: list[Start], objective: 
 def _while_compiling(
     validation: Validation, number: int, objective: Objective, work: Callable, more: Callable[[], object]
 ):
-    """Do some work, and then more, while the solver's program compiles: each takes one core. Only one program
-    runs: programs on several devices could wait for one another for ever."""
+    """Call `work` and `more` while the solver's program compiles in a thread; return the result of `work`.
+
+    Only this thread runs programs, since concurrent programs on several devices could deadlock.
+    """
     if program_folder() is None:
         return work()
     with ThreadPoolExecutor(1) as beside:
         ready = beside.submit(_prepare, validation, number, objective)
-        done = work()
+        result = work()
         more()
         ready.result()
-        return done
+        return result
 
 
 def _prepare(validation: Validation, number: int, objective: Objectives) -> None:
-    # A thread has jax's settings from the process, not from the caller.
+    # A new thread has the process's JAX settings, not those of the calling thread.
     with float64():
         prepare_solver(validation.tasks, number, objective)
 
 
 def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, loss: float) -> Start:
-    """The start where a search from it ended; itself where that found nothing better."""
+    """Return the start moved to `point`; unchanged if the search did not move."""
     if (point == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]
@@ -321,6 +328,6 @@ def _ranked(starts: list[Start]) -> list[Start]:
 
 
 def _agree(starts: list[Start], agreed: float) -> bool:
-    """Whether enough of the best starts do."""
+    """Return whether the `SURE` best starts agree within the relative difference `agreed`."""
     ranked = _ranked(starts)
     return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + agreed) * ranked[0].rms

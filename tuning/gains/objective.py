@@ -1,22 +1,23 @@
-"""What tuning minimises: a figure of the restitution errors of a batch of scenarios, and penalties beside it.
+"""Objective of tuning: a metric of the restitution errors of a batch of scenarios, plus penalties.
 
-With e - e* of every contact, divergence weighted against convergence (`Objective`), the figures are
+With the error e - e* of every contact, weighted where positive (`Objective`), the metrics are
 
     rms     root of the mean square
     cvar    mean magnitude of the worst 5 % of the contacts (the conditional value at risk)
     worst   the largest magnitude
 
-and the penalties a command that peaks above the reference's force, one that chatters, and a compensator that
-amplifies the noise of the force sensor. Each penalty is a dimensionless number; its weight says how many
-limits of the error that number is worth. `objective_value` has them exactly.
+The penalties are for a command that exceeds the ideal contact's peak force, for chatter, and for amplified
+noise of the force sensor. Each penalty is a dimensionless number; its weight is the error, in multiples of
+the limit, that a penalty of 1 equals. `objective_value` computes them exactly.
 
-Levenberg-Marquardt wants smooth sums of squares. That of `residuals` is the square of the norm
+Levenberg-Marquardt needs smooth sums of squares. That of `residuals` is the square of the norm
 
     (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
 
-which is the rms, and never below the other two: the mean of the worst is at most the p-th root of the mean
-of their p-th powers. The exact tail is no use to a solver that linearises: contacts outside it weigh nothing,
-and a step that spoils one of them is not foreseen. By this norm the tail ends lower.
+It equals the rms, and is an upper bound of the other two, since the mean of the worst is at most the p-th
+root of the mean of their p-th powers. The exact tail suits no linearising solver: contacts outside it have
+no weight, so that the solver does not foresee a step that makes one of them worse. With the norm the solver
+reaches a lower tail.
 """
 
 import dataclasses
@@ -37,57 +38,55 @@ from jaxhil.simulation.outcome import Outcome
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, scenario_metrics
 from tuning.transparency.probes import are_probes
 
-SCALE = 0.01  # an error of one: the solver's first steps are damped as for residuals of order one
-FAILED = 3.0  # error of a contact that does not end, or is not reached: as bad as a wild divergence
-CHUNK = 32  # lanes with probes that are computed side by side
-TAIL = 20  # cvar: the worst one in so many contacts, at least one
-POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # of the norms in the residuals; even
+SCALE = 0.01  # error that makes a residual of 1; the solver's first damping is for residuals of order one
+FAILED = 3.0  # error of a contact that does not end or is not reached, as of a strong divergence
+CHUNK = 32  # lanes with probes that are computed together
+TAIL = 20  # cvar: the worst 1/TAIL of the contacts, at least one
+POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norms in the residuals
 OBJECTIVES = tuple(POWERS)
 WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency"))
 IN_LIMITS = ("command_weight", "noise_weight", "chatter_weight")  # weights in multiples of the limit
-# By what share of itself an error within the tolerance still counts: of equally quiet gains the most
-# accurate are wanted.
+# Factor on an error within the tolerance: of equally quiet gains the most accurate are wanted.
 TOLERATED = 0.02
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What to minimise: J with
+    """Objective J of tuning.
 
-        J^2 = figure(E)^2 + (transparency_weight rms(H))^2
+        J^2 = metric(E)^2 + (transparency_weight rms(H))^2
           + limit^2 ((command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2)
 
         E  per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive
-        H  the same of the transparency probes, e* their own (`tuning.transparency.probes`)
-        C  per contact, of probes too, max(0, peak |F_c| / the reference's peak force - 1) [1]
-        S  per contact, of probes too, the chatter [1]: how far F_c goes up and down beyond a single swing
-           (`jaxhil.simulation.metrics`), over the reference's peak force; with the sensors' noise in it
+        H  per contact of the transparency probes the error e - e* [1] (`tuning.transparency.probes`)
+        C  per contact, probes included, max(0, peak |F_c| / peak force of the ideal contact - 1) [1]
+        S  per contact, probes included, the chatter [1]: variation of F_c beyond a single rise and fall
+           (`jaxhil.simulation.metrics`) over the ideal contact's peak force, with the sensors' noise
         N  max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
-           (`Compensator.noise_amplification`); a command quieter than the measured force earns nothing
+           (`Compensator.noise_amplification`)
 
-    With w the weight of X, one of C, S and N, minimising J raises the figure to at most
-    sqrt(figure^2 + (w limit X)^2), both taken at the gains of the least figure: what a weight costs is known
-    in multiples of the limit, whatever the rig.
+    Let w be the weight of X, one of C, S and N. Minimising J raises the metric to at most
+    sqrt(metric^2 + (w limit X)^2), both evaluated at the gains of the least metric. The cost of a weight is
+    thus known in multiples of the limit for every rig.
 
-    With a `tolerance`, max(figure - tolerance, `TOLERATED` figure) takes the figure's place: gains whose
-    error is within it are compared by the penalties.
+    With a `tolerance`, max(metric - tolerance, `TOLERATED` metric) replaces the metric, so that the penalties
+    decide between gains whose error is within the tolerance.
 
-    Raises `InputError` for another name or a weight that is negative or not finite, or 0 for divergence.
+    Raise `InputError` for an unknown name or a weight that is negative, not finite, or 0 for divergence.
     """
 
-    name: str = "rms"  # of the figure, one of `OBJECTIVES`
-    # how much more a squared divergence (e > e*) counts than a squared convergence [1]
+    name: str = "rms"  # name of the metric, one of `OBJECTIVES`
+    # weight of a squared divergence (e > e*) relative to a squared convergence [1]
     divergence_weight: float = 1.0
-    # how many limits of the error a command is worth that peaks one reference peak too high [1]
-    command_weight: float = 0.0
-    noise_weight: float = 0.0  # the same of an amplification one too large [1]
-    chatter_weight: float = 0.0  # the same of one swing over the reference's peak too many [1]
-    transparency_weight: float = 0.0  # with 1, probes' errors count as much as those of the scenarios [1]
-    # a function of the user's own in the figure's place, of the metrics of all scenarios but the probes;
-    # divergence_weight has no part in it
+    command_weight: float = 0.0  # error, in limits, that C = 1 equals [1]
+    noise_weight: float = 0.0  # error, in limits, that N = 1 equals [1]
+    chatter_weight: float = 0.0  # error, in limits, that S = 1 equals [1]
+    transparency_weight: float = 0.0  # weight of the probes' rms error relative to the metric [1]
+    # user's function of the metrics of all scenarios without probes, which replaces the metric;
+    # divergence_weight does not apply to it
     function: MetricsFunction | None = None
-    limit: float = 0.01  # of the error [1]: the unit of the weights of command, noise and chatter
-    # up to which the figure is good enough [1]; None: no error is, and the program has no such part
+    limit: float = 0.01  # limit of the error [1], the unit of the weights of command, noise and chatter
+    # metric that is good enough [1]; None: there is no tolerance, and the program is compiled without one
     tolerance: float | None = None
 
     def __post_init__(self):
@@ -107,7 +106,7 @@ class Objective:
 
     @property
     def weights(self) -> "Weights":
-        """The numbers in it, each a scalar array, those of penalties in the unit of an error."""
+        """Return the weights as scalar arrays, those of penalties in the unit of an error."""
         numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHTS]
         return Weights(*map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0)))
 
@@ -116,53 +115,53 @@ RMS = Objective()
 
 
 class Terms(NamedTuple):
-    """What of an objective shapes the compiled program."""
+    """Static properties of an objective, which determine the compiled program."""
 
-    name: str  # of its figure
-    command: bool  # whether the command has a part
-    noise: bool  # whether the noise has one
-    chatter: bool  # whether the chatter has one
-    transparency: bool = False  # whether the scenarios come with probes
-    function: MetricsFunction | None = None  # the user's, in the place of the figure, if any
-    contacts: int = 0  # how many the user's function gets
-    tolerance: bool = False  # whether errors within a tolerance, which may be 0, are good enough
+    name: str  # name of its metric
+    command: bool  # whether it has a term of the command's peak
+    noise: bool  # whether it has a term of the amplified noise
+    chatter: bool  # whether it has a term of the chatter
+    transparency: bool = False  # whether the scenarios include probes
+    function: MetricsFunction | None = None  # user's function that replaces the metric, if any
+    contacts: int = 0  # number of contacts that the user's function gets
+    tolerance: bool = False  # whether it has a tolerance, which may be 0
 
 
 class Weights(NamedTuple):
-    """The weights of an objective (`Objective`): numbers that one program takes, each problem its own."""
+    """Weights of an `Objective` per problem, which are arguments of the compiled program."""
 
-    divergence: Float[Array, "*problems"]  # of a squared divergence over a squared convergence [1]
-    command: Float[Array, "*problems"]  # of the command's excess [1]
-    noise: Float[Array, "*problems"]  # of the amplification beyond 1 [1]
-    chatter: Float[Array, "*problems"]  # of the chatter [1]
-    transparency: Float[Array, "*problems"]  # of the probes' errors [1]
-    tolerance: Float[Array, "*problems"]  # of the figure [1]
+    divergence: Float[Array, "*problems"]  # weight of a squared divergence over a squared convergence [1]
+    command: Float[Array, "*problems"]  # weight of the command's excess C [1]
+    noise: Float[Array, "*problems"]  # weight of the excess amplification N [1]
+    chatter: Float[Array, "*problems"]  # weight of the chatter S [1]
+    transparency: Float[Array, "*problems"]  # weight of the probes' errors H [1]
+    tolerance: Float[Array, "*problems"]  # tolerance of the metric [1]
 
 
 class Problem(NamedTuple):
-    """What one start is solved for; where there are several, each leaf has a leading axis of them."""
+    """Inputs of the solver for one start; for several, every leaf has a leading axis of problems."""
 
-    rig: Any  # a batch of scenarios, as `RigModel.prepared` returns it
-    fixed: dict[str, Array]  # gains that stay as they are
-    weights: Weights  # the objective's
+    rig: Any  # batch of scenarios, as returned by `RigModel.prepared`
+    fixed: dict[str, Array]  # gains that are not tuned
+    weights: Weights  # weights of the objective
 
 
 def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
-    """The objective of each of so many tasks, from that of all of them or a list of them."""
+    """Return a list with the objective of each of `number` tasks, from one of all or one per task."""
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
 def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> Terms:
-    """The terms of objectives of one name and function: a part that one of them has, all have, some with a
-    weight of 0. `probed` scenarios come with probes; all have so many `contacts`, if there is a function.
+    """Return the union of the terms of objectives that share name and function; missing terms get weight 0.
 
-    Raises ValueError for objectives of several names or functions.
+    `probed` says that the scenarios include probes; with a function all scenarios have `contacts` contacts.
+    Raise ValueError if names or functions differ.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
     return Terms(
         name=name,
-        # What is tolerated makes room for a quieter command.
+        # A tolerance serves the search for quieter commands, which weights command and noise.
         command=tolerance or any(objective.command_weight > 0 for objective in objectives),
         noise=tolerance or any(objective.noise_weight > 0 for objective in objectives),
         chatter=any(objective.chatter_weight > 0 for objective in objectives),
@@ -178,15 +177,14 @@ def residuals(
     gains: Float[Array, "problems gains"],
     problems: Problem,
 ) -> Float[Array, "problems residuals"]:
-    """(J / `SCALE`)^2 of every problem as a sum of squares, J as of `Objective`; the loss is half of it.
+    """Return residuals of every problem whose sum of squares is (J / `SCALE`)^2, J as of `Objective`.
 
-    One residual per contact slot of every scenario for the figure, or the norm that stands for it, as many
-    for the command, as many for its chatter, one for the noise, and one for every contact slot of the probes,
-    where they are among the terms. Contacts that fail count with the constant error, excess and chatter
-    `FAILED`.
+    There is one residual per contact slot of every scenario for the norm of the errors and, if among the
+    terms, as many for the probes, the command and the chatter, and one for the noise. A failed contact has
+    error, excess and chatter `FAILED`.
 
-    `static` are the rig model, the loop, the names of the gains that are tuned and the objective's terms. The
-    scenarios of all problems run side by side, as the lanes of one batch.
+    `static` are the rig model, the loop, the names of the tuned gains and the objective's terms. The
+    scenarios of all problems are the lanes of one batch.
     """
     model, loop, names, terms = static
     if terms.chatter:
@@ -209,10 +207,10 @@ def residuals(
     amplification = jnp.mean(by_problem(model.noise_amplification(loop, values, rig)), axis=1)
     probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
     wanted = by_problem(outcome.wanted)
-    figure = None
+    metric = None
     if terms.function is not None:
-        figure = terms.function.values(metrics_of(outcome, number, terms.contacts, terms.transparency))
-    return weigh(terms, problems.weights, error, excess, chatter, wanted, amplification, probes, figure)
+        metric = terms.function.values(metrics_of(outcome, number, terms.contacts, terms.transparency))
+    return weigh(terms, problems.weights, error, excess, chatter, wanted, amplification, probes, metric)
 
 
 def weigh(
@@ -224,31 +222,33 @@ def weigh(
     wanted: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
     probes: Bool[Array, "problems contacts"] | None = None,
-    figure: Float[Array, "problems"] | None = None,
+    metric: Float[Array, "problems"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """The residuals of `contact_terms` and of the noise's amplification; `probes`: which contacts are of
-    probes, where the terms have transparency; `figure`: the value of the user's function, which is one
-    residual, where they have one."""
+    """Return the residuals from the terms of `contact_terms` and the amplification of the noise.
 
-    # A problem that asks for no contact, which fills up a call, has errors of 0.
-    def counted(asked):
-        return jnp.maximum(jnp.sum(asked, axis=1, dtype=jnp.int32), 1)[:, None]
+    `probes` masks the contacts of probes, if the terms have transparency. `metric` is the value of the user's
+    function, which replaces the residuals of the errors by one residual.
+    """
+
+    # A problem that only fills up a call has no wanted contact; its errors of 0 are divided by 1.
+    def counted(mask):
+        return jnp.maximum(jnp.sum(mask, axis=1, dtype=jnp.int32), 1)[:, None]
 
     count = plain = counted(wanted)
-    blindness = []
+    transparency = []
     if terms.transparency and probes is not None:
-        blind = _norm(jnp.where(probes, error, 0), counted(wanted & probes), 2)
-        blindness = [weights.transparency[:, None] * blind]
+        probe_errors = _norm(jnp.where(probes, error, 0), counted(wanted & probes), 2)
+        transparency = [weights.transparency[:, None] * probe_errors]
         error, plain = jnp.where(probes, 0, error), counted(wanted & ~probes)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
     number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
-    if figure is None:
-        own = _norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])
+    if metric is None:
+        errors = _norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])
     else:
-        own = figure[:, None]
+        errors = metric[:, None]
     if terms.tolerance:
-        own = own * _untolerated(own, weights.tolerance[:, None])
-    parts = [own, *blindness]
+        errors = errors * _untolerated(errors, weights.tolerance[:, None])
+    parts = [errors, *transparency]
     if terms.command:
         parts.append(weights.command[:, None] * _norm(excess, count, 2))
     if terms.chatter:
@@ -271,10 +271,13 @@ def _untolerated(
 def contact_terms(
     outcome: Outcome,
 ) -> tuple[Float[Any, "slots *batch"], Float[Any, "slots *batch"], Float[Any, "slots *batch"]]:
-    """Per contact the restitution error, the command's excess over the reference's peak force, relative to
-    it, and the chatter: `FAILED` for contacts that failed, 0 for those not asked for. NumPy in, NumPy out."""
+    """Return per contact the restitution error, the command's relative excess and the chatter, all [1].
+
+    The excess is that of the command's peak over the ideal contact's peak force. Failed contacts have
+    `FAILED`, contacts that are not wanted 0. NumPy arrays give NumPy arrays.
+    """
     xp = jnp if isinstance(outcome.error, jax.Array) else np
-    # The inner `where` keeps what a failed contact leaves behind out of the derivative.
+    # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
     usable = outcome.good & xp.isfinite(outcome.error) & xp.isfinite(outcome.peak_ratio)
     usable = usable & xp.isfinite(outcome.chatter)
     error = xp.where(usable, outcome.error, FAILED)
@@ -286,8 +289,10 @@ def contact_terms(
 
 
 def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
-    """What a user's function gets, for each of so many problems whose scenarios are side by side: leaves
-    (problems, contacts, scenarios), without the copies of `probed` ones."""
+    """Return the arguments of a user's function, leaves (problems, contacts, scenarios), without probes.
+
+    `outcome` holds the scenarios of `number` problems side by side, with their probes if `probed`.
+    """
 
     def by_problem(leaf):
         several = leaf[:contacts].reshape(contacts, number, -1)
@@ -305,34 +310,34 @@ def objective_value(
     probe_errors: Float[np.ndarray, "*points contacts"] | None = None,
     value: Float[np.ndarray, "*points"] | None = None,
 ) -> Float[np.ndarray, "*points"]:
-    """J [1] of `Objective`, exactly, for all three names: what a table of results is made of.
+    """Return the exact J [1] of `Objective`.
 
-    `errors`, `excesses` and `chatter` (none: no part in it) are those of `contact_terms`, of the contacts
-    asked for; `probe_errors` are the errors of the transparency probes, which are not among `errors` then.
-    What is not finite counts as `FAILED`. `value` is that of the user's function, which is the figure then.
+    `errors`, `excesses` and `chatter` are those of `contact_terms` for the wanted contacts; a term that is
+    None counts as 0. `errors` are without those of the transparency probes, which are `probe_errors`.
+    Non-finite numbers count as `FAILED`. `value`, that of the user's function, replaces the metric.
     """
-    given = errors, excesses, chatter, probe_errors
-    error, excess, swings, blindness = (
+    terms = errors, excesses, chatter, probe_errors
+    error, excess, swings, transparency = (
         np.where(np.isfinite(term), term, FAILED)
-        for term in (np.zeros(1) if term is None else term for term in given)
+        for term in (np.zeros(1) if term is None else term for term in terms)
     )
-    figure = _figure(objective, error) if value is None else value
+    metric = _metric(objective, error) if value is None else value
     if objective.tolerance:
-        figure = np.maximum(figure - objective.tolerance, TOLERATED * figure)
+        metric = np.maximum(metric - objective.tolerance, TOLERATED * metric)
     parts = (
-        figure,
+        metric,
         objective.limit * objective.command_weight * _rms(excess),
         objective.limit * objective.chatter_weight * _rms(swings),
         objective.limit * objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
-        objective.transparency_weight * _rms(blindness),
+        objective.transparency_weight * _rms(transparency),
     )
     return np.sqrt(sum(part**2 for part in parts))
 
 
-def _figure(
+def _metric(
     objective: Objective, error: Float[np.ndarray, "*points contacts"]
 ) -> Float[np.ndarray, "*points"]:
-    """Of errors alone."""
+    """Return the metric of the errors, without penalties."""
     size = np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error))
     if objective.name == "rms":
         return _rms(size)
@@ -350,9 +355,9 @@ def _tail(count):
 
 
 def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int) -> Array:
-    """Sum of squares: (sum of |E|^p / m)^(2/p); residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p).
+    """Return residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p), whose sum of squares is (sum of |E|^p / m)^(2/p).
 
-    They are of first degree in the errors, so that Gauss-Newton steps neither overshoot nor fall short.
+    They are homogeneous of degree one in the errors, so that Gauss-Newton steps have the right length.
     """
     size = jnp.abs(error)
     largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))
@@ -363,16 +368,16 @@ def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems
 
 
 def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
-    """Lanes, the last axis of every leaf, `CHUNK` at a time: each chunk ends with its own slowest lane."""
+    """Apply `function` to `CHUNK` lanes (last axis) at a time, so that slow lanes delay only their chunk."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
     size = math.gcd(lanes, CHUNK)
     chunks = jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
     )
-    done = lax.map(function, chunks)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), done)
+    results = lax.map(function, chunks)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), results)
 
 
 def _side_by_side(leaf: Array) -> Array:
-    """(problems, ..., scenarios) -> (..., lanes)"""
+    """Reshape (problems, ..., scenarios) to (..., lanes)."""
     return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], leaf.shape[0] * leaf.shape[-1])

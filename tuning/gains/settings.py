@@ -1,4 +1,4 @@
-"""What a tuning run is asked to do: how many scenarios, starts and steps, and what to minimise."""
+"""Settings of a tuning run: numbers of scenarios, starts and steps, and the objective."""
 
 from dataclasses import dataclass
 
@@ -9,26 +9,26 @@ from tuning.gains.objective import RMS, Objective
 class TuneSettings:
     """Settings of `tuning.gains.tune`, the same for all mechanisms of a run."""
 
-    # how many to tune on; None: 32, or 128 with sensor noise (`tuning.gains.tasks`)
+    # number of training scenarios; None: 32, or 128 with sensor noise (`tuning.gains.tasks`)
     scenarios: int | None = None
-    # points that the solver starts from, in every batch of starts (`tuning.gains.multistart`)
+    # starts of the solver in every batch (`tuning.gains.multistart`)
     starts: int = 4
-    steps: int = 25  # most solver steps from each start
-    validation: int = 511  # fresh scenarios to judge the gains on
-    seed: int = 0  # of scenarios and starts
-    objective: Objective = RMS  # what to minimise
-    polish: int = 160  # evaluations without derivatives at the end, for each gain
-    # whether to search the gains' whole ranges as well, and say how much better they can be
+    steps: int = 25  # largest number of solver steps from each start
+    validation: int = 511  # number of fresh scenarios on which the gains are evaluated
+    seed: int = 0  # seed of scenarios and starts
+    objective: Objective = RMS  # objective to minimise
+    polish: int = 160  # evaluations of the final search without derivatives, per gain
+    # whether to compare the tuned gains with those of a search of the gains' whole ranges
     global_search: bool = False
     scanned: int = 256  # points of a scan, the best of which become starts
-    # name of the compensator's gains that are judged as they are, in the place of tuning
+    # name of a setting of the compensator's gains that is evaluated instead of tuning
     setting: str | None = None
-    # whether the quietest gains within the objective's limit are wanted, where sensors are noisy
+    # whether to search for the quietest gains within the objective's limit if sensors are noisy
     quiet: bool = False
-    # whether to judge transparency even where the objective does not weigh it
+    # whether to evaluate transparency even if the objective does not weight it
     judge_transparency: bool = False
 
     @property
     def probed(self) -> bool:
-        """Whether every scenario comes with its transparency probes (`tuning.transparency.probes`)."""
+        """Return whether every scenario has its transparency probes (`tuning.transparency.probes`)."""
         return self.judge_transparency or self.objective.transparency_weight > 0

@@ -1,7 +1,7 @@
-"""What there is to solve: one task a mechanism, with the scenarios that its gains are tuned on.
+"""Tuning tasks: one mechanism each, with the scenarios on which its gains are tuned.
 
-Tasks whose loops have the same shape (law, sensors, limits, lengths of delay lines) share one compiled
-program, and are solved in one batch.
+Tasks whose loops differ only in the length of their delay lines share one compiled program, and are solved in
+one batch.
 """
 
 import dataclasses
@@ -30,51 +30,50 @@ from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import Bounds, to_gains
 from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
 
-# In training a contact that takes longer than this many times its undelayed duration, and so many
-# seconds more, has failed.
+# In training a contact fails if it takes longer than PATIENCE undelayed durations plus SHORTEST_PATIENCE.
 PATIENCE = 2.0
 SHORTEST_PATIENCE = 0.15  # s
 
-SCENARIOS, NOISY_SCENARIOS = 32, 128  # to tune on, without and with sensor noise, probes included
+SCENARIOS, NOISY_SCENARIOS = 32, 128  # default training scenarios without noise; with it, probes included
 
 
 @dataclass(frozen=True)
 class TuneTask:
-    """A mechanism to tune."""
+    """Tuning task of one mechanism."""
 
-    mechanism: AnyMechanism  # what is tuned for
-    compensator: str  # what is tuned
+    mechanism: AnyMechanism  # mechanism to tune for
+    compensator: str  # compensator whose gains are tuned
     literature: dict[str, float]  # the compensator's gains by the literature's rule, or those of a setting
-    scenarios: Any  # to tune on
-    loop: Any  # that runs them
-    common: CommonProgram | None = None  # the program it shares with unlike mechanisms, if it does
-    probed: bool = False  # whether each scenario comes with its transparency probes
+    scenarios: Any  # training scenarios
+    loop: Any  # loop that runs the scenarios
+    common: CommonProgram | None = None  # program shared with unlike mechanisms, if any
+    probed: bool = False  # whether each scenario has its transparency probes
 
     @property
     def number(self) -> int:
-        """Scenarios, probes not counted."""
+        """Return the number of scenarios without probes."""
         return self.lanes // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
     def lanes(self) -> int:
-        """Scenarios, probes counted."""
+        """Return the number of scenarios with their probes."""
         return lanes_of(self.scenarios)
 
     @property
     def contacts(self) -> int:
-        """Rows of each scenario's outcome: its contacts, or both errors of its episodes."""
+        """Return the rows of a scenario's outcome: its contacts, or both errors of each six-axis episode."""
         return self.model.rows(self.mechanism)
 
     @property
     def model(self) -> RigModel:
-        """The model of the mechanism's rig."""
+        """Return the model of the mechanism's rig."""
         return rig_model(self.mechanism)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
-        """The gains that tuning moves for this mechanism."""
-        known: Any = self.mechanism
-        return tuple(gain for gain in compensator_of(self.compensator).gains if gain.tuned(known))
+        """Return the gains that are tuned for this mechanism."""
+        mechanism: Any = self.mechanism
+        return tuple(gain for gain in compensator_of(self.compensator).gains if gain.tuned(mechanism))
 
 
 def build_task(
@@ -86,13 +85,12 @@ def build_task(
     setting: str | None = None,
     probed: bool = False,
 ) -> TuneTask:
-    """Training scenarios are quasi-random: they fill the range evenly. Their contacts must end in time.
+    """Build a task with quasi-random training scenarios, whose contacts have a time limit.
 
-    Each comes with a realisation of the sensors' noise of its own. Gains can be fitted to a few of them, so
-    that there are more, unless a number is given, where there is noise. The transparency probes of `probed`
-    ones are as good for that: there are fewer scenarios then.
-
-    Raises ValueError for probed tasks of a common program.
+    Each scenario has its own realisation of the sensors' noise. With noise the default number of `scenarios`
+    is larger, since gains can be fitted to a few realisations; transparency probes (`probed`) count as
+    scenarios. `setting` names a setting whose gains replace the literature's. Raise ValueError for probed
+    tasks of a `common` program.
     """
     if probed and common is not None:
         raise ValueError("probed: found True, allowed False for mechanisms that share a program")
@@ -117,18 +115,20 @@ def build_task(
 
 
 def has_sensor_noise(mechanism: AnyMechanism) -> bool:
-    """Whether either sensor is noisy, in some scenarios at least."""
+    """Return whether the force or position sensor has noise in any scenario."""
     rig = mechanism.rig
     paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
-    # In six axes the position sensor has none.
+    # The six-axis position sensor has no noise.
     position = getattr(rig.position_sensor, "noise_std", 0.0)
     noisy = bool(max(np.max(rig.force_sensor.noise_std), position) > 0)
     return noisy or any(path in mechanism.uncertainty for path in paths)
 
 
 def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
-    """Indices of what one program serves: loops that differ by the length of their delay lines alone, with
-    scenario arrays of the same shapes. In the order in which they come."""
+    """Group loops that share a compiled program; return lists of indices in order of the first index.
+
+    The loops of a group differ only in the length of their delay lines; their scenarios have equal shapes.
+    """
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
         shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
@@ -138,24 +138,24 @@ def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
 
 
 def common_loop(loops: list[Any]) -> Any:
-    """The loop of like ones, with the longest of their delay lines."""
+    """Return the loop that serves all `loops` of a group, with the longest of their delay lines."""
     longest = {name: max(getattr(loop, name) for loop in loops) for name in _rings(loops[0])}
     return dataclasses.replace(loops[0], **longest)
 
 
 def _rings(loop: Any) -> list[str]:
-    """Fields of a loop that are lengths of delay lines."""
+    """Return the fields of a loop that are lengths of delay lines."""
     return [name for name in ("ring", "controller_ring") if hasattr(loop, name)]
 
 
 def tuned_names(tasks: list[TuneTask]) -> tuple[str, ...]:
-    """Names of all gains that are tuned for at least one of the tasks."""
+    """Return the names of all gains that are tuned for at least one of the tasks."""
     tuned = {gain.name for task in tasks for gain in task.tuned}
     return tuple(gain.name for gain in compensator_of(tasks[0].compensator).gains if gain.name in tuned)
 
 
 def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
-    """Bounds (gains,) of a task; of a gain that is not tuned for it both are the literature's value."""
+    """Return the bounds (gains,) of a task; both are the literature's value for a gain that is not tuned."""
     gains = {gain.name: gain for gain in compensator_of(task.compensator).gains}
     moved = {gain.name for gain in task.tuned}
 
@@ -172,19 +172,23 @@ def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
 def gains_at(
     task: TuneTask, names: tuple[str, ...], bounds: Bounds, coordinates: Float[np.ndarray, "*points gains"]
 ) -> dict[str, Float[np.ndarray, "*points"]]:
-    """All of the compensator's gains: `names` at `coordinates` of their ranges, as far as tuned for the
-    task."""
+    """Return all gains of the compensator at unit coordinates of the gains `names`.
+
+    Gains that are not tuned for the task have the literature's value.
+    """
     moved = {gain.name for gain in task.tuned}
-    found = dict(zip(names, np.moveaxis(to_gains(coordinates, bounds), -1, 0), strict=True))
+    values = dict(zip(names, np.moveaxis(to_gains(coordinates, bounds), -1, 0), strict=True))
     return {
-        name: found[name] if name in moved else np.full(coordinates.shape[:-1], literature)
+        name: values[name] if name in moved else np.full(coordinates.shape[:-1], literature)
         for name, literature in task.literature.items()
     }
 
 
 def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:
-    """(number, gains) coordinates of the unit box: `first`, then Sobol points, every other one of them within
-    a quarter of each gain's range of `first`, the rest anywhere."""
+    """Return points (number, gains) of the unit box: `first`, then Sobol points.
+
+    Every other Sobol point lies within 1/8 of each gain's range from `first`, the rest anywhere.
+    """
     points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
         1 << max(number - 1, 1).bit_length()
     )
@@ -195,13 +199,13 @@ def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -
 
 @partial(jax.jit, static_argnums=0)
 def _patience(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
-    """How long [s] a contact may take in training before it has failed: some of its undelayed durations."""
+    """Return the time limit [s] of a contact in training (`PATIENCE`)."""
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
-    # A noisy command never dies out, so that a contact's end is waited for longer: gains do not pay for that.
+    # A noisy command never dies out, so that every contact ends later; the limit allows for that.
     sensor = scenarios.force_sensor
     longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), LONGEST_FADING, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

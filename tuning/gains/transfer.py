@@ -1,7 +1,7 @@
-"""Gains tuned for one mechanism as a start for its neighbours.
+"""Transfer of gains tuned for one mechanism, as a start for similar mechanisms.
 
-`distance` says how alike two mechanisms are, `nearest` picks the most alike of those already tuned, and
-`carry_over` makes its gains those of another mechanism.
+`distance` measures how different two mechanisms are, `nearest` selects the nearest mechanism already tuned,
+and `carry_over` converts its gains to another mechanism.
 """
 
 import functools
@@ -21,63 +21,66 @@ from tuning.gain_file import validity_envelope
 
 
 class Traits(NamedTuple):
-    """What a mechanism's restitution without compensation depends on, nominally."""
+    """Nominal properties that determine a mechanism's restitution without compensation."""
 
     slowest: float  # omega of the slowest contact [rad/s]
-    fastest: float  # of the fastest [rad/s]
-    force_delay: float  # delay and lag of the force sensor [s]
-    simulator_delay: float  # those of the motion simulator with its command [s]
+    fastest: float  # omega of the fastest contact [rad/s]
+    force_delay: float  # delay plus lag of the force sensor [s]
+    simulator_delay: float  # delay plus lag of the motion simulator and its command [s]
     control_period: float  # [s]
     damping_ratio: float  # [1]
-    law: str  # contact law
+    law: str  # name of the contact law
     two_sided: bool  # whether there are two surfaces
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Gains that were tuned before."""
+    """Gains of an earlier tuning."""
 
-    mechanism: Mechanism  # that they were tuned for
+    mechanism: Mechanism  # mechanism they were tuned for
     gains: Mapping[str, float]  # [SI units]
-    source: str  # where they come from, as a user would say
+    source: str  # origin of the gains, for messages
 
     @functools.cached_property
     def traits(self) -> Traits:
-        """Those of the mechanism."""
+        """Return the traits of the mechanism."""
         return traits(self.mechanism)
 
 
 def distance(a: Mechanism, b: Mechanism) -> float:
-    """How unlike two mechanisms are [1]: 0 for equal ones, the same both ways.
+    """Return the distance of two mechanisms [1], which is symmetric, and 0 for equal ones.
 
-    The root of the sum of squares of
+    It is the root of the sum of squares of
 
-        ln(omega_a / omega_b)       of the slowest and of the fastest contact, half of each square
-        (pi/2) omega (tau_a - tau_b)    of the force's delay, the motion simulator's, the control period,
-                                    omega the geometric mean of all four frequencies
-        pi (xi_a - xi_b)            of the damping ratio
-        1                           for another contact law or number of surfaces
+        ln(omega_a / omega_b) / sqrt(2)     for the slowest and for the fastest contact
+        (pi/2) omega (tau_a - tau_b)        for the delays of force and motion simulator and the control
+                                            period, omega the geometric mean of all four frequencies
+        pi (xi_a - xi_b)                    for the damping ratio
+        1                                   if contact law or number of surfaces differ
 
-    so that each counts by what it does to ln e: a delay in the loop multiplies the restitution by about
+    so that each term is about its effect on ln e: a delay in the loop multiplies the restitution by about
     exp(pi omega tau / 2), damping by about exp(-pi xi).
     """
-    return _apart(traits(a), traits(b))
+    return _distance(traits(a), traits(b))
 
 
 def traits(mechanism: Mechanism) -> Traits:
-    """Of the nominal run. The stiffness k of a law that is not linear is that of the linear contact with the
-    same peak force (`validity_envelope`); xi = b/(2 sqrt(k M)), of Hunt and Crossley's law chi v/pi, from
-    e = 1 - chi v; the largest of all contacts."""
+    """Return the traits of the nominal run.
+
+    The stiffness k of a nonlinear law is that of the linear contact with the same peak force
+    (`validity_envelope`). The damping ratio, the largest of all contacts, is b/(2 sqrt(k M)), or chi v/pi for
+    Hunt and Crossley's law, from e = 1 - chi v.
+    """
     nominal = build_scenarios(mechanism)
     frequency = validity_envelope(mechanism, nominal)["contact_frequency"]
     slowest, fastest = (2 * math.pi * frequency[end] for end in ("low", "high"))
     simulator, sensor, rig = nominal.simulator, nominal.force_sensor, mechanism.rig
     # The lag of num(s)/den(s) behind a uniform motion: the difference of their slopes at s = 0.
     slopes = [
-        float(one[-2, 0] / one[-1, 0]) if len(one) > 1 else 0.0
-        for one in (np.asarray(simulator.denominator), np.asarray(simulator.numerator))
+        float(polynomial[-2, 0] / polynomial[-1, 0]) if len(polynomial) > 1 else 0.0
+        for polynomial in (np.asarray(simulator.denominator), np.asarray(simulator.numerator))
     ]
-    held = rig.command_latency - (0.5 if rig.command_hold == "zoh" else 0.0)
+    command_delay = rig.command_latency - (0.5 if rig.command_hold == "zoh" else 0.0)
     damping = float(np.max(nominal.contact.damping))
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
     law = contact_law(mechanism.contact.law)
@@ -85,7 +88,10 @@ def traits(mechanism: Mechanism) -> Traits:
         slowest=slowest,
         fastest=fastest,
         force_delay=float(sensor.delay[0] + sensor.time_constant[0]),
-        simulator_delay=float(simulator.delay[0]) + slopes[0] - slopes[1] + held * rig.control_period,
+        simulator_delay=float(simulator.delay[0])
+        + slopes[0]
+        - slopes[1]
+        + command_delay * rig.control_period,
         control_period=rig.control_period,
         damping_ratio=law.damping_ratio(damping, mass, velocity, math.sqrt(slowest * fastest)),
         law=law.name,
@@ -94,45 +100,47 @@ def traits(mechanism: Mechanism) -> Traits:
 
 
 def nearest(mechanism: Mechanism, tuned: Sequence[Tuned]) -> Tuned:
-    """The tuned mechanism least distant from `mechanism`, the first of equally distant ones."""
-    own = traits(mechanism)
-    return min(tuned, key=lambda one: _apart(own, one.traits))
+    """Return the tuned mechanism nearest to `mechanism`, the first of equally distant ones."""
+    target = traits(mechanism)
+    return min(tuned, key=lambda candidate: _distance(target, candidate.traits))
 
 
 def near_to(mechanism: AnyMechanism, sources: Sequence[Sequence[Tuned]]) -> list[Tuned]:
-    """The nearest mechanism of each source; in six axes it is not known what is near."""
+    """Return the nearest mechanism of each source; none in six axes, where no distance is defined."""
     if not isinstance(mechanism, Mechanism):
         return []
-    return [nearest(mechanism, known) for known in sources]
+    return [nearest(mechanism, tuned) for tuned in sources]
 
 
 def carry_over(
     compensator: str, gains: Mapping[str, float], source: Mechanism, target: Any
 ) -> dict[str, float]:
-    """Gains of `compensator` tuned for `source`, for `target`.
+    """Convert gains of `compensator` tuned for `source` to `target`.
 
-    Bounds and the literature's values follow from the mechanism: from its stiffness and mass, its delays, its
-    control period. What tuning found is taken relative to them. A gain on a logarithmic scale keeps its ratio
-    to the literature's value, any other its displacement from it as a share of the gain's range; both are
-    then clipped into the target's bounds. For equal mechanisms these are the very gains.
+    A gain on a logarithmic scale keeps its ratio to the literature's value. Any other gain keeps its
+    difference from the literature's value as a share of the gain's range. Both are then clipped to the
+    target's bounds. For equal mechanisms the gains do not change.
     """
-    known, wanted = literature_gains(source, compensator), literature_gains(target, compensator)
-    carried = {}
+    old_literature, new_literature = (
+        literature_gains(source, compensator),
+        literature_gains(target, compensator),
+    )
+    converted = {}
     for gain in COMPENSATORS[compensator].gains:
-        old, new = known[gain.name], wanted[gain.name]
+        old, new = old_literature[gain.name], new_literature[gain.name]
         lower, upper = float(gain.lower(target)), float(gain.upper(target))
         span = float(gain.upper(source)) - float(gain.lower(source))
-        # Written so that a factor of 1 changes no digit.
+        # In this form a factor of 1 leaves every digit of the gain unchanged.
         if gain.logarithmic and old > 0:
             value = gains[gain.name] * (new / old)
         else:
             factor = (upper - lower) / span if span > 0 else 1.0
             value = gains[gain.name] * factor + (new - old * factor)
-        carried[gain.name] = min(max(value, lower), upper)
-    return carried
+        converted[gain.name] = min(max(value, lower), upper)
+    return converted
 
 
-def _apart(ours: Traits, theirs: Traits) -> float:
+def _distance(ours: Traits, theirs: Traits) -> float:
     omega = ((ours.slowest * ours.fastest) * (theirs.slowest * theirs.fastest)) ** 0.25
     squares = [
         (math.log(ours.slowest) - math.log(theirs.slowest)) ** 2 / 2,

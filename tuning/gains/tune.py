@@ -1,4 +1,4 @@
-"""Tuning of mechanisms: scenarios, starts, solve, and judgement on scenarios that tuning never saw."""
+"""Tuning of mechanisms of one program, and evaluation of the gains on fresh scenarios."""
 
 import math
 import time
@@ -33,97 +33,104 @@ from tuning.transparency.probes import probe_figures
 
 
 class ErrorFigures(NamedTuple):
-    """What is said of the restitution errors e - e* of all contacts of a batch."""
+    """Metrics of the restitution errors e - e* of all contacts of a batch."""
 
-    rms: float  # root mean square of |e - e*| [1]
-    p99: float  # 99th percentile of it [1]
-    max: float  # maximum of it [1]
-    mean: float  # of e - e* [1]
+    rms: float  # root mean square of e - e* [1]
+    p99: float  # 99th percentile of |e - e*| [1]
+    max: float  # maximum of |e - e*| [1]
+    mean: float  # mean of e - e* [1]
     diverging: float  # share of contacts with e > e* [1]
-    peak_ratio: float  # largest |F_c| over the reference's peak force [1]
-    chatter: float  # root mean square of the chatter [1] (`jaxhil.simulation.evaluation.Outcome`)
-    failed: int  # contacts that did not end
+    peak_ratio: float  # largest |F_c| over the ideal contact's peak force [1]
+    chatter: float  # root mean square of the chatter [1] (`jaxhil.simulation.outcome.Outcome`)
+    failed: int  # number of contacts that did not end
     # 99th percentile of the largest real force over the ideal contact's peak force [1]
     peak_force_ratio: float = math.nan
     # 1st and 99th percentile of the time with a real force over the ideal contact's duration [1]
     duration_ratio: tuple[float, float] = (math.nan, math.nan)
-    # share of the contacts beyond the bounds on either (`jaxhil.simulation.contact_bounds`) [1]
+    # share of contacts with a force or duration ratio beyond `jaxhil.simulation.contact_bounds` [1]
     unlike: float = 0.0
 
 
 class Freedom(NamedTuple):
-    """How far a gain may move before the loss rises by a hundredth, as a share of its range."""
+    """Tolerance of a gain: the change that raises the loss by 1 %, as a share of the gain's range."""
 
-    alone: float  # the others held
-    together: float  # the others moved along, at their best
+    alone: float  # with all other gains fixed
+    together: float  # with all other gains at their best
 
 
 @dataclass(frozen=True)
 class TuneResult:
-    """What tuning found for one mechanism; "before" is no compensation."""
+    """Result of tuning for one mechanism; "before" means without compensation."""
 
-    compensator: str  # what was tuned
-    mechanism: AnyMechanism  # for what it was
-    gains: dict[str, float]  # all of the compensator's, as tuned
-    literature: dict[str, float]  # by the literature's rule
+    compensator: str  # compensator that was tuned
+    mechanism: AnyMechanism  # mechanism it was tuned for
+    gains: dict[str, float]  # all tuned gains of the compensator
+    literature: dict[str, float]  # gains by the literature's rule
     figures: dict[str, ErrorFigures]  # of "before", "literature" and "tuned" on the same fresh scenarios
-    nominal: dict[str, ErrorFigures]  # the same figures of the nominal run
+    nominal: dict[str, ErrorFigures]  # the same of the nominal run
     starts: list[Start]  # every start of the solver
     outcomes: dict[str, Outcome]  # on the fresh scenarios, for plots
-    scenarios: Any  # the fresh ones, for plots
-    settings: TuneSettings  # how it was tuned
-    timings: dict[str, float] = field(default_factory=dict)  # seconds by stage
+    scenarios: Any  # fresh scenarios, for plots
+    settings: TuneSettings  # settings of the tuning
+    timings: dict[str, float] = field(default_factory=dict)  # duration of each stage [s]
     intervals: ErrorIntervals | None = None  # 95 % intervals of the tuned figures
-    first: tuple[Tuned, ...] = ()  # what the last starts of the first batch took their gains from
-    freedom: dict[str, Freedom] = field(default_factory=dict)  # how far each tuned gain may move
-    global_comparison: GlobalComparison | None = None  # how far from the best anywhere, if that was searched
-    # transparency, slope and peak of each, where the scenarios are probed
+    first: tuple[Tuned, ...] = ()  # origins of the gains of the last starts of the first batch
+    freedom: dict[str, Freedom] = field(default_factory=dict)  # tolerance of each tuned gain
+    global_comparison: GlobalComparison | None = None  # comparison with a global search, if there was one
+    # transparency, slope and peak of "before", "literature" and "tuned", if the scenarios have probes
     transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
-    # of the tuned gains on the same fresh scenarios without the sensors' noise; None where there is none
+    # of the tuned gains on the same fresh scenarios without the sensors' noise; None if there is no noise
     without_noise: ErrorFigures | None = None
     quiet: bool = False  # whether these are the quietest gains within the limit, not those of least error
 
     @property
     def usual_starts(self) -> int:
-        """Starts before those that began at gains known before: the rest of the first batch."""
+        """Return the number of starts of the first batch that do not come from earlier gains (`first`)."""
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
 def tune_block(
     tasks: list[TuneTask], settings: TuneSettings, work: Work, near: list[list[Tuned]]
 ) -> list[TuneResult]:
-    """What is found for mechanisms of one program, each of which starts from gains `near` it as well."""
+    """Tune mechanisms of one program and evaluate the gains; `near` holds further starts of each."""
     clock, validation = _Clock(), build_validation(tasks, settings.validation, settings.seed, work)
-    judging, beforehand = _judging_runs(tasks, settings), _known_runs(tasks, settings)
-    work.later += judging - beforehand
-    known: dict[str, list] = {}
-    found = work.step(
+    evaluating, beforehand = _evaluation_runs(tasks, settings), _baseline_runs(tasks, settings)
+    work.later += evaluating - beforehand
+    baselines: dict[str, list] = {}
+    searched = work.step(
         "search",
         list[MultistartResult],
-        lambda: _search(validation, settings, near, lambda: known.update(_judge_known(validation))),
+        lambda: _search(
+            validation, settings, near, lambda: baselines.update(_evaluate_baselines(validation))
+        ),
     )
-    work.later -= judging - beforehand
+    work.later -= evaluating - beforehand
     clock.lap("tune")
-    work.begin(f"judging on {settings.validation} fresh scenarios", judging - (beforehand if known else 0))
-    best = [one.best.gains if one.best else task.literature for one, task in zip(found, tasks, strict=True)]
-    judged = {**(known or _judge_known(validation)), "tuned": validation.judge(best)}
+    work.begin(
+        f"judging on {settings.validation} fresh scenarios", evaluating - (beforehand if baselines else 0)
+    )
+    best = [
+        result.best.gains if result.best else task.literature
+        for result, task in zip(searched, tasks, strict=True)
+    ]
+    evaluated = {**(baselines or _evaluate_baselines(validation)), "tuned": validation.judge(best)}
     noisy = [has_sensor_noise(task.mechanism) for task in tasks]
     noiseless = validation.judge(best, noise=False) if any(noisy) else []
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
-        for i, one in enumerate(found):
-            left = FACTOR * tasks[0].lanes * sum(later.evaluations for later in found[i:])
-            work.begin(f"searching everywhere, {i + 1} of {len(found)}", left)
+        for i, result in enumerate(searched):
+            left = FACTOR * tasks[0].lanes * sum(later.evaluations for later in searched[i:])
+            work.begin(f"searching everywhere, {i + 1} of {len(searched)}", left)
             comparisons[i] = work.step(
                 "search everywhere",
                 GlobalComparison | None,
-                lambda i=i, one=one: compare_with_global_search(validation, i, one, settings),
+                lambda i=i, result=result: compare_with_global_search(validation, i, result, settings),
             )
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
-        split = {key: split_nominal(every[i][0]) for key, every in judged.items()}
+        split = {key: split_nominal(outcomes[i][0]) for key, outcomes in evaluated.items()}
         fresh = {key: outcome for key, (outcome, _) in split.items()}
         result = TuneResult(
             compensator=task.compensator,
@@ -132,30 +139,30 @@ def tune_block(
             literature=task.literature,
             figures={key: figures(outcome) for key, outcome in fresh.items()},
             nominal={key: figures(nominal) for key, (_, nominal) in split.items()},
-            starts=found[i].starts,
+            starts=searched[i].starts,
             outcomes=fresh,
             scenarios=validation.fresh[i],
             settings=settings,
             timings=clock.laps,
             intervals=error_intervals(fresh["tuned"].error, fresh["tuned"].good),
             first=tuple(near[i]),
-            freedom=_freedom(task, validation.names, found[i].best),
+            freedom=_freedom(task, validation.names, searched[i].best),
             global_comparison=comparisons[i],
-            transparency=_transparency(validation, i, {key: every[i][1] for key, every in judged.items()}),
+            transparency=_transparency(validation, i, {key: pairs[i][1] for key, pairs in evaluated.items()}),
             without_noise=figures(split_nominal(noiseless[i][0])[0]) if noisy[i] else None,
-            quiet=found[i].quiet is not None,
+            quiet=searched[i].quiet is not None,
         )
         results.append(result)
     return results
 
 
 def runs_of_block(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Simulated runs that a block takes, about."""
-    return _search_runs(tasks, settings) + _judging_runs(tasks, settings)
+    """Return the approximate number of simulated runs of `tune_block`."""
+    return _search_runs(tasks, settings) + _evaluation_runs(tasks, settings)
 
 
 def block_name(tasks: Sequence[TuneTask]) -> str:
-    """What messages call mechanisms that are tuned together."""
+    """Return the name, for messages, of mechanisms that are tuned together."""
     return tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
 
 
@@ -164,16 +171,16 @@ def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     return expected_runs(tasks, settings) if searched else 0
 
 
-def _judging_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Those of the judgement and, if one is asked for, of the search everywhere."""
+def _evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
+    """Return the runs of the evaluation and of the global search, if there is one."""
     noisy = any(has_sensor_noise(task.mechanism) for task in tasks)
-    judged = (2.0 if noisy else 1.5) * _known_runs(tasks, settings)
-    everywhere = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
-    return judged + everywhere
+    evaluation = (2.0 if noisy else 1.5) * _baseline_runs(tasks, settings)
+    global_search = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
+    return evaluation + global_search
 
 
-def _known_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Those of the judgement that do not wait for what is found."""
+def _baseline_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+    """Return the runs to evaluate no compensation and the literature's gains."""
     return 2 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
 
 
@@ -183,23 +190,25 @@ def _search(
     near: list[list[Tuned]],
     meanwhile: Callable[[], object],
 ) -> list[MultistartResult]:
-    """The best gains of every task; none where there are none to tune, or a setting is judged as it is. What
-    is done `meanwhile`, as the solver compiles, is the judgement of what is known beforehand."""
+    """Search the best gains of every task; the result is empty without gains to tune or with a setting.
+
+    `meanwhile` is called while the solver compiles.
+    """
     tasks = validation.tasks
     if settings.setting is not None or not any(task.tuned for task in tasks):
         return [MultistartResult(None, [], 0) for _ in tasks]
     compensator = tasks[0].compensator
     text = f"tuning {compensator} on {tasks[0].number} scenarios each"
-    validation.work.begin(text, expected_runs(tasks, settings) + _known_runs(tasks, settings))
+    validation.work.begin(text, expected_runs(tasks, settings) + _baseline_runs(tasks, settings))
     first = [
-        [carry_over(compensator, one.gains, one.mechanism, task.mechanism) for one in own]
-        for task, own in zip(tasks, near, strict=True)
+        [carry_over(compensator, tuned.gains, tuned.mechanism, task.mechanism) for tuned in neighbours]
+        for task, neighbours in zip(tasks, near, strict=True)
     ]
     return find_gains(validation, settings, first, meanwhile)
 
 
-def _judge_known(validation: Validation) -> dict[str, list]:
-    """What `Validation.judge` says of no compensation and of the literature's gains, known beforehand."""
+def _evaluate_baselines(validation: Validation) -> dict[str, list]:
+    """Evaluate no compensation and the literature's gains, which needs no search."""
     literature = [task.literature for task in validation.tasks]
     plain = [uncompensated(validation.tasks[0].compensator, gains) for gains in literature]
     return {
@@ -211,27 +220,27 @@ def _judge_known(validation: Validation) -> dict[str, list]:
 def _transparency(
     validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
 ) -> dict[str, dict[str, Estimate]]:
-    """Of a task under several gains, where its scenarios have probes."""
+    """Return the transparency of a task under several gains; empty if its scenarios have no probes."""
     probed = validation.probed[task]
     if probed is None:
         return {}
-    return {key: probe_figures(probed, own) for key, own in outcomes.items() if own is not None}
+    return {key: probe_figures(probed, outcome) for key, outcome in outcomes.items() if outcome is not None}
 
 
-def _freedom(task: TuneTask, names: tuple[str, ...], found: Start | None) -> dict[str, Freedom]:
-    """Of the gains tuned for the task, from the solver's last J^T J."""
+def _freedom(task: TuneTask, names: tuple[str, ...], best: Start | None) -> dict[str, Freedom]:
+    """Return the tolerances of the gains tuned for the task, from the solver's last J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
-    if found is None or not moved or not np.all(np.isfinite(found.curvature)):
+    if best is None or not moved or not np.all(np.isfinite(best.curvature)):
         return {}
-    values, vectors = np.linalg.eigh(found.curvature[np.ix_(moved, moved)])
+    values, vectors = np.linalg.eigh(best.curvature[np.ix_(moved, moved)])
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
-    known = sensitivity(root, (found.rms / SCALE) ** 2 / 2)
-    pairs = zip(known.alone, known.together, strict=True)
+    tolerances = sensitivity(root, (best.rms / SCALE) ** 2 / 2)
+    pairs = zip(tolerances.alone, tolerances.together, strict=True)
     return {names[i]: Freedom(float(a), float(b)) for i, (a, b) in zip(moved, pairs, strict=True)}
 
 
 def figures(outcome: Outcome) -> ErrorFigures:
-    """Summary of a batch; NaN where no contact ended."""
+    """Compute the metrics of a batch, NaN if no contact ended."""
     errors = outcome.error[outcome.good]
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
@@ -254,7 +263,7 @@ def figures(outcome: Outcome) -> ErrorFigures:
 
 
 def _real_contacts(outcome: Outcome) -> dict[str, Any]:
-    """Return what `ErrorFigures` says of the real contacts beside the ideal ones."""
+    """Return the fields of `ErrorFigures` that compare real with ideal contacts."""
     good = outcome.good
     lowest, highest = np.nanpercentile(outcome.duration_ratio[good], (1, 99))
     return {
@@ -265,7 +274,7 @@ def _real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:
-    """Return the metrics of each error by itself, by its name; nothing where there is but one error."""
+    """Return the metrics of each error by its name; empty if the rig model has only one error."""
     model = rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}
@@ -277,9 +286,9 @@ def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:
 
 
 def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
-    """Compensator and gains that pass the measured force on unchanged: what "before" is judged with.
+    """Return the compensator and gains that leave the measured force unchanged, for "before".
 
-    Neutral gains need no program of their own. In the place of a law that has none stands no compensation.
+    Neutral gains need no other program. A compensator without neutral gains is replaced by "none".
     """
     if all(gain.neutral is None for gain in compensator_of(compensator).gains):
         return "none", {}
@@ -287,7 +296,7 @@ def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[
 
 
 def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
-    """The gains, neutral where they can be."""
+    """Return the gains with neutral values where the compensator defines them."""
     neutral = {
         gain.name: gain.neutral for gain in compensator_of(compensator).gains if gain.neutral is not None
     }
@@ -295,6 +304,8 @@ def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]
 
 
 class _Clock:
+    """Stop watch of named stages [s]."""
+
     def __init__(self):
         self.laps, self._last = {}, time.perf_counter()
 

@@ -1,7 +1,7 @@
-"""Tuning of many mechanisms: block after block here, or side by side by the workers of a cluster.
+"""Tuning of many mechanisms, block by block in this process or in parallel by the workers of a cluster.
 
-What is found of each is kept at once, and until then every step of a search here, where there is a place
-for it (`tuning.caches.pieces`).
+Each result is cached when it is complete, and before that every step of a search in this process, if there is
+a cache (`tuning.caches.pieces`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,18 +28,18 @@ from tuning.gains.work import Work
 from tuning.statistics.bootstrap import ErrorIntervals
 from tuning.statistics.intervals import Estimate
 
-BLOCK = 16  # mechanisms tuned and judged together: what is done when work is interrupted is kept
+BLOCK = 16  # mechanisms tuned and evaluated together; an interruption loses at most one block
 
 
 class _Block(NamedTuple):
     """Mechanisms that are tuned together."""
 
-    tasks: list[TuneTask]  # one a mechanism
-    near: list[list[Tuned]]  # of each, what its last starts take their gains from
+    tasks: list[TuneTask]  # one per mechanism
+    near: list[list[Tuned]]  # per mechanism, the origins of the gains of its last starts
 
 
 class _Kept(NamedTuple):
-    """What of a result does not follow from what was asked for; its fields, and outcomes as arrays."""
+    """Cached part of a `TuneResult`: the fields that the inputs do not determine, with outcomes as arrays."""
 
     gains: dict[str, float]
     figures: dict[str, ErrorFigures]
@@ -58,7 +58,7 @@ class _Kept(NamedTuple):
 def tune(
     mechanism: AnyMechanism, compensator: str, settings: TuneSettings, work: Work | None = None
 ) -> TuneResult:
-    """Tune the gains of `compensator` for `mechanism`; the `work` hears how far it is."""
+    """Tune the gains of `compensator` for `mechanism`; `work` reports the progress."""
     return next(tune_all([mechanism], compensator, settings, work))[1]
 
 
@@ -72,44 +72,45 @@ def tune_all(
     pieces: Pieces = NOTHING_KEPT,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, TuneResult]]:
-    """(index, result) of every mechanism, as they are done: like ones together, in one program.
+    """Yield (index, result) of every mechanism, in the order in which they finish.
 
-    The gains of the nearest of those `tuned` before, with the same compensator, are a start for each, and so
-    are those of the nearest of the first block for the others: in the places of the last other starts, never
-    of the literature's. Unlike mechanisms of one `common` program are tuned together in it.
+    Mechanisms that share a program are tuned together; with a `common` program unlike ones share it too. The
+    gains of the nearest mechanism of `tuned`, with the same compensator, replace one of the last starts of
+    each mechanism, but never the literature's. So do those of the nearest mechanism of the first block in the
+    other blocks.
 
-    Each result is a piece of those kept, under its mechanism's name. It follows from all mechanisms that are
-    tuned together: the last bits of each depend on the others. With a `scheduler`, the workers of a cluster
-    tune the blocks.
+    Each result is cached in `pieces` under its mechanism's name, for the same set of mechanisms tuned
+    together, since these affect its last bits. With a `scheduler`, the workers of a cluster tune the blocks.
     """
-    work, found = work or Work(), []
+    work, first_block = work or Work(), []
     tasks = _tasks(mechanisms, compensator, settings, common)
     indices = [
         group[begin : begin + BLOCK]
         for group in _groups(tasks, settings)
         for begin in range(0, len(group), BLOCK)
     ]
-    left = sum(runs_of_block([tasks[i] for i in own], settings) for own in indices)
+    left = sum(runs_of_block([tasks[i] for i in members], settings) for members in indices)
     afterwards = work.later
-    for some in (indices[:1], indices[1:]):
-        sources = [known for known in (tuned, found) if known]
+    for groups in (indices[:1], indices[1:]):
+        sources = [source for source in (tuned, first_block) if source]
         sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
         blocks = [
-            _Block([tasks[i] for i in own], [near_to(mechanisms[i], sources) for i in own]) for own in some
+            _Block([tasks[i] for i in members], [near_to(mechanisms[i], sources) for i in members])
+            for members in groups
         ]
         work.later = afterwards + left
         if scheduler is None:
             computed = _here(blocks, settings, work, pieces)
         else:
             computed = _on_cluster(scheduler, blocks, settings, work, pieces)
-        for place, results in computed:
-            if not found:
-                found = [
-                    Tuned(one.mechanism, one.gains, one.mechanism.name)
-                    for one in results
-                    if isinstance(one.mechanism, Mechanism)
+        for index, results in computed:
+            if not first_block:
+                first_block = [
+                    Tuned(result.mechanism, result.gains, result.mechanism.name)
+                    for result in results
+                    if isinstance(result.mechanism, Mechanism)
                 ]
-            yield from zip(some[place], results, strict=True)
+            yield from zip(groups[index], results, strict=True)
         left -= sum(runs_of_block(block.tasks, settings) for block in blocks)
 
 
@@ -121,7 +122,7 @@ def _tasks(
 
 
 def _groups(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Indices of what one program serves; a user's function also gets as many contacts of all."""
+    """Group the indices of tasks that share a program and, with a user's function, the number of contacts."""
     groups = alike([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
@@ -133,50 +134,50 @@ def _groups(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
 def _here(
     blocks: list[_Block], settings: TuneSettings, work: Work, pieces: Pieces
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """(place, results) of every block, one after the other."""
-    for place, block in enumerate(blocks):
+    """Yield (index, results) of every block, in order."""
+    for index, block in enumerate(blocks):
         runs = runs_of_block(block.tasks, settings)
         work.later -= runs
         work.name = block_name(block.tasks)
-        results = _kept(block, settings, pieces)
+        results = _read(block, settings, pieces)
         if results is not None:
             work.keep("as kept", runs)
         else:
             if pieces.keeps:
                 work.journal = pieces.journal(_names(block)[0], _inputs(block, settings))
             results = tune_block(block.tasks, settings, work, block.near)
-            _keep(block, settings, pieces, map(_to_keep, results))
+            _write(block, settings, pieces, map(_to_keep, results))
             work.journal.finish()
-        yield place, results
+        yield index, results
 
 
 def _on_cluster(
     scheduler: str, blocks: list[_Block], settings: TuneSettings, work: Work, pieces: Pieces
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """(place, results) of every block, in the order in which workers finish them."""
+    """Yield (index, results) of every block, in the order in which workers finish them."""
     missing = []
-    for place, block in enumerate(blocks):
+    for index, block in enumerate(blocks):
         runs = runs_of_block(block.tasks, settings)
-        results = _kept(block, settings, pieces)
+        results = _read(block, settings, pieces)
         if results is not None:
             work.later -= runs
             work.keep("as kept", runs)
-            yield place, results
+            yield index, results
             continue
         mechanisms = [task.mechanism for task in block.tasks]
         first = block.tasks[0]
-        missing.append(Piece(place, (mechanisms, first.compensator, settings, first.common, block.near)))
+        missing.append(Piece(index, (mechanisms, first.compensator, settings, first.common, block.near)))
     what = f"tune-{digest_of([_inputs(block, settings) for block in blocks])[:16]}"
     work.begin("on the cluster", 0.0)
-    for place, content in on_workers(scheduler, tune_to_keep, missing, setting(), what):
-        block, kept = blocks[place], decode(content, list[_Kept])
+    for index, content in on_workers(scheduler, tune_to_keep, missing, setting(), what):
+        block, cached = blocks[index], decode(content, list[_Kept])
         runs = runs_of_block(block.tasks, settings)
         work.later -= runs
         work.name = block_name(block.tasks)
         work.begin("tuned on the cluster", runs)
         work.ran(runs)
-        _keep(block, settings, pieces, kept)
-        yield place, _restored(block, kept, settings)
+        _write(block, settings, pieces, cached)
+        yield index, _restored(block, cached, settings)
 
 
 def tune_to_keep(
@@ -186,18 +187,18 @@ def tune_to_keep(
     common: CommonProgram | None,
     near: list[list[Tuned]],
 ) -> bytes:
-    """What is to be kept of a block's results, on a worker."""
+    """Return the encoded part of a block's results that is cached; called on a worker."""
     tasks = _tasks(mechanisms, compensator, settings, common)
-    return encode([_to_keep(one) for one in tune_block(tasks, settings, Work(), near)])
+    return encode([_to_keep(result) for result in tune_block(tasks, settings, Work(), near)])
 
 
 def _inputs(block: _Block, settings: TuneSettings) -> list[Any]:
-    """All that a block's results follow from."""
+    """Return all inputs that determine a block's results."""
     first = block.tasks[0]
     return [
         *("tune", first.compensator, [to_builtins(task.mechanism) for task in block.tasks]),
         *(settings, first.common),
-        [[(to_builtins(one.mechanism), one.gains, one.source) for one in own] for own in block.near],
+        [[(to_builtins(t.mechanism), t.gains, t.source) for t in neighbours] for neighbours in block.near],
     ]
 
 
@@ -205,35 +206,35 @@ def _names(block: _Block) -> list[str]:
     return [f"tune {task.mechanism.name}" for task in block.tasks]
 
 
-def _kept(block: _Block, settings: TuneSettings, pieces: Pieces) -> list[TuneResult] | None:
-    """A block's results as kept from before; None if one is missing."""
+def _read(block: _Block, settings: TuneSettings, pieces: Pieces) -> list[TuneResult] | None:
+    """Read a block's results from the cache; return None if one is missing."""
     if not pieces.keeps:
         return None
     inputs = _inputs(block, settings)
-    kept = [pieces.read(name, (inputs, i), _Kept) for i, name in enumerate(_names(block))]
-    return _restored(block, kept, settings) if all(kept) else None
+    cached = [pieces.read(name, (inputs, i), _Kept) for i, name in enumerate(_names(block))]
+    return _restored(block, cached, settings) if all(cached) else None
 
 
-def _keep(block: _Block, settings: TuneSettings, pieces: Pieces, results: Iterable[_Kept]) -> None:
+def _write(block: _Block, settings: TuneSettings, pieces: Pieces, results: Iterable[_Kept]) -> None:
     if pieces.keeps:
         inputs = _inputs(block, settings)
-        for i, (name, one) in enumerate(zip(_names(block), results, strict=True)):
-            pieces.write(name, (inputs, i), one)
+        for i, (name, result) in enumerate(zip(_names(block), results, strict=True)):
+            pieces.write(name, (inputs, i), result)
 
 
 def _to_keep(result: TuneResult) -> _Kept:
     values = {name: getattr(result, name) for name in _Kept._fields}
-    outcomes = {key: [*one.metrics, *one[1:]] for key, one in result.outcomes.items()}
+    outcomes = {key: [*outcome.metrics, *outcome[1:]] for key, outcome in result.outcomes.items()}
     return _Kept(**{**values, "outcomes": outcomes})
 
 
-def _restored(block: _Block, kept: list[_Kept], settings: TuneSettings) -> list[TuneResult]:
+def _restored(block: _Block, parts: list[_Kept], settings: TuneSettings) -> list[TuneResult]:
     number, results = len(Metrics._fields), []
-    for task, near, one in zip(block.tasks, block.near, kept, strict=True):
-        arrays: dict[str, list[Any]] = {**one.outcomes}
-        outcomes = {key: Outcome(Metrics(*own[:number]), *own[number:]) for key, own in arrays.items()}
+    for task, near, cached in zip(block.tasks, block.near, parts, strict=True):
+        arrays: dict[str, list[Any]] = {**cached.outcomes}
+        outcomes = {key: Outcome(Metrics(*a[:number]), *a[number:]) for key, a in arrays.items()}
         result = TuneResult(
-            **{**one._asdict(), "outcomes": outcomes},
+            **{**cached._asdict(), "outcomes": outcomes},
             compensator=task.compensator,
             mechanism=task.mechanism,
             literature=task.literature,

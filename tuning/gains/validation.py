@@ -1,7 +1,6 @@
-"""Trying out gains without derivatives: on fresh scenarios to judge them, on training scenarios to search.
+"""Evaluation of gains without derivatives, on fresh scenarios and, for searches, on training scenarios.
 
-Both go through one compiled program, that of `jaxhil.simulation.evaluation`, with as many lanes at every
-call.
+Both use the compiled program of `jaxhil.simulation.evaluation`, with the same number of lanes in every call.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,42 +24,45 @@ from tuning.gains.work import Work
 from tuning.optimisation.unit_box import Bounds, to_coordinates
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
 
-# Draws of the validation come from another seed than those of training.
+# Offset that makes the seed of validation differ from that of training.
 VALIDATION_SEED = 0x5EED
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Like tasks with fresh scenarios, ready to be evaluated under any gains; see `build_validation`."""
+    """Evaluator of gains for like tasks with fresh scenarios, built by `build_validation`."""
 
-    tasks: list[TuneTask]  # the tasks, whose scenarios are those of training
-    fresh: list[Any]  # fresh scenarios of each
-    # the same with their transparency probes; None of each where the tasks are not probed
+    tasks: list[TuneTask]  # tasks with their training scenarios
+    fresh: list[Any]  # fresh scenarios of each task
+    # fresh scenarios of each task with their transparency probes; None for tasks without probes
     probed: list[ProbedScenarios | None]
-    loop: Any  # that of all tasks
-    names: tuple[str, ...]  # of the gains that are tuned for any of the tasks
-    bounds: list[Bounds]  # of those gains, of each task
-    # fresh scenarios of all tasks side by side, with probes if any, after each task's its nominal run
+    loop: Any  # loop of all tasks
+    names: tuple[str, ...]  # names of the gains that are tuned for any of the tasks
+    bounds: list[Bounds]  # bounds of those gains, per task
+    # lanes of all tasks: of each task the fresh scenarios, with any probes, then its nominal run
     judged: Any
     training: Any  # training scenarios, (tasks, ..., scenarios)
-    lanes: int  # of `judged` that belong to a task
-    work: Work  # hears of every run
+    lanes: int  # number of lanes of `judged` per task
+    work: Work  # progress report
 
     def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
     ) -> list[tuple[Outcome, Outcome | None]]:
-        """Of every task under its gains: outcome on fresh scenarios, the nominal run last; where tasks are
-        probed, outcome (slots, scenarios, `LANES_PER_SCENARIO`) of the fresh scenarios with their probes.
-        Of another `compensator` than that of the tasks, if one is given; or without the sensors' noise."""
+        """Evaluate one set of gains of every task on its fresh scenarios; return a pair of outcomes per task.
+
+        The first outcome is that of the fresh scenarios and, last, of the nominal run. The second one, of
+        probed tasks only, has leaves (slots, scenarios, `LANES_PER_SCENARIO`) of the scenarios with their
+        probes. `compensator` replaces that of the tasks; `noise=False` removes the sensors' noise.
+        """
         model, loop = self.tasks[0].model, self.loop
         if compensator is not None:
             loop = model.with_compensator(loop, compensator)
-        values = {name: np.repeat([one[name] for one in gains], self.lanes) for name in gains[0]}
+        values = {name: np.repeat([task[name] for task in gains], self.lanes) for name in gains[0]}
         outcome = model.begin_batch(loop, values, self._judged if noise else self._judged_without_noise)()
-        every = cut(outcome, self.lanes)
+        outcomes = cut(outcome, self.lanes)
         self.work.ran(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
-            return [(own, None) for own in every]
+            return [(outcome, None) for outcome in outcomes]
 
         def plain(leaf):
             return np.concatenate([leaf[..., :-1:LANES_PER_SCENARIO], leaf[..., -1:]], axis=-1)
@@ -68,7 +70,7 @@ class Validation:
         def with_probes(leaf):
             return leaf[..., :-1].reshape(*leaf.shape[:-1], -1, LANES_PER_SCENARIO)
 
-        return [(jax.tree.map(plain, own), jax.tree.map(with_probes, own)) for own in every]
+        return [(jax.tree.map(plain, leaves), jax.tree.map(with_probes, leaves)) for leaves in outcomes]
 
     def losses(
         self,
@@ -78,33 +80,35 @@ class Validation:
         scenarios: int | None = None,
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
-        """`objective_value` of points of the unit box on the training scenarios of the tasks `which`, or on
-        the first so many `scenarios` of each, probes counted; the objective is that of all tasks, or one of
-        each. At least so many `lanes` are computed at a time."""
+        """Return `objective_value` at points of the unit box on the training scenarios of the tasks `which`.
+
+        `scenarios` limits these to the first ones of each task, probes counted. `objective` is one of all
+        tasks or one per task. At least `lanes` lanes are computed per call.
+        """
         objectives = one_each(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
         number = lanes_of(self.training)
         number = min(scenarios or number, number)
         points = coordinates.shape[1]
-        found = np.empty((len(which), points))
+        losses = np.empty((len(which), points))
         lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
-        # As many points of all tasks in every part: the same scenarios serve all.
-        together = min(len(which), at_once)
-        each = at_once // together
-        parts = [
-            (slice(first, first + together), slice(point, point + each))
-            for first in range(0, len(which), together)
-            for point in range(0, points, each)
+        # Every call has equally many points per task, so that all calls use the same placed scenarios.
+        tasks_per_call = min(len(which), at_once)
+        points_per_call = at_once // tasks_per_call
+        calls = [
+            (slice(first, first + tasks_per_call), slice(point, point + points_per_call))
+            for first in range(0, len(which), tasks_per_call)
+            for point in range(0, points, points_per_call)
         ]
-        # A part is prepared, and another one looked through, while one between them runs.
+        # All calls are queued first, so that the device computes while the results are read.
         read = _of_terms if objectives[which[0]].function is None else _everything
         running = [
-            self._begin(noise, which[some], coordinates[some, own], number, lanes, read)
-            for some, own in parts
+            self._begin(noise, which[rows], coordinates[rows, columns], number, lanes, read)
+            for rows, columns in calls
         ]
-        for (some, own), ended in zip(parts, running, strict=True):
-            outcome, amplification = ended()
+        for (rows, columns), result in zip(calls, running, strict=True):
+            outcome, amplification = result()
             shape, pairs = amplification.shape, amplification.size
             self.work.ran(pairs * number)
             # (slots, tasks, points, scenarios)
@@ -112,24 +116,24 @@ class Validation:
             wanted = outcome.wanted.reshape(terms[0].shape)
             probes = are_probes(number) & self.tasks[0].probed
             values = self._values_of(objectives[which[0]], outcome, pairs)
-            for place, task in enumerate(which[some]):
-                asked = wanted[:, place, 0]  # a contact is asked for at every point
-                error, excess, chatter = (np.moveaxis(term[:, place], 1, 0) for term in terms)
-                found[some.start + place, own] = objective_value(
+            for index, task in enumerate(which[rows]):
+                mask = wanted[:, index, 0]  # the wanted contacts are the same at every point
+                error, excess, chatter = (np.moveaxis(term[:, index], 1, 0) for term in terms)
+                losses[rows.start + index, columns] = objective_value(
                     objectives[task],
-                    error[:, asked & ~probes],
-                    excess[:, asked],
-                    amplification[place],
-                    chatter[:, asked],
-                    error[:, asked & probes] if self.tasks[0].probed else None,
-                    None if values is None else values.reshape(shape)[place],
+                    error[:, mask & ~probes],
+                    excess[:, mask],
+                    amplification[index],
+                    chatter[:, mask],
+                    error[:, mask & probes] if self.tasks[0].probed else None,
+                    None if values is None else values.reshape(shape)[index],
                 )
-        return found
+        return losses
 
     def _values_of(
         self, objective: Objective, outcome: Outcome, pairs: int
     ) -> Float[np.ndarray, "pairs"] | None:
-        """Of the user's function, if there is one, for every pair of task and point."""
+        """Return the user's function, if there is one, for every pair of task and point."""
         if objective.function is None:
             return None
         task = self.tasks[0]
@@ -138,10 +142,13 @@ class Validation:
     def _begin(
         self, noise, which, coordinates, number, lanes, read
     ) -> Callable[[], tuple[Outcome, Float[np.ndarray, "which points"]]]:
-        """Start as many points of each task; what is returned waits for what is `read` of their outcome, and
-        for the noise's amplification."""
-        gains = [self._gains(task, own) for task, own in zip(which, coordinates, strict=True)]
-        values = {name: np.repeat([own[name] for own in gains], number) for name in self.tasks[0].literature}
+        """Start the evaluation of points of each task; return a function that waits for the result.
+
+        The result is the part of the outcome that `read` selects, and the amplification of the noise.
+        """
+        gains = [self._gains(task, points) for task, points in zip(which, coordinates, strict=True)]
+        names = self.tasks[0].literature
+        values = {name: np.repeat([task_gains[name] for task_gains in gains], number) for name in names}
         shape = coordinates.shape[:2]
         scenarios, batch = self._placed(tuple(which), shape[1], number, lanes)
         ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
@@ -151,29 +158,28 @@ class Validation:
         constants = Constants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
-        own: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
-        amplification = np.asarray(self.loop.compensator.noise_amplification(own, constants))
+        arrays: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
+        amplification = np.asarray(self.loop.compensator.noise_amplification(arrays, constants))
         return lambda: (ended(), np.mean(amplification.reshape(*shape, number), axis=-1))
 
     @cached_property
     def _judged(self) -> Batch:
-        # Where few are judged, they share the program of the training scenarios.
+        # Padded to the lanes of the training scenarios, a small batch shares their program.
         return self.tasks[0].model.place_batch(self.judged, at_least=lanes_of(self.training))
 
     @cached_property
     def _judged_without_noise(self) -> Batch:
-        # The same program: its noise is multiplied by 0.
+        # The noise is multiplied by 0, so that the same program is used.
         model = self.tasks[0].model
         return model.place_batch(model.without_noise(self.judged), at_least=lanes_of(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
-        """Training scenarios of tasks, the first so many of each, once for each of so many points; the same
-        on the devices. The last few are kept: a search asks for them again and again."""
+        """Return the cached function `_placed`, since a search needs the same scenarios many times."""
         return lru_cache(maxsize=4)(partial(_placed, self.tasks[0].model, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
-        """All of the compensator's gains at a point of the unit box."""
+        """Return all gains of the compensator at a point of the unit box."""
         return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
 
     def _gains(
@@ -184,8 +190,8 @@ class Validation:
     def coordinates(
         self, task: int, several: Sequence[Mapping[str, float]]
     ) -> Float[np.ndarray, "several gains"]:
-        """The points of the unit box where several sets of gains are."""
-        gains = np.array([[one[name] for name in self.names] for one in several])
+        """Return the points of the unit box of several sets of gains."""
+        gains = np.array([[values[name] for name in self.names] for values in several])
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 
 
@@ -194,13 +200,15 @@ def _everything(outcome: Outcome) -> Outcome:
 
 
 def _of_terms(outcome: Any) -> Any:
-    """What `contact_terms` needs of an outcome."""
+    """Return the outcome with only the fields that `contact_terms` needs."""
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
 def _placed(
     model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
+    """Return the first `number` training scenarios of tasks, once per point, on the host and the devices."""
+
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
         return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
@@ -212,9 +220,9 @@ def _placed(
 def build_validation(
     tasks: list[TuneTask], scenarios: int, seed: int, work: Work | None = None
 ) -> Validation:
-    """So many fresh scenarios of each of the tasks, which are alike (`tuning.gains.tasks.alike`)."""
+    """Draw `scenarios` fresh scenarios of each of the like tasks (`tuning.gains.tasks.alike`)."""
     drawn = [_fresh(task, scenarios, seed + VALIDATION_SEED) for task in tasks]
-    fresh, probed, judged, loops = (list(each) for each in zip(*drawn, strict=True))
+    fresh, probed, judged, loops = (list(column) for column in zip(*drawn, strict=True))
     names = tuned_names(tasks)
     return Validation(
         tasks=tasks,
@@ -234,12 +242,12 @@ def build_validation(
 
 
 def judged_runs(scenarios: int, probed: bool) -> int:
-    """Runs of a task under one set of gains, with its nominal one."""
+    """Return the number of runs of a task under one set of gains, the nominal run included."""
     return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
 
 def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
-    """What `Validation.judge` gives, as outcome of the fresh scenarios and of the nominal run."""
+    """Split an outcome of `Validation.judge` into those of the fresh scenarios and of the nominal run."""
     fresh, nominal = (
         jax.tree.map(lambda leaf, part=part: leaf[..., part], outcome)
         for part in (slice(-1), slice(-1, None))
@@ -248,13 +256,13 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
 
 
 def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
-    """Scenarios of a task that its tuning with that seed never saw."""
+    """Draw scenarios of a task that differ from its training scenarios of the same seed."""
     seed += VALIDATION_SEED
     return task.model.scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
 
 def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Fresh scenarios of a task, the same with their probes, what is judged of it, its loop."""
+    """Return a task's fresh scenarios, the same with probes (if any), its lanes to evaluate, and its loop."""
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):
