@@ -1,10 +1,10 @@
-"""Monte Carlo sweeps: scenarios by index, computed in chunks, kept in a store that survives interruptions.
+"""Monte Carlo sweeps: scenarios by index, computed in chunks, in a store that survives interruptions.
 
-What options may say is here, where nothing imports jax: it must not start before it is configured.
+The values allowed for options are defined here, without importing JAX, which must be configured first.
 """
 
 SAMPLINGS = ("random", "sobol")
 PRECISIONS = ("float64", "float32")
-MOST = 2**32  # scenarios: the noise's keys have 32 bits for the index
-LARGEST_CHUNK = 2**20  # scenarios
+MOST = 2**32  # largest number of scenarios; the noise's random keys have 32 bits for the index
+LARGEST_CHUNK = 2**20  # largest number of scenarios of a chunk
 LARGEST_SEED = 2**63 - 1

@@ -1,7 +1,7 @@
-"""Chunks of a sweep: scenarios by index through the loop, on every core, as rows of the store.
+"""Computation of the chunks of a sweep on all cores: from indices of scenarios to rows of the store.
 
-One compiled program serves every chunk. Its delay lines are made for the extremes of what can be drawn, not
-for what a chunk happens to draw, so that a scenario's rows are the same to the bit in any chunk.
+One compiled program serves every chunk. Its delay lines are sized for the extremes of all possible draws, so
+that a scenario's row is identical to the bit in any chunk.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -27,38 +27,38 @@ PERIOD = "rig.control_period"
 
 
 class Sweep(NamedTuple):
-    """What a manifest asks for, ready to run."""
+    """Sweep of a manifest with its loop, ready to run."""
 
     manifest: Manifest
-    mechanism: AnyMechanism  # of the gain file
-    loop: Any  # serves whatever can be drawn (`widest_loop`)
-    gains: dict[str, float]  # of the gain file
+    mechanism: AnyMechanism  # mechanism in the gain file
+    loop: Any  # loop for all possible draws (`widest_loop`)
+    gains: dict[str, float]  # gains in the gain file
 
     @property
     def model(self) -> RigModel:
-        """The model of the mechanism's rig."""
+        """Return the model of the mechanism's rig."""
         return rig_model(self.mechanism)
 
 
 class _Batch(NamedTuple):
     """Scenarios to run."""
 
-    first: int  # index of the first
-    draws: dict[str, np.ndarray]  # what they are made of, by dotted path
+    first: int  # index of the first scenario
+    draws: dict[str, np.ndarray]  # drawn values by dotted path
     scenarios: Any
 
 
 def build_sweep(manifest: Manifest) -> Sweep:
-    """Raises `InputError` for a manifest with an impossible gain file."""
+    """Build the sweep of a manifest; raise `InputError` if its gain file is invalid."""
     loaded = loaded_gains(manifest)
     return Sweep(manifest, loaded.mechanism, widest_loop(loaded, manifest.works), loaded.gains)
 
 
 def widest_loop(loaded: LoadedGains, works: bool) -> Any:
-    """The loop that serves whatever can be drawn."""
+    """Return the loop for all possible draws; with `works`, mechanical works are computed exactly."""
     draws = extremes(loaded.mechanism)
     if PERIOD in draws:
-        # The longest delay counted in the shortest periods.
+        # Reversed, the longest delay meets the shortest period, which needs the longest delay line.
         draws[PERIOD] = draws[PERIOD][::-1]
     model = rig_model(loaded.mechanism)
     scenarios = model.scenarios(loaded.mechanism, draws)
@@ -66,19 +66,19 @@ def widest_loop(loaded: LoadedGains, works: bool) -> Any:
 
 
 def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
-    """Rows of the scenarios number `first` to `first + number - 1`; `number` is at most the chunk's.
+    """Compute the rows of scenarios `first` to `first + number - 1`; `number` is at most that of a chunk.
 
-    A run that fails, or whose numbers are no longer finite, is a row that says so.
+    A run that fails or becomes non-finite gives a row with that status.
     """
     return _begin(sweep, _draw(sweep, first, number, precision))()
 
 
 def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
-    """Part by part its number and rows. While the caller uses them, the next part is computed already."""
+    """Yield the number and rows of each part; the next part is computed while the caller uses them."""
     running = None
     for part in parts:
-        # It waits its turn behind the one that runs, so that no core does. The first one starts threads, to
-        # which all are open.
+        # The next part is queued behind the running one, so that no core is idle. The first part starts the
+        # threads of JAX, which must be allowed to use all cores.
         with on_half_the_cores(0) if running is not None else nullcontext():
             begun = part, _begin(sweep, _draw(sweep, *sweep.manifest.part_rows(part), None))
         if running is not None:
@@ -89,15 +89,15 @@ def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows],
 
 
 def in_precision(scenarios: Any, precision: str) -> Any:
-    """Scenarios whose numbers make the program one of that precision."""
+    """Convert the scenarios' floating-point numbers, and thereby the program, to the precision."""
 
     def cast(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         if leaf.dtype.kind != "f":
             return leaf
-        # What all lanes have in common stays one number.
-        own = leaf[..., :1] if leaf.strides[-1] == 0 else leaf
-        return np.broadcast_to(own.astype(precision, copy=False), leaf.shape)
+        # A number broadcast to all lanes stays one number in memory.
+        values = leaf[..., :1] if leaf.strides[-1] == 0 else leaf
+        return np.broadcast_to(values.astype(precision, copy=False), leaf.shape)
 
     return jax.tree.map(cast, scenarios)
 
@@ -109,7 +109,7 @@ def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batc
 
 
 def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
-    """Start computing; what is returned waits for the rows."""
+    """Start the computation of a batch; return a function that waits for its rows."""
     manifest = sweep.manifest
     limit, works = manifest.largest_error, manifest.works
     read = partial(read_of, sweep.mechanism, works)

@@ -1,7 +1,7 @@
-"""Columns of a sweep's store: what is kept of every scenario, with names, units and meanings.
+"""Columns of a sweep's store, with names, units and meanings.
 
-A number per contact is a column per contact, `error_1`, `error_2`, ...; an entry of a list that is drawn
-likewise, `contact.stiffness_1`. What a contact that failed or was not reached does not have is null.
+A metric of a contact has one column per contact (`error_1`, `error_2`, ...), a drawn list one column per
+entry (`contact.stiffness_1`). Metrics that a failed or unreached contact lacks are null.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,7 +27,7 @@ UNLIKENESS = (
 )
 SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
 STATUSES = tuple(STATUS_NAMES.values())
-# From harmless to worst; the status of a run that failed is a cause by itself.
+# From harmless to worst; every status of a failed run is an outcome.
 OUTCOMES = (
     GOOD,
     BEYOND,
@@ -40,7 +40,7 @@ Kind = Literal["integer", "input", "number", "flag", "text"]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A column of the store."""
+    """Column of the store."""
 
     name: str
     kind: Kind  # inputs are in float64, numbers in the sweep's precision
@@ -49,10 +49,10 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PerContact(NamedTuple):
-    """A number that every contact has."""
+    """Metric of every contact."""
 
-    name: str  # of its column, without the contact's number
-    unit: str  # as a column's
+    name: str  # name of its column, without the contact's number
+    unit: str  # SI; "1" for a ratio
     meaning: str
 
 
@@ -71,7 +71,7 @@ PER_CONTACT = (
     PerContact("energy_in", "J", "kinetic energy of the numerical model before the contact"),
     PerContact("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
-# What episodes of six axes have of these, and in the place of the error both of theirs.
+# Metrics that six-axis episodes share with contacts; two errors replace the restitution error.
 PER_EPISODE = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
 PER_EPISODE = (*PER_EPISODE, "duration", "reference_duration", "approach_velocity")
 ERRORS_IN_SPACE = {
@@ -82,7 +82,7 @@ WORKS = (
     PerContact("work_in", "J", "work done on the mechanism by the real contact force"),
     PerContact("work_out", "J", "work returned by the mechanism"),
 )
-# Of what did not end, as the run's state is then, these are still known.
+# Metrics that are also stored for a contact that did not end, up to the end of the run.
 KNOWN_UNENDED = (
     "peak_force",
     "peak_command",
@@ -105,43 +105,43 @@ _UNITS = {
 
 
 class Slot(NamedTuple):
-    """Where a row says how one contact went, or one error of an episode."""
+    """Columns of one contact, or of one error of an episode."""
 
-    number: int  # of the contact or the episode, from 1
+    number: int  # number of the contact or episode, from 1
     error: str  # column of its error
-    status: str  # and of its status
+    status: str  # column of its status
 
 
 def slots(mechanism: AnyMechanism) -> list[Slot]:
-    """Return a slot for every row of an outcome: every contact, or every error of every episode."""
+    """Return the slots of an outcome's rows: every contact, or every error of every episode."""
     model = rig_model(mechanism)
     return error_slots(model.errors, model.runs(mechanism))
 
 
 def error_slots(errors: Iterable[str], runs: int) -> list[Slot]:
-    """Return the slots of every error of so many contacts or episodes."""
+    """Return the slots of every error of `runs` contacts or episodes."""
     numbers = range(1, runs + 1)
     return [Slot(number, f"{error}_{number}", f"status_{number}") for error in errors for number in numbers]
 
 
 def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
-    """The columns of a sweep over `mechanism`, in their order."""
+    """Return the columns of a sweep over `mechanism` in their order."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
         Column(name, "input", unit_of(mechanism, path), f"{path}, drawn")
         for path in dimensions(mechanism)
         for name in input_names(mechanism, path)
     ]
-    what = rig_model(mechanism).run_name
+    run = rig_model(mechanism).run_name
     for number in sorted({slot.number for slot in slots(mechanism)}):
         columns += [
-            Column(f"{one.name}_{number}", "number", one.unit, f"{what} {number}: {one.meaning}")
-            for one in _kept(mechanism, works)
+            Column(f"{metric.name}_{number}", "number", metric.unit, f"{run} {number}: {metric.meaning}")
+            for metric in _stored(mechanism, works)
         ]
-        columns.append(Column(f"status_{number}", "text", "", f"{what} {number}: how it ended"))
+        columns.append(Column(f"status_{number}", "text", "", f"{run} {number}: how it ended"))
     return [
         *columns,
-        Column("worst_error", "number", "1", f"the error of largest magnitude of all {what}s that ended"),
+        Column("worst_error", "number", "1", f"the error of largest magnitude of all {run}s that ended"),
         Column(
             "outcome",
             "text",
@@ -153,20 +153,20 @@ def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
 
 
 def texts_of(column: str) -> tuple[str, ...]:
-    """What a column of texts may hold; rows hold the text's place in it."""
+    """Return the allowed texts of a text column; rows hold indices into them."""
     return OUTCOMES if column == "outcome" else STATUSES
 
 
-def _kept(mechanism: AnyMechanism, works: bool) -> list[PerContact]:
-    """The numbers that every contact has."""
+def _stored(mechanism: AnyMechanism, works: bool) -> list[PerContact]:
+    """Return the metrics that are stored for every contact."""
     if rig_model(mechanism).axes == 1:
         return [*PER_CONTACT, *(WORKS if works else ())]
     errors = [PerContact(name, "1", meaning) for name, meaning in ERRORS_IN_SPACE.items()]
-    return [*errors, *(one for one in PER_CONTACT if one.name in PER_EPISODE)]
+    return [*errors, *(metric for metric in PER_CONTACT if metric.name in PER_EPISODE)]
 
 
 def unit_of(mechanism: AnyMechanism, path: str) -> str:
-    """SI unit of the mechanism file's key."""
+    """Return the SI unit of a key of the mechanism file."""
     table, _, key = path.rpartition(".")
     name = table.removeprefix("contact.")
     if not isinstance(mechanism, SixAxisMechanism):
@@ -186,21 +186,21 @@ def unit_of(mechanism: AnyMechanism, path: str) -> str:
 
 
 def input_names(mechanism: AnyMechanism, path: str) -> list[str]:
-    """Names of the columns of a key that is drawn: the path itself, or one per entry, counted from 1."""
+    """Return the columns of a drawn key: the path itself, or one name per entry, counted from 1."""
     if path == PHASE and isinstance(mechanism, Mechanism):
         shape: tuple[int, ...] = (mechanism.approach.contacts,)
     else:
         shape = np.shape(value_at(mechanism, path))
-    return [path + "".join(f"_{place + 1}" for place in index) for index in np.ndindex(*shape)]
+    return [path + "".join(f"_{entry + 1}" for entry in index) for index in np.ndindex(*shape)]
 
 
 def read_of(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
-    """What `rows_of` reads of an outcome; None in the place of all else."""
-    names = {"status", "restitution", "approach_velocity", *(one.name for one in _kept(mechanism, works))}
+    """Return the outcome with the fields that `rows_of` reads, and None for all others."""
+    names = {"status", "restitution", "approach_velocity", *(m.name for m in _stored(mechanism, works))}
     metrics = outcome.metrics
-    other: Any = dict.fromkeys(set(metrics._fields) - names)
+    unread_metrics: Any = dict.fromkeys(set(metrics._fields) - names)
     unread: Any = dict.fromkeys(("chatter", "wanted", "good", "unlike"))
-    return outcome._replace(metrics=metrics._replace(**other), **unread)
+    return outcome._replace(metrics=metrics._replace(**unread_metrics), **unread)
 
 
 def rows_of(
@@ -212,14 +212,14 @@ def rows_of(
     limit: float,
     works: bool,
 ) -> dict[str, np.ndarray]:
-    """One array (number,) per column; NaN where there is nothing to say, texts as their places."""
-    metrics, made = outcome.metrics, slots(mechanism)
+    """Return one array (number,) per column; missing metrics are NaN, texts are indices (`texts_of`)."""
+    metrics, contacts = outcome.metrics, slots(mechanism)
     number = metrics.status.shape[-1]
     rows = {"index": np.arange(first, first + number)}
     for path, values in draws.items():
         entries = np.reshape(values, (number, -1)).T
         rows.update(zip(input_names(mechanism, path), entries, strict=True))
-    status = np.asarray(metrics.status[: len(made)])
+    status = np.asarray(metrics.status[: len(contacts)])
     ended, reached = status == OK, status != NOT_REACHED
     values = {
         **{name: getattr(metrics, name) for name in metrics._fields},
@@ -229,29 +229,29 @@ def rows_of(
         "peak_ratio": outcome.peak_ratio,
         **_energies(scenarios, metrics),
     }
-    names = [one.name for one in _kept(mechanism, works)]
+    names = [metric.name for metric in _stored(mechanism, works)]
     codes = np.searchsorted(sorted(STATUS_NAMES), status).astype(np.int8)
-    for place, slot in enumerate(made):
+    for index, slot in enumerate(contacts):
         for name in set(names) & set(values):
-            known = reached[place] if name in KNOWN_UNENDED else ended[place]
-            rows[f"{name}_{slot.number}"] = np.where(known, values[name][place], np.nan)
-        rows[slot.error] = np.where(ended[place], outcome.error[place], np.nan)
-        rows[slot.status] = codes[place]
+            valid = reached[index] if name in KNOWN_UNENDED else ended[index]
+            rows[f"{name}_{slot.number}"] = np.where(valid, values[name][index], np.nan)
+        rows[slot.error] = np.where(ended[index], outcome.error[index], np.nan)
+        rows[slot.status] = codes[index]
     period = np.asarray(scenarios.control_period)
-    found = {**rows, **judge(rows, made, force_range(scenarios), period, limit)}
+    columns = {**rows, **judge(rows, contacts, force_range(scenarios), period, limit)}
     names = [column.name for column in sweep_columns(mechanism, works)]
-    return {name: found[name] for name in names if name in found}
+    return {name: columns[name] for name in names if name in columns}
 
 
 def force_range(scenarios: Any) -> np.ndarray:
-    """Largest force [N] that the sensor reads, (number,); of three channels the least."""
+    """Return the largest force [N] that the sensor reads (number,), the least of three channels."""
     if hasattr(scenarios, "sensor"):
         return np.min(np.asarray(scenarios.sensor.errors.range)[:3], axis=0)
     return np.asarray(scenarios.force_sensor.range)
 
 
 def _energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
-    """Kinetic energy [J] before and after a contact on one axis."""
+    """Return the kinetic energy [J] before and after each contact; empty in six axes."""
     if not hasattr(scenarios, "equivalent_mass"):
         return {}
     rebound = metrics.restitution * metrics.approach_velocity
@@ -269,23 +269,23 @@ def judge(
     """Return `worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
 
     Args:
-        rows: columns by name. Those of a store that an earlier version wrote have no ideal contact's peak
-            force and duration: its outcomes say nothing of them.
+        rows: columns by name. Stores of an earlier version lack the ideal contact's peak force and duration,
+            so that no row is `UNLIKE`.
         made: contacts or episodes.
-        force_range: of the force sensor [N], of every row or of all.
-        period: control period [s], likewise.
-        limit: of the error [1].
+        force_range: range of the force sensor [N], per row or of all rows.
+        period: control period [s], per row or of all rows.
+        limit: limit of the error [1].
     """
 
-    def each(names: Iterable[str]) -> np.ndarray:
+    def stacked(names: Iterable[str]) -> np.ndarray:
         return np.stack([rows[name] for name in names])
 
-    status = np.array(sorted(STATUS_NAMES))[each(slot.status for slot in made)]
-    error = each(slot.error for slot in made)
-    peak = each(f"peak_force_{slot.number}" for slot in made)
+    status = np.array(sorted(STATUS_NAMES))[stacked(slot.status for slot in made)]
+    error = stacked(slot.error for slot in made)
+    peak = stacked(f"peak_force_{slot.number}" for slot in made)
     size = np.where(status == OK, np.abs(error), -1)
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
-    # What was not reached has no peak and no shortfall: they are beyond nothing.
+    # Peak and shortfall of an unreached contact are NaN, for which the comparisons are false.
     beyond_range = peak > force_range.astype(peak.dtype)
     saturated = np.any(beyond_range, axis=0)
     for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
@@ -297,23 +297,25 @@ def judge(
 
 def _unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
     """Return which rows have a real contact that is too hard, too short or too long."""
-    found = np.zeros(len(rows["index"]), bool)
+    unlike = np.zeros(len(rows["index"]), bool)
     for number in numbers:
         ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]
         if ideal[0] is not None and ideal[1] is not None:
             force, duration = rows[f"peak_force_{number}"], rows[f"duration_{number}"]
-            found |= unlike_ideal(force, ideal[0], duration, ideal[1], period.astype(duration.dtype))
-    return found
+            unlike |= unlike_ideal(force, ideal[0], duration, ideal[1], period.astype(duration.dtype))
+    return unlike
 
 
 def _outcomes(
     status: np.ndarray, beyond: np.ndarray, unlike: np.ndarray, saturated: np.ndarray
 ) -> np.ndarray:
-    """Return the worst that can be said of every scenario, as its place in `OUTCOMES`."""
-    found = np.where(beyond, OUTCOMES.index(BEYOND), OUTCOMES.index(GOOD))
-    found = np.where(unlike, OUTCOMES.index(UNLIKE), found)
-    found = np.where(saturated, OUTCOMES.index(SATURATED), found)
+    """Return the worst outcome that applies to every scenario, as index into `OUTCOMES`."""
+    outcome = np.where(beyond, OUTCOMES.index(BEYOND), OUTCOMES.index(GOOD))
+    outcome = np.where(unlike, OUTCOMES.index(UNLIKE), outcome)
+    outcome = np.where(saturated, OUTCOMES.index(SATURATED), outcome)
     for code, name in STATUS_NAMES.items():
         if code != OK:
-            found = np.where(np.any(status == code, axis=0), np.maximum(found, OUTCOMES.index(name)), found)
-    return found.astype(np.int8)
+            outcome = np.where(
+                np.any(status == code, axis=0), np.maximum(outcome, OUTCOMES.index(name)), outcome
+            )
+    return outcome.astype(np.int8)

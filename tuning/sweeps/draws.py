@@ -1,11 +1,10 @@
-"""Scenarios by index: draw i is a function of the seed and of i alone.
+"""Draws of scenarios by index, where draw i is a function of the seed and of i only.
 
-Whatever the chunks, the devices, the number of scenarios or the interruptions, scenario i is the same, its
-sensors' noise included.
+Scenario i and its sensors' noise do not depend on chunks, devices, number of scenarios or interruptions.
 
 - `random`: independent draws, from counter-based generators (`jaxhil.mechanism.uncertainty.draw`).
-- `sobol`: R = `REPLICATES` scrambled Sobol sequences, each scrambled by itself; scenario i is point i // R of
-  sequence i % R. The means of the R sequences are independent and alike, so that an interval can be stated
+- `sobol`: R = `REPLICATES` independently scrambled Sobol sequences; scenario i is point i // R of sequence
+  i % R. The means of the R sequences are independent and identically distributed, which gives an interval
   (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised quasi-Monte Carlo).
 """
 
@@ -19,13 +18,13 @@ from jaxhil.mechanism.uncertainty import at_points, dimensions, draw
 from jaxhil.rig_models import rig_model
 
 REPLICATES = 16
-BITS = 30  # of a Sobol point's coordinate
+BITS = 30  # bits of a Sobol point's coordinate
 
 
 def drawn_scenarios(
     mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
 ) -> tuple[dict[str, np.ndarray], Any]:
-    """Draws and scenarios number `first` to `first + number - 1`; draws by dotted path, as of `draw`."""
+    """Return the draws, by dotted path as of `draw`, and scenarios `first` to `first + number - 1`."""
     if sampling == "random":
         draws = draw(mechanism, number, seed, first)
     else:
@@ -34,45 +33,45 @@ def drawn_scenarios(
 
 
 def sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:
-    """Points `first` to `first + number - 1` of the interleaved sequences, (number, dimension), within 0..1.
+    """Return points `first` to `first + number - 1` of the interleaved sequences, (number, dimension).
 
-    No coordinate is 0 or 1: each is the middle of its cell of width 2**-30.
+    Coordinates are within 0 to 1, exclusively: each is the middle of its cell of width 2**-30.
     """
     points = np.empty((number, dimension))
     for replicate in range(REPLICATES):
-        place = (replicate - first) % REPLICATES
-        if place < number:
-            rows = len(range(place, number, REPLICATES))
-            begin = (first + place) // REPLICATES
-            points[place::REPLICATES] = _sequence(dimension, seed, replicate).rows(begin, rows)
+        offset = (replicate - first) % REPLICATES
+        if offset < number:
+            rows = len(range(offset, number, REPLICATES))
+            begin = (first + offset) // REPLICATES
+            points[offset::REPLICATES] = _sequence(dimension, seed, replicate).rows(begin, rows)
     return points
 
 
 class _Sequence:
-    """One scrambled Sobol sequence, read anywhere; on from where it stands costs nothing more."""
+    """Scrambled Sobol sequence with random access; sequential reads need no fast-forward."""
 
     def __init__(self, dimension: int, seed: int, replicate: int):
-        # Takes most of a second to import.
+        # This import takes most of a second.
         from scipy.stats import qmc
 
         generator = np.random.default_rng([seed, replicate])
         self._engine = qmc.Sobol(dimension, scramble=True, bits=BITS, rng=generator)
 
     def rows(self, begin: int, number: int) -> np.ndarray:
+        """Return points `begin` to `begin + number - 1`, (number, dimension)."""
         if begin < self._engine.num_generated:
             self._engine.reset()
         if begin > self._engine.num_generated:
             self._engine.fast_forward(begin - self._engine.num_generated)
-        # A few points of a sequence have no balance to lose; all of them together have it.
         return _quiet_random(self._engine, number) + 2.0 ** -(BITS + 1)
 
 
 def _quiet_random(engine, number: int) -> np.ndarray:
+    """Return the next points without SciPy's warning about a first batch that is no power of two."""
     if number == 0:
         return np.empty((0, engine.d))
     if engine.num_generated:
         return engine.random(number)
-    # SciPy warns of a first batch that is no power of two.
     head = engine.random(1)
     return np.concatenate([head, engine.random(number - 1)]) if number > 1 else head
 

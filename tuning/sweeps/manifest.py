@@ -1,7 +1,7 @@
-"""The manifest of a sweep: everything that its rows follow from (`schema = "jaxhil/sweep/2"`), as JSON.
+"""Manifest of a sweep: all inputs that determine its rows (`schema = "jaxhil/sweep/2"`), as JSON.
 
-It is the plan before the sweep and the label of the store afterwards. `digest` of its content is in every
-part of the store, so that no part of another sweep is taken for one of this.
+It is written before the sweep and identifies the store. Every part of the store holds the `digest` of its
+content, so that parts of other sweeps are detected.
 """
 
 import json
@@ -28,61 +28,61 @@ from tuning.sweeps.draws import REPLICATES
 
 SCHEMA = "jaxhil/sweep/2"
 NAME = "manifest.json"
-CHUNK = 16384  # scenarios
-LARGEST = 8 * 1024 * 1024  # bytes
+CHUNK = 16384  # default number of scenarios per chunk
+LARGEST = 8 * 1024 * 1024  # largest size of a file [bytes]
 OTHER_COLUMNS = "columns: found others than this version writes"
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """What a sweep's rows follow from."""
+    """All inputs that determine a sweep's rows."""
 
     schema: Literal["jaxhil/sweep/2"]
-    scenarios: Annotated[int, Meta(ge=1, le=MOST)]  # the most there can be, where there is `until_width`
-    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]  # scenarios a part
+    scenarios: Annotated[int, Meta(ge=1, le=MOST)]  # number of scenarios, the largest one with `until_width`
+    chunk: Annotated[int, Meta(ge=1, le=LARGEST_CHUNK)]  # scenarios per part
     seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
     sampling: Literal["random", "sobol"]
     replicates: Annotated[int, Meta(ge=1)]  # Sobol sequences; 1 for random sampling
     precision: Literal["float64", "float32"]
-    limit: Annotated[float, Meta(ge=0)] | None  # of the restitution error; None: no limit
-    works: bool  # whether works are audited
+    limit: Annotated[float, Meta(ge=0)] | None  # limit of the restitution error [1]; None: no limit
+    works: bool  # whether mechanical works are computed
     columns: list[Column]
     gains_sha256: Digest  # digest of the gain file
-    mechanism_sha256: Digest  # of its mechanism's file
-    gain_file: dict[str, Any]  # the gain file itself
-    sources_sha256: Digest  # of the code that computed it
-    versions: dict[str, str]  # of the packages that it stands on
-    xla_flags: str  # of the compiler, as far as they may change a last bit
+    mechanism_sha256: Digest  # digest of its mechanism's file
+    gain_file: dict[str, Any]  # content of the gain file
+    sources_sha256: Digest  # digest of the code that computes the rows
+    versions: dict[str, str]  # versions of the packages that the code uses
+    xla_flags: str  # compiler flags that may change the last bits
     created: str  # date
     sha256: Digest  # digest of all but the date
-    # the sweep ends with the first part after which the confidence sequence is that narrow
+    # the sweep ends with the first part after which the confidence sequence has this width [1]
     until_width: Annotated[float, Meta(gt=0, le=1)] | None = None
 
     @property
     def parts(self) -> int:
-        """Number of parts of the store, all of `chunk` rows but the last."""
+        """Return the number of parts of the store, all of `chunk` rows but the last."""
         return -(-self.scenarios // self.chunk)
 
     @property
     def largest_error(self) -> float:
-        """The limit of the restitution error; infinite if there is none."""
+        """Return the limit of the restitution error [1]; infinite if there is none."""
         return math.inf if self.limit is None else self.limit
 
     @property
     def axes(self) -> int:
-        """How many axes the runs have, 1 or 6."""
+        """Return the number of axes, 1 or 6."""
         return self.gain_file.get("axes", 1)
 
     def part_rows(self, part: int) -> tuple[int, int]:
-        """Index of the first scenario of a part, and the number of its scenarios."""
+        """Return the index of a part's first scenario, and the number of its scenarios."""
         first = part * self.chunk
         return first, min(self.chunk, self.scenarios - first)
 
 
 class Choices(NamedTuple):
-    """What a sweep's caller chooses."""
+    """Options of a sweep, which are fields of `Manifest`."""
 
-    scenarios: int  # these and all that follow: see `Manifest`
+    scenarios: int
     seed: int = 0
     sampling: str = "random"
     precision: str = "float64"
@@ -93,7 +93,7 @@ class Choices(NamedTuple):
 
 
 def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
-    """The manifest of a sweep of a checked gain file. Raises `InputError` for an impossible choice."""
+    """Build the manifest of a sweep of a checked gain file; raise `InputError` for an invalid option."""
     if choices.sampling == "sobol" and choices.scenarios < REPLICATES:
         allowed = f"{REPLICATES} or more, the replicates of sobol sampling"
         raise InputError(f"--scenarios: found {choices.scenarios}, allowed {allowed}")
@@ -117,13 +117,13 @@ def build_manifest(loaded: LoadedGains, choices: Choices) -> Manifest:
 
 
 def encode(manifest: Manifest) -> bytes:
-    """The manifest file's content."""
+    """Return the content of the manifest file."""
     document = msgspec.to_builtins(manifest)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
 
 
 def decode(content: bytes, source: str) -> Manifest:
-    """The manifest in a file called `source`. Raises `InputError`, one line, for whatever is wrong."""
+    """Parse the content of a manifest file called `source`; raise `InputError` if it is invalid."""
     try:
         document = json.loads(content.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
@@ -134,7 +134,7 @@ def decode(content: bytes, source: str) -> Manifest:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of the store in `folder`. Raises `InputError` if there is none, or none that will do."""
+    """Read the manifest of the store in `folder`; raise `InputError` if it is missing or invalid."""
     path = folder / NAME
     source = one_line(str(path))
     try:
@@ -153,44 +153,43 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def loaded_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
-    """The gain file within a manifest, checked as if it were read."""
+    """Return the gain file within a manifest, checked like a file."""
     return check_document(manifest.gain_file, f"{source}: gain_file", any_axes=True)
 
 
 def differences(old: Manifest, new: Manifest) -> list[str]:
-    """What of the inputs is not the same, each as "key: found OLD, asked for NEW"."""
+    """Return the differences of the inputs, each as "key: found OLD, asked for NEW"."""
     keys = ("gains_sha256", *Choices._fields, "xla_flags")
     values = ((key, getattr(old, key), getattr(new, key)) for key in keys)
-    found_differences = [
+    return [
         f"{key}: found {_short(before)}, asked for {_short(now)}"
         for key, before, now in values
         if before != now
     ]
-    return found_differences
 
 
 def other_code(old: Manifest, new: Manifest) -> list[str]:
-    """What of the code that computes the rows is not the same, likewise."""
-    found_differences = _other_versions(old, new.sources_sha256, new.versions)
-    return found_differences + ([OTHER_COLUMNS] if old.columns != new.columns else [])
+    """Return the differences of the code that computes the rows, likewise."""
+    changes = _other_versions(old, new.sources_sha256, new.versions)
+    return changes + ([OTHER_COLUMNS] if old.columns != new.columns else [])
 
 
 def unlike_here(manifest: Manifest) -> list[str]:
-    """What of this process is not as the manifest says, so that its rows may differ in their last bits."""
+    """Return the differences of this process from the manifest that may change the rows' last bits."""
     flags = rounding_flags(xla_flags())
     loaded = loaded_gains(manifest)
-    found_differences = _other_versions(manifest, _sources(loaded), versions())
+    changes = _other_versions(manifest, _sources(loaded), versions())
     if flags != manifest.xla_flags:
-        found_differences.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
+        changes.append(f"xla_flags: found {_short(manifest.xla_flags)}, here {_short(flags)}")
     if manifest.columns != sweep_columns(loaded.mechanism, manifest.works):
-        found_differences.append(OTHER_COLUMNS)
-    return found_differences
+        changes.append(OTHER_COLUMNS)
+    return changes
 
 
 def _sources(loaded: LoadedGains) -> str:
     contact = loaded.mechanism.contact
-    several = contact.values() if isinstance(contact, dict) else [contact]
-    return sources_sha256(compensator_of(loaded.compensator), *(contact_law(one.law) for one in several))
+    contacts = contact.values() if isinstance(contact, dict) else [contact]
+    return sources_sha256(compensator_of(loaded.compensator), *(contact_law(c.law) for c in contacts))
 
 
 def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:
@@ -203,8 +202,8 @@ def _other_versions(manifest: Manifest, sources: str, here: Mapping[str, str]) -
     ]
 
 
-def _prefixed(found: Mapping[str, str]) -> dict[str, str]:
-    return {f"versions.{name}": number for name, number in found.items()}
+def _prefixed(packages: Mapping[str, str]) -> dict[str, str]:
+    return {f"versions.{name}": number for name, number in packages.items()}
 
 
 def _decode(document: Mapping[str, Any], source: str) -> Manifest:
@@ -217,11 +216,11 @@ def _decode(document: Mapping[str, Any], source: str) -> Manifest:
     except (msgspec.ValidationError, RecursionError) as error:
         raise InputError(f"{source}: {one_line(str(error), 160)}") from None
     try:
-        found = digest(document)
+        computed = digest(document)
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{source}: {one_line(str(error), 160)}") from None
-    if found != manifest.sha256:
-        raise InputError(f"{source}: sha256: found {manifest.sha256[:12]}..., allowed {found[:12]}...")
+    if computed != manifest.sha256:
+        raise InputError(f"{source}: sha256: found {manifest.sha256[:12]}..., allowed {computed[:12]}...")
     if manifest.until_width is not None and manifest.sampling != "random":
         raise InputError(f"{source}: until_width: found with {manifest.sampling}, allowed with random")
     for key, inner in (("gains_sha256", "sha256"), ("mechanism_sha256", "mechanism_sha256")):

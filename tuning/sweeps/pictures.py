@@ -1,6 +1,6 @@
-"""Pictures of a sweep: restitution error over its inputs, the failure region, convergence of the estimate.
+"""Plots of a sweep: restitution error over its inputs, failure region, convergence of the estimate.
 
-Written into the store's folder once its parts are there; they say nothing that the rows do not.
+They are made from the rows and written into the store's folder after its parts.
 """
 
 from collections.abc import Sequence
@@ -34,16 +34,16 @@ from tuning.sweeps.manifest import Manifest, loaded_gains
 from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile
 from tuning.sweeps.store import PICTURES, Store, kept_part
 
-FEW = 20  # contacts of a cell below which it has no quantile: a 95th percentile needs as many
+FEW = 20  # least number of contacts of a cell with a 95th percentile
 FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
-# What errors and contacts are called in six axes.
+# Terms for errors and contacts that replace those of one axis in six-axis plots.
 IN_SPACE = {
     "|e - e*|": "|error|",
     "restitution error": "errors",
     "a contact": "an episode",
     "contacts": "errors",
 }
-# Every quantile of the profile: its order, label, colour, line.
+# Order, label, colour and line style of every quantile of the profile.
 PROFILE = (
     (0.5, "half of the contacts", SKY, "-"),
     (0.95, "95 %", BLUE, "-"),
@@ -52,9 +52,9 @@ PROFILE = (
 
 
 def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figure]:
-    """The pictures by the names of their files, of the parts up to the first that is missing.
+    """Draw the plots of the parts before the first missing one; return them by file name.
 
-    One part at a time is read. `acceptable`, a probability, is drawn where the estimate converges.
+    One part is read at a time. `acceptable` is a failure probability [1] that the convergence plot shows.
     """
     manifest, mechanism = store.manifest, loaded_gains(store.manifest).mechanism
     plan = regions = None
@@ -73,22 +73,22 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
     )
     if manifest.axes == 6:
         for figure in drawn:
-            _say_in_space(figure)
+            _rename_for_six_axes(figure)
     return dict(zip(PICTURES, drawn, strict=True))
 
 
-def _say_in_space(figure: Figure) -> None:
-    """Call an error what it is in six axes, where an episode has two."""
+def _rename_for_six_axes(figure: Figure) -> None:
+    """Replace the terms of one axis by those of six axes, where an episode has two errors."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
-        said = text.get_text()
-        for one, other in IN_SPACE.items():
-            said = said.replace(one, other)
-        text.set_text(said)
+        label = text.get_text()
+        for old, new in IN_SPACE.items():
+            label = label.replace(old, new)
+        text.set_text(label)
 
 
 def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:
-    """Draw and write the pictures; their paths. Raises `InputError` when one cannot be written."""
+    """Draw and write the plots; return their paths. Raise `InputError` if one cannot be written."""
     paths = []
     for name, figure in draw_store(store, acceptable).items():
         path = Path(store.folder) / name
@@ -100,7 +100,7 @@ def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:
 
 @matplotlib.style.context("default")
 def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
-    """Quantiles of |e - e*| over the first input and, as a map, over both."""
+    """Plot quantiles of |e - e*| over the first input and, as a map, over both inputs."""
     figure = new_figure((8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85)
     two = len(plan.per_contact) == 2
     figure.subplots_adjust(left=0.095, right=0.88, hspace=0.12, wspace=0.03)
@@ -121,12 +121,12 @@ def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Fi
 
 @matplotlib.style.context("default")
 def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
-    """Scenarios as points: which failed, over both inputs, and the worst error over each."""
+    """Plot scenarios as points, failed or not, over both inputs, and the worst error over each input."""
     number = len(plan.per_scenario)
     points, limit = regions.points, _drawn_limit(manifest)
     size = (13, 4.9) if number == 2 else (7, 5.3)
-    said = f"{regions.failed} of {regions.scenarios} scenarios failed"
-    figure = new_figure(size, f"{name}: {said}", below=1.0 if number == 2 else 1.4)
+    title = f"{name}: {regions.failed} of {regions.scenarios} scenarios failed"
+    figure = new_figure(size, title, below=1.0 if number == 2 else 1.4)
     figure.subplots_adjust(wspace=0.32)
     panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
     if number == 2:
@@ -136,17 +136,17 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
     finite = points.size[np.isfinite(points.size) & (points.size > 0)]
     values = [*finite, *([limit] if limit else [])] or [1.0]
     low, high = min(values) / 1.5, max(values) * 1.5
-    # The smallest errors of all tell nothing and would take most of the axis.
+    # Very small errors would take most of the axis without being informative.
     low = max(low, 1e-4 * high)
-    for place, one in enumerate(plan.per_scenario):
-        axes = panels[place - number]
+    for index, quantity in enumerate(plan.per_scenario):
+        axes = panels[index - number]
         shown = np.clip(np.where(np.isfinite(points.size), points.size, high), low, None)
-        _draw_points(axes, points.inputs[place], shown, points.failed, points.size)
+        _draw_points(axes, points.inputs[index], shown, points.failed, points.size)
         if limit:
             axes.axhline(
                 limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}", zorder=4
             )
-        _name_axis(axes.xaxis, one, points.inputs[place])
+        _name_axis(axes.xaxis, quantity, points.inputs[index])
         axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
         plain_ticks(axes.yaxis, low, high)
     for axes in panels:
@@ -163,9 +163,9 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
 def convergence(
     plan: Plan, regions: Regions, manifest: Manifest, name: str, acceptable: float | None = None
 ) -> Figure:
-    """Failure probability and its interval against the number of scenarios, in the order of the index."""
+    """Plot the failure probability and its interval over the number of scenarios, in order of the index."""
     figure = new_figure((7.6, 5.2), f"{name}: failure probability as scenarios are added", below=1.05)
-    figure.subplots_adjust(right=0.93)  # the last number is a long one
+    figure.subplots_adjust(right=0.93)  # The last tick label is long.
     axes = figure.subplots()
     axes.set(xlabel="number of scenarios [1]", ylabel="failure probability [1]")
     looks = plan.looks[plan.looks <= regions.scenarios]
@@ -178,15 +178,17 @@ def convergence(
     if plan.replicates == 1:
         _, low, high = binomial_interval(total, looks)
         _, wide_low, wide_high = confidence_sequence(total, looks)
-        said = "95 % at a number fixed beforehand"
+        text = "95 % at a number fixed beforehand"
     else:
-        each = [replicate_interval(k, n // plan.replicates) for k, n in zip(failures, looks, strict=True)]
-        low, high = np.array([one.low for one in each]), np.array([one.high for one in each])
+        intervals = [
+            replicate_interval(k, n // plan.replicates) for k, n in zip(failures, looks, strict=True)
+        ]
+        low, high = np.array([i.low for i in intervals]), np.array([i.high for i in intervals])
         wide_low = wide_high = None
-        said = f"95 % from {plan.replicates} scrambled Sobol replicates"
+        text = f"95 % from {plan.replicates} scrambled Sobol replicates"
     axes.set_xscale("log")
-    said += f", last {low[-1]:.3g} to {high[-1]:.3g}"
-    axes.fill_between(looks, low, high, color=SKY, alpha=0.4, linewidth=0, label=said)
+    text += f", last {low[-1]:.3g} to {high[-1]:.3g}"
+    axes.fill_between(looks, low, high, color=SKY, alpha=0.4, linewidth=0, label=text)
     if wide_low is not None and wide_high is not None:
         label = "95 % at all numbers at once: stop wherever you like"
         style: dict[str, Any] = {"color": ORANGE, "linestyle": "--", "linewidth": 1.3}
@@ -209,22 +211,22 @@ def convergence(
 
 
 def plain_ticks(axis: Axis, low: float, high: float) -> None:
-    """Ticks of a logarithmic axis as plain numbers, enough of them to read off values."""
+    """Set enough ticks on a logarithmic axis to read off values, with plain numbers as labels."""
     decades = np.log10(high / low)
-    some = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
+    factors = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
     if decades < 0.9:
         axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
     else:
-        axis.set_major_locator(LogLocator(subs=some))
+        axis.set_major_locator(LogLocator(subs=factors))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: float | None) -> None:
-    """Quantiles over an input alone."""
+def _draw_profile(axes: Axes, quantity: Input, cells: int, sizes: np.ndarray, limit: float | None) -> None:
+    """Draw quantiles of |e - e*| over one input."""
     counts = sizes.reshape(cells, -1, sizes.shape[-1]).sum(axis=1)
-    edges = one.edges(cells)
-    middles = np.sqrt(edges[1:] * edges[:-1]) if one.logarithmic else (edges[1:] + edges[:-1]) / 2
+    edges = quantity.edges(cells)
+    middles = np.sqrt(edges[1:] * edges[:-1]) if quantity.logarithmic else (edges[1:] + edges[:-1]) / 2
     for order, label, colour, line in PROFILE:
         values = quantile(counts, order, round(1 / (1 - order)))
         shown = np.where(np.isfinite(values), values, np.nan)
@@ -235,7 +237,7 @@ def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: 
     axes.set_yscale("log")
     if limit:
         axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
-    _name_axis(axes.xaxis, one)
+    _name_axis(axes.xaxis, quantity)
     axes.set(xlabel="", ylabel="|e - e*| not exceeded by [1]")
     plain_ticks(axes.yaxis, *axes.get_ylim())
     finish(axes, None)
@@ -245,7 +247,7 @@ def _draw_profile(axes: Axes, one: Input, cells: int, sizes: np.ndarray, limit: 
 def _draw_map(
     figure: Figure, axes: Axes, bar: Axes, plan: Plan, sizes: np.ndarray, limit: float | None
 ) -> None:
-    """The 95th percentile per cell; with a limit, blue within it and red beyond."""
+    """Draw the 95th percentile per cell; with a limit, blue within it and red beyond."""
     first, second = plan.per_contact
     values = quantile(sizes, 0.95, FEW)
     finite = values[np.isfinite(values)]
@@ -253,8 +255,8 @@ def _draw_map(
     if limit:
         low, high = np.clip(low, limit / 100, limit / 1.5), max(high, 1.5 * limit)
         middle = float(np.log(limit / low) / np.log(high / low))
-        places = (0.0, middle / 2, middle, (1 + middle) / 2, 1.0)
-        anchors = list(zip(places, (BLUE, SKY, "white", ORANGE, VERMILION), strict=True))
+        positions = (0.0, middle / 2, middle, (1 + middle) / 2, 1.0)
+        anchors = list(zip(positions, (BLUE, SKY, "white", ORANGE, VERMILION), strict=True))
         colours = LinearSegmentedColormap.from_list("limit", anchors)
     else:
         high = max(high, 1.5 * low)
@@ -281,13 +283,14 @@ def _draw_map(
     if unended:
         handles.append(Patch(color=BLACK, label="more than 5 % did not end"))
     if handles:
-        # Below the axes: cells are everywhere inside.
+        # The legend is below the axes, whose whole area is covered with cells.
         figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=2)
 
 
 def _draw_points(
     axes: Axes, across: np.ndarray, up: np.ndarray, failed: np.ndarray, size: np.ndarray
 ) -> None:
+    """Draw scenarios as points whose marker shows whether they failed and whether all contacts ended."""
     ended = np.isfinite(size)
     for which, label, colour, marker, width in (
         (~failed, "not failed", SKY, "o", 2.0),
@@ -301,26 +304,26 @@ def _draw_points(
 
 
 def _counted(label: str, points: Points, regions: Regions) -> str:
-    """The label of points, with their number and what it is a part of."""
-    shown, of = int(np.sum(points.failed)), regions.failed
+    """Return a label of points with their number and, if only some are drawn, the total."""
+    shown, total = int(np.sum(points.failed)), regions.failed
     unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
     if label in (FAILED, UNENDED) and unended:
-        part = "" if shown == of else f" of the first {shown} of {of}"
+        part = "" if shown == total else f" of the first {shown} of {total}"
         if label == FAILED:
             return f"failed, every contact ended ({shown - unended}{part})"
         return f"{label} ({unended}{part})"
     if label == "not failed":
-        shown, of = len(points.failed) - shown, regions.scenarios - of
+        shown, total = len(points.failed) - shown, regions.scenarios - total
     elif label != FAILED:
         return label
-    return f"{label} ({of})" if shown == of else f"{label} (the first {shown} of {of})"
+    return f"{label} ({total})" if shown == total else f"{label} (the first {shown} of {total})"
 
 
 def _bar_ticks(axis: Axis, low: float, high: float) -> None:
-    """Ticks of a colour bar: both ends, and between them what is not too close to one."""
-    places = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
-    room = (high / low) ** 0.06
-    inner = [float(place) for place in places if low * room < place < high / room]
+    """Set ticks of a colour bar at both ends, and between them where they do not overlap the ends."""
+    values = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
+    gap = (high / low) ** 0.06
+    inner = [float(value) for value in values if low * gap < value < high / gap]
     axis.set_major_locator(FixedLocator([low, *inner, high]))
     axis.set_minor_locator(NullLocator())
     ends = {low: f"{float(f'{low:.2g}'):g}", high: f"{float(f'{high:.2g}'):g}"}
@@ -328,7 +331,7 @@ def _bar_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
-    """Show the later part of the way: at first the interval is wide, whatever the end."""
+    """Set the limits of the probability axis by the last 99 % of the scenarios, with narrow intervals."""
     late = looks >= looks[-1] / 100
     ends = [*low[late], *high[late], *share[late], acceptable or 0.0]
     top, least = max(ends), min(value for value in ends if value > 0)
@@ -340,25 +343,24 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
         plain_ticks(axes.yaxis, least / 3, 3 * top)
 
 
-def _name_axis(axis: Axis, one: Input, values: Sequence[float] | np.ndarray = ()) -> None:
-    """Name, scale and ends of an input's axis; `values` that are to be on it, with room for their markers,
-    may reach further."""
-    axis.set_label_text(one.label)
-    low, high = float(np.min(values, initial=one.low)), float(np.max(values, initial=one.high))
+def _name_axis(axis: Axis, quantity: Input, values: Sequence[float] | np.ndarray = ()) -> None:
+    """Set label, scale and limits of an input's axis, which also covers `values` and their markers."""
+    axis.set_label_text(quantity.label)
+    low, high = float(np.min(values, initial=quantity.low)), float(np.max(values, initial=quantity.high))
     axes, across = axis.axes, axis is axis.axes.xaxis
     scale: Any = axes.set_xscale if across else axes.set_yscale
     limits: Any = axes.set_xlim if across else axes.set_ylim
-    if one.logarithmic:
+    if quantity.logarithmic:
         scale("log")
         plain_ticks(axis, low, high)
     else:
         axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
-    room = 0.02 if len(values) else 0.0
-    ends = np.log([low, high]) if one.logarithmic else np.array([low, high])
-    ends = ends + room * (ends[1] - ends[0]) * np.array([-1, 1])
-    limits(*(np.exp(ends) if one.logarithmic else ends))
+    margin = 0.02 if len(values) else 0.0
+    ends = np.log([low, high]) if quantity.logarithmic else np.array([low, high])
+    ends = ends + margin * (ends[1] - ends[0]) * np.array([-1, 1])
+    limits(*(np.exp(ends) if quantity.logarithmic else ends))
 
 
 def _drawn_limit(manifest: Manifest) -> float | None:
-    """A limit of 0 or none has no place on a logarithmic axis."""
+    """Return the limit; None if it is 0, which a logarithmic axis cannot show."""
     return manifest.limit if manifest.limit else None

@@ -1,7 +1,7 @@
-"""Scenarios at chosen points of the unit box of all uncertain numbers, run through a sweep's own program.
+"""Scenarios at selected points of the unit box of all uncertain numbers, run by a sweep's program.
 
-They are run in pieces, here or by the workers of a cluster, each kept when it is finished: what a piece gives
-follows from the sweep and its points alone.
+They run in pieces, in this process or on the workers of a cluster. Each finished piece is cached, since its
+result depends only on the sweep and its points.
 """
 
 import hashlib
@@ -16,26 +16,26 @@ from tuning.caches.pieces import NOTHING_KEPT, Pieces
 from tuning.sweeps.chunks import Rows, Sweep, in_precision
 from tuning.sweeps.columns import rows_of
 
-FEWEST = 256  # points of a piece, where there are several
+FEWEST = 256  # least number of points per piece if there are several
 COLUMNS = ("outcome", "worst_error")
 
 Done = Callable[[int], None]  # called with a number of scenarios
 
 
 class Points(NamedTuple):
-    """A piece."""
+    """Piece of the points to run."""
 
-    name: str  # the same for the same points alone
-    points: Float[np.ndarray, "number inputs"]  # of the unit box
-    noise: Int[np.ndarray, "number"]  # indices of realisations
+    name: str  # unique name, from the digest of points and noise
+    points: Float[np.ndarray, "number inputs"]  # points of the unit box
+    noise: Int[np.ndarray, "number"]  # indices of the noise realisations
 
 
-# Runs pieces and gives their names and rows, in any order.
+# Runs pieces and yields their names and rows in any order.
 Computer = Callable[[Sweep, Iterable[Points]], Iterator[tuple[str, Rows]]]
 
 
 def run_piece(sweep: Sweep, points: np.ndarray, noise: np.ndarray) -> Rows:
-    """`COLUMNS` of the scenarios at at most a chunk's points, in order."""
+    """Compute `COLUMNS` of the scenarios at the points, at most a chunk, in order."""
     manifest = sweep.manifest
     scenarios = sweep.model.scenarios(sweep.mechanism, at_points(sweep.mechanism, points), manifest.seed)
     key = np.stack([scenarios.key[0], noise.astype(np.uint32)])
@@ -46,27 +46,27 @@ def run_piece(sweep: Sweep, points: np.ndarray, noise: np.ndarray) -> Rows:
 
 
 def run_here(sweep: Sweep, pieces: Iterable[Points]) -> Iterator[tuple[str, Rows]]:
-    """One after the other."""
+    """Run pieces one after the other in this process."""
     return ((piece.name, run_piece(sweep, piece.points, piece.noise)) for piece in pieces)
 
 
 class Running(NamedTuple):
-    """How points are run."""
+    """Settings with which points are run."""
 
-    done: Done = lambda _: None  # hears of scenarios that were run
-    found: Done = lambda _: None  # and of those that are kept from before
-    kept: Pieces = NOTHING_KEPT  # where finished pieces are kept
+    done: Done = lambda _: None  # called with the number of scenarios that were run
+    found: Done = lambda _: None  # called with the number of scenarios that were in the cache
+    kept: Pieces = NOTHING_KEPT  # cache of finished pieces
     computer: Computer = run_here
-    several: int = 1  # pieces that are wanted, where there are points enough
+    several: int = 1  # number of pieces if there are at least `FEWEST` points for each
 
 
 HERE = Running()
 
 
 def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, running: Running = HERE) -> Rows:
-    """`COLUMNS` of the scenarios at points (number, inputs) of the unit box, in order.
+    """Compute `COLUMNS` of the scenarios at points (number, inputs) of the unit box, in order.
 
-    `noise` (number,) are indices of realisations. To the bit, a scenario's do not depend on the pieces.
+    `noise` (number,) holds indices of realisations. Results do not depend on the pieces, to the bit.
     """
     number, label = len(points), sweep.manifest.sha256
     size = min(sweep.manifest.chunk, max(FEWEST, -(-number // running.several)))
@@ -75,14 +75,14 @@ def run_points(sweep: Sweep, points: np.ndarray, noise: np.ndarray, running: Run
     pieces = {piece.name: piece for piece in order}
     rows: dict[str, Rows] = {}
     for name, piece in pieces.items():
-        found = running.kept.read(name, (label, piece), dict[str, np.ndarray])
-        if found is not None:
-            rows[name] = found
+        cached = running.kept.read(name, (label, piece), dict[str, np.ndarray])
+        if cached is not None:
+            rows[name] = cached
             running.found(len(piece.points))
     missing = [piece for name, piece in pieces.items() if name not in rows]
-    for name, found in running.computer(sweep, missing) if missing else ():
-        running.kept.write(name, (label, pieces[name]), found)
-        rows[name] = found
+    for name, computed in running.computer(sweep, missing) if missing else ():
+        running.kept.write(name, (label, pieces[name]), computed)
+        rows[name] = computed
         running.done(len(pieces[name].points))
     return {column: np.concatenate([rows[piece.name][column] for piece in order]) for column in COLUMNS}
 

@@ -1,4 +1,4 @@
-"""Replay: one scenario of a store again, to the bit, and a picture of its motion."""
+"""Replay of one scenario of a store, identical to the bit, with a plot of its motion."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 
 class Replay(NamedTuple):
-    """A scenario of a store, run again."""
+    """Stored and recomputed row of a scenario."""
 
     sweep: Sweep
-    stored: dict[str, np.ndarray]  # its row, arrays of length 1
-    again: dict[str, np.ndarray]  # the row made again
+    stored: dict[str, np.ndarray]  # stored row, arrays of length 1
+    again: dict[str, np.ndarray]  # recomputed row
     different: list[str]  # names of the columns that differ
 
 
 def replay(store: Store, index: int) -> Replay:
-    """Run scenario `index` again, by itself, in the program that ran its chunk.
+    """Run scenario `index` again, alone, in the program that ran its chunk.
 
-    Raises `InputError` for an index that the store does not hold.
+    Raise `InputError` for an index that the store does not hold.
     """
     stored = read_row(store, index)
     sweep = build_sweep(store.manifest)
@@ -41,7 +41,7 @@ def replay(store: Store, index: int) -> Replay:
 
 
 def picture_of(sweep: Sweep, index: int, title: str) -> Figure:
-    """The scenario's motion tick by tick, of one axis or of six."""
+    """Plot the scenario's motion at every tick, for one axis or six."""
     if sweep.model.axes == 1:
         return contact_plot(motion_of(sweep, index), title, sensors="rig")
     from tuning.pictures.six_axes import six_axes_plot
@@ -50,7 +50,7 @@ def picture_of(sweep: Sweep, index: int, title: str) -> Figure:
 
 
 def motion_of(sweep: Sweep, index: int) -> list[Piece]:
-    """The motion of a scenario of one axis tick by tick, for plots, in float64."""
+    """Return the motion of a one-axis scenario at every tick, for plots, in float64."""
     loaded = loaded_gains(sweep.manifest)
     gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
     lane = jax.tree.map(np.asarray, _scenario(sweep, index))
@@ -58,7 +58,7 @@ def motion_of(sweep: Sweep, index: int) -> list[Piece]:
 
 
 def recorded(sweep: Sweep, index: int) -> "Recorded":
-    """Every tick of a scenario of six axes."""
+    """Record every tick of a six-axis scenario."""
     from jaxhil.sixdof.recording import record_scenario
 
     assert isinstance(sweep.mechanism, SixAxisMechanism)
@@ -67,6 +67,6 @@ def recorded(sweep: Sweep, index: int) -> "Recorded":
 
 
 def _scenario(sweep: Sweep, index: int) -> Any:
-    """A batch of one lane, in float64."""
+    """Return the scenario as a batch of one lane, in float64."""
     manifest = sweep.manifest
     return drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]

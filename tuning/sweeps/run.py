@@ -1,11 +1,11 @@
-"""Running a sweep: the parts that its store lacks, computed here or by a cluster, written here.
+"""Computation of the parts that a sweep's store lacks, in this process or by a cluster.
 
-What is computed where makes no difference to the rows. Interrupted at any moment, the store keeps the parts
-that were written, and running again goes on with those that are missing.
+The rows do not depend on where they are computed. After an interruption the store holds the parts that were
+written, and another run computes the missing ones.
 
-A sweep until its interval is as narrow as wanted looks at its parts in the order of their numbers, whatever
-order they come in, and ends at the first after which it is: where, follows from the rows alone, and parts
-beyond are removed.
+A sweep with `until_width` evaluates its parts in order of their numbers, whenever they are computed. It ends
+with the first part after which the interval is narrow enough, and removes later parts. The end depends on the
+rows only.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -20,21 +20,21 @@ from tuning.sweeps.columns import OUTCOMES, slots
 from tuning.sweeps.store import Store, read_part, remove_parts, write_part
 from tuning.sweeps.tally import Tally, add_rows, empty_tally
 
-COMPARED = 4096  # scenarios that a float32 sweep runs in float64 too
+COMPARED = 4096  # number of scenarios that a float32 sweep also runs in float64
 
-# Called with the number of rows that are there now and the tally so far: those found, then those computed.
+# Called with the number of rows of a part, found or computed, and the tally so far.
 Progress = Callable[[int, Tally], None]
-# Runs some parts of a sweep and gives their rows, in any order.
+# Computes parts of a sweep and yields their numbers and rows in any order.
 Computer = Callable[[Sweep, Iterable[int]], Generator[tuple[int, Rows], None, None]]
 
 
 class Precision(NamedTuple):
-    """The first scenarios of a sweep in float64 beside float32."""
+    """Comparison of float32 with float64 on the first scenarios of a sweep."""
 
-    scenarios: int  # how many
-    largest_difference: float | None  # of a contact's error where both ended; None if none did
-    median_difference: float | None  # of the same
-    changed_outcomes: int  # scenarios with another outcome
+    scenarios: int  # number of scenarios
+    largest_difference: float | None  # of a contact's error [1] if it ended in both; None if none did
+    median_difference: float | None  # of the same [1]
+    changed_outcomes: int  # number of scenarios with another outcome
     failed_float32: int
     failed_float64: int
 
@@ -42,9 +42,10 @@ class Precision(NamedTuple):
 def run_sweep(
     store: Store, found: Progress, computed: Progress, computer: Computer = run_parts
 ) -> tuple[Sweep, Tally]:
-    """Compute and write every part that is missing, as far as it goes: the sweep and its tally.
+    """Compute and write every missing part, up to the end of the sweep; return the sweep and its tally.
 
-    Raises `InputError` when a part cannot be written or a cluster cannot be reached.
+    `found` is called for stored parts, `computed` for new ones. Raise `InputError` if a part cannot be
+    written or a cluster cannot be reached.
     """
     manifest = store.manifest
     sweep = build_sweep(manifest)
@@ -66,16 +67,16 @@ def run_sweep(
 
 
 def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
-    """What float32 changes, on the first `number` scenarios."""
+    """Compare float32 with float64 on the first `number` scenarios."""
     number = min(number, sweep.manifest.chunk, sweep.manifest.scenarios)
     single, double = (run_chunk(sweep, 0, number, precision) for precision in ("float32", "float64"))
     names = [slot.error for slot in slots(sweep.mechanism)]
-    both = np.concatenate([np.abs(single[name].astype(float) - double[name]) for name in names])
-    both = both[np.isfinite(both)]
+    change = np.concatenate([np.abs(single[name].astype(float) - double[name]) for name in names])
+    change = change[np.isfinite(change)]
     return Precision(
         number,
-        float(np.max(both)) if len(both) else None,
-        float(np.median(both)) if len(both) else None,
+        float(np.max(change)) if len(change) else None,
+        float(np.median(change)) if len(change) else None,
         int(np.sum(single["outcome"] != double["outcome"])),
         int(np.sum(single["failed"])),
         int(np.sum(double["failed"])),
@@ -83,29 +84,29 @@ def compare_precisions(sweep: Sweep, number: int = COMPARED) -> Precision:
 
 
 def describe_outcomes(tally: Tally) -> dict[str, int]:
-    """Number of scenarios of each outcome that was met."""
+    """Return the number of scenarios of each outcome that occurred."""
     return {name: count for name, count in zip(OUTCOMES, tally.outcomes, strict=True) if count}
 
 
 def _run_until(store: Store, sweep: Sweep, found: Progress, computed: Progress, computer: Computer) -> Tally:
-    """The tally at the first part after which the interval is narrow enough, or at the last one."""
+    """Run a sweep with `until_width`; return the tally of the parts up to its end."""
     manifest = store.manifest
     tally = empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
     width: Any = manifest.until_width
-    following, own = 0, set()
+    following, new = 0, set()
 
     def look(rows: Rows) -> bool:
-        """Take the following part; whether it is the last."""
+        """Add the following part; return whether it is the last."""
         nonlocal tally, following
         tally = add_rows(tally, rows)
-        tell = computed if following in own else found
-        tell(len(rows["index"]), tally)
+        report = computed if following in new else found
+        report(len(rows["index"]), tally)
         following += 1
         assert tally.looks is not None
         return enough(tally.looks, width) or following == manifest.parts
 
     def look_at_stored() -> bool:
-        """Take what is there, up to the first gap."""
+        """Add the stored parts up to the first missing one; return whether the last part was among them."""
         while (rows := read_part(store, following)) is not None:
             if look(rows):
                 return True
@@ -116,8 +117,8 @@ def _run_until(store: Store, sweep: Sweep, found: Progress, computed: Progress, 
         with closing(computer(sweep, missing)) as parts:
             for part, rows in parts:
                 write_part(store, part, rows)
-                own.add(part)
-                # A cluster's come in any order: one that comes early waits in the store.
+                new.add(part)
+                # A cluster computes parts in any order; an early one waits in the store.
                 if part == following and (look(rows) or look_at_stored()):
                     break
     remove_parts(store, following)

@@ -1,11 +1,10 @@
-"""Studies of a sweep, kept in its store as JSON: read back to the bit, or not at all.
+"""Files of a sweep's studies in its store, as JSON that is read back exactly to the bit.
 
     DIR/studies/drivers-1024.json, rare-0.04-10x1000.json, ...
 
-A study follows to the bit from the sweep's manifest and a few arguments. Its file (`schema =
-"jaxhil/study/1"`) names both and carries a digest of its content: one that is damaged, or of another sweep,
-is as good as none, and the study can be run again. JSON knows no number that is not finite; null stands for
-the only such number that its place can have, and any other cannot be written.
+The sweep's manifest and a few arguments determine a study to the bit. Its file (`schema = "jaxhil/study/1"`)
+holds both and a digest of its content. A file that is damaged or of another sweep is ignored, and the study
+can be run again. JSON has no non-finite numbers; null stands for the only one that a field can have.
 """
 
 import json
@@ -24,7 +23,7 @@ from tuning.sweeps.store import STUDIES, Store
 from tuning.sweeps.studies import REPLICATES, SAMPLES, ErrorIndices, InputIndices
 
 SCHEMA = "jaxhil/study/1"
-# What null stands for in a record's numbers, and in fields that differ.
+# Value of null in the numbers of a record, and in fields that differ from their record.
 NULLS: dict[Any, float | None] = {InputIndices: math.nan, ErrorIndices: None, SubsetSimulation: math.inf}
 FIELD_NULLS = {"thresholds": math.nan}
 
@@ -38,9 +37,9 @@ class IndicesRequest(NamedTuple):
 class RareRequest(NamedTuple):
     """Arguments of `tuning.sweeps.studies.rare_failure`."""
 
-    limit: float  # of the restitution error
-    samples: int = SAMPLES  # per level and replicate
-    replicates: int = REPLICATES  # how often it runs
+    limit: float  # limit of the restitution error [1]
+    samples: int = SAMPLES  # samples per level and replicate
+    replicates: int = REPLICATES  # number of independent runs
 
 
 Request = IndicesRequest | RareRequest
@@ -48,7 +47,7 @@ Found = ErrorIndices | SubsetSimulation
 
 
 def study_path(store: Store, request: Request) -> Path:
-    """Where the study of such arguments is kept."""
+    """Return the path of the file of a study with these arguments."""
     if isinstance(request, IndicesRequest):
         return store.folder / STUDIES / f"drivers-{request.number}.json"
     name = f"rare-{float(request.limit)!r}-{request.replicates}x{request.samples}.json"
@@ -56,7 +55,7 @@ def study_path(store: Store, request: Request) -> Path:
 
 
 def write_study(store: Store, request: Request, found: Found) -> None:
-    """Write what a study found. Raises `InputError` when it cannot be written."""
+    """Write the result of a study; raise `InputError` if it cannot be written."""
     path = study_path(store, request)
     with writing(path):
         content = encode(store.manifest, request, found)
@@ -65,7 +64,7 @@ def write_study(store: Store, request: Request, found: Found) -> None:
 
 
 def read_study(store: Store, request: Request) -> Any:
-    """What `write_study` wrote; None if it is missing, damaged, or not of this sweep."""
+    """Read the result of a study; return None if it is missing, damaged, or of another sweep."""
     try:
         with open_plain(study_path(store, request)) as file:
             content = file.read(LARGEST + 1)
@@ -75,31 +74,31 @@ def read_study(store: Store, request: Request) -> Any:
 
 
 def encode(manifest: Manifest, request: Request, found: Found) -> bytes:
-    """The file's content. Raises ValueError for what JSON cannot express."""
+    """Return the content of a study's file; raise ValueError for values that JSON lacks."""
     document = {**_label(manifest, request), "result": _plain(found, None)}
     document["sha256"] = digest(document)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
 
 
 def decode(manifest: Manifest, request: Request, content: bytes) -> Any:
-    """What `encode` got; None for any other content than it made of the same manifest and request."""
+    """Return the result that `encode` encoded; None if the content is damaged or of another study."""
     kind = ErrorIndices if isinstance(request, IndicesRequest) else SubsetSimulation
     try:
         document = json.loads(content)
-        signed = document.pop("sha256") == digest(document)
-        result = document.pop("result")
-        found = _restored(kind, result, None)
-        signed = signed and _plain(found, None) == result
+        valid = document.pop("sha256") == digest(document)
+        content_of_result = document.pop("result")
+        result = _restored(kind, content_of_result, None)
+        valid = valid and _plain(result, None) == content_of_result
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError, msgspec.MsgspecError):
-        # A file of another making can be wrong in any way.
+        # A file of another program can be wrong in any way.
         return None
-    if not signed or document != _label(manifest, request):
+    if not valid or document != _label(manifest, request):
         return None
-    return found if isinstance(request, IndicesRequest) or _fits(found, request) else None
+    return result if isinstance(request, IndicesRequest) or _fits(result, request) else None
 
 
 def _label(manifest: Manifest, request: Request) -> dict[str, Any]:
-    """What a study's file says besides its result and the digest."""
+    """Return the entries of a study's file besides its result and the digest."""
     return {
         "schema": SCHEMA,
         "study": "drivers" if isinstance(request, IndicesRequest) else "rare",
@@ -111,12 +110,12 @@ def _label(manifest: Manifest, request: Request) -> dict[str, Any]:
 
 
 def _plain(value: Any, null: float | None) -> Any:
-    """Records as mappings, arrays as lists, the number that is not finite as None."""
+    """Convert records to mappings, arrays to lists, and the non-finite number `null` to None."""
     if hasattr(value, "_fields"):
         null = NULLS[type(value)]
-        return {name: _plain(one, FIELD_NULLS.get(name, null)) for name, one in value._asdict().items()}
+        return {name: _plain(field, FIELD_NULLS.get(name, null)) for name, field in value._asdict().items()}
     if isinstance(value, (tuple, list)):
-        return [_plain(one, null) for one in value]
+        return [_plain(element, null) for element in value]
     if isinstance(value, np.ndarray):
         return _plain(value.tolist(), null)
     if isinstance(value, float) and (value == null or (math.isnan(value) and null is math.nan)):
@@ -125,7 +124,7 @@ def _plain(value: Any, null: float | None) -> Any:
 
 
 def _restored(kind: Any, value: Any, null: float | None) -> Any:
-    """What `_plain` got, of that `kind`. Raises ValueError or TypeError for anything else."""
+    """Convert the result of `_plain` back to a `kind`; raise ValueError or TypeError if it does not fit."""
     if hasattr(kind, "_fields"):
         hints, null = get_type_hints(kind), NULLS[kind]
         if value.keys() != hints.keys():
@@ -138,14 +137,12 @@ def _restored(kind: Any, value: Any, null: float | None) -> Any:
         array[np.isnan(array)] = null
         return array
     if element := get_args(kind):
-        return tuple(_restored(element[0], one, null) for one in value)
+        return tuple(_restored(element[0], item, null) for item in value)
     return msgspec.convert(null if value is None else value, kind)
 
 
-def _fits(found: SubsetSimulation, request: RareRequest) -> bool:
-    """Whether its arrays have the shapes that belong together."""
-    each = (request.replicates,)
-    shaped = found.estimates.shape == found.formula_coefficients.shape == found.thresholds.shape[1:] == each
-    return (
-        shaped and found.worst_points.ndim == 2 and found.worst_points.shape[:1] == found.worst_values.shape
-    )
+def _fits(rare: SubsetSimulation, request: RareRequest) -> bool:
+    """Return whether the shapes of the result's arrays agree with the request and with each other."""
+    shape = (request.replicates,)
+    fits = rare.estimates.shape == rare.formula_coefficients.shape == rare.thresholds.shape[1:] == shape
+    return fits and rare.worst_points.ndim == 2 and rare.worst_points.shape[:1] == rare.worst_values.shape

@@ -1,8 +1,7 @@
-"""Two studies beside a sweep: which uncertain input drives the error, and how probable a rare failure is.
+"""Two studies of a sweep: Sobol indices of the uncertain inputs, and the probability of a rare failure.
 
-Both choose their scenarios themselves, as points of the unit box of all uncertain numbers, and run them
-through the sweep's own program. The sensors' noise is one more uncertain input, not a number that can be
-chosen: its realisation is addressed by an index.
+Both select scenarios as points of the unit box of all uncertain numbers, and run them in the sweep's program.
+The sensors' noise is a further uncertain input, whose realisation is selected by an index.
 """
 
 from typing import NamedTuple
@@ -26,47 +25,47 @@ from tuning.sweeps.points import HERE, Running, run_points
 from tuning.sweeps.tally import error_sizes
 
 NOISE = "sensor noise"
-TOGETHER = " + "  # between keys that are one input
-CAP_LIMITS = 10.0  # largest error that drivers look at, over the limit
-CAP_UNLIMITED = 10.0  # the same where there is no limit
-SAMPLES, REPLICATES = 1000, 10  # of subset simulation: per level and replicate, and how often it runs
-FAR_ABOVE = 2.0  # replicates that spread so much more than the formula says have not seen the same failures
+TOGETHER = " + "  # joins the keys that are one input
+CAP_LIMITS = 10.0  # cap on |error| for Sobol indices, in multiples of the limit
+CAP_UNLIMITED = 10.0  # cap on |error| [1] if there is no limit
+SAMPLES, REPLICATES = 1000, 10  # subset simulation: samples per level and replicate, number of replicates
+FAR_ABOVE = 2.0  # spread of replicates over the formula's, beyond which they found different failure regions
 
 
 class InputIndices(NamedTuple):
-    """The Sobol indices of an uncertain input, with intervals of 95 %; nan where nothing varies."""
+    """Sobol indices of an uncertain input, with 95 % intervals; NaN if the error does not vary."""
 
-    input: str  # its key, or the keys of numbers that vary together, joined by `TOGETHER`
-    first_order: float  # its own share of the variance
-    first_order_low: float  # end of the interval
-    first_order_high: float  # end of the interval
-    total: float  # its share with all interactions
-    total_low: float  # end of the interval
-    total_high: float  # end of the interval
+    input: str  # its key, or the keys of correlated numbers, joined by `TOGETHER`
+    first_order: float  # share of the variance without interactions [1]
+    first_order_low: float  # low end of the interval
+    first_order_high: float  # high end of the interval
+    total: float  # share of the variance with all interactions [1]
+    total_low: float  # low end of the interval
+    total_high: float  # high end of the interval
 
 
 class ErrorIndices(NamedTuple):
     """Sobol indices of the worst |error| cut at `cap`."""
 
-    inputs: tuple[InputIndices, ...]  # those of largest total index first
+    inputs: tuple[InputIndices, ...]  # in descending order of the total index
     cap: float
-    evaluations: int  # scenarios that were run
-    capped: int  # how many of them reached the cap or had no error
+    evaluations: int  # number of scenarios that were run
+    capped: int  # number of scenarios that reached the cap or had no error
 
 
 def error_indices(sweep: Sweep, number: int, running: Running = HERE) -> ErrorIndices:
-    """Sobol indices of the worst |error|, from `number` (a power of two) times inputs + 2 scenarios.
+    """Compute Sobol indices of the worst |error| from `number` (a power of two) x (inputs + 2) scenarios.
 
-    An input is a key of the mechanism's uncertainty, with all its entries; keys that are correlated are one,
-    since the indices presume independent inputs; the phases of all contacts are one, and so is noise where
-    sensors have any: the scenarios of A have one realisation each, those of B another. An error beyond
-    `CAP_LIMITS` limits, or a run without one, counts as that, lest a few runs that diverge make up all of the
+    An input is a key of the mechanism's uncertainty with all its entries. Correlated keys are one input,
+    since the indices assume independent inputs. The phases of all contacts are one input, and so is noise, if
+    there is any: rows of the design's matrix B have other realisations than those of A. An |error| beyond the
+    cap, or a run without an error, counts as the cap, so that a few diverging runs do not dominate the
     variance.
     """
     inputs = independent_inputs(sweep.mechanism)
     names, entries = list(inputs), [len(columns) for columns in inputs.values()]
     if _noisy(sweep):
-        # A column of the design that stands for nothing but which realisation it is.
+        # This column only selects between two realisations of the noise.
         names, entries = [*names, NOISE], [*entries, 1]
     order = np.argsort(np.concatenate(list(inputs.values())))
     points = saltelli_design(entries, number, sweep.manifest.seed)[:, order]
@@ -77,14 +76,13 @@ def error_indices(sweep: Sweep, number: int, running: Running = HERE) -> ErrorIn
     cap = CAP_LIMITS * limit if limit else CAP_UNLIMITED
     indices = sobol_indices(sizes, entries, number, sweep.manifest.seed, cap=cap)
     numbers = np.stack([*indices.first_order, *indices.total], axis=1)
-    found = [InputIndices(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
-    found.sort(key=lambda one: -np.nan_to_num(one.total))
-    return ErrorIndices(tuple(found), cap, len(points), int(np.sum(sizes >= cap)))
+    results = [InputIndices(name, *row.tolist()) for name, row in zip(names, numbers, strict=True)]
+    results.sort(key=lambda result: -np.nan_to_num(result.total))
+    return ErrorIndices(tuple(results), cap, len(points), int(np.sum(sizes >= cap)))
 
 
 def independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
-    """The columns that each input has among those of `dimensions`: a key's, or those of all keys that are
-    correlated."""
+    """Return the columns of each input among those of `dimensions`; correlated keys are one input."""
     columns = dimensions(mechanism)
     ends = dict(zip(columns, np.cumsum(list(columns.values())), strict=True))
     group = {key: keys for keys in correlated_groups(mechanism) for key in keys}
@@ -95,7 +93,10 @@ def independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
 
 
 def most_scenarios(samples: int = SAMPLES, replicates: int = REPLICATES) -> int:
-    """That `rare_failure` runs: each level but the first begins with a part of those of the last."""
+    """Return the largest number of scenarios that `rare_failure` runs.
+
+    Each level but the first reuses a share of the scenarios of the level before.
+    """
     return replicates * (samples + (LEVELS - 1) * (samples - samples // STEPS))
 
 
@@ -106,11 +107,11 @@ def rare_failure(
     samples: int = SAMPLES,
     replicates: int = REPLICATES,
 ) -> SubsetSimulation:
-    """Subset simulation of the probability that a scenario fails, with `limit` in the place of the sweep's.
+    """Estimate the probability that a scenario fails, by subset simulation, with `limit` [1] on the error.
 
-    The performance is the worst |error|, infinite where the scenario fails otherwise. Noise has a realisation
-    of its own in every scenario. A chain that accepts a scenario accepts its noise with it: that is a
-    proposal of noise independent of the last, so that the chain is as valid as without noise.
+    The performance is the worst |error|, infinite if the scenario fails for another reason. Every scenario
+    has its own realisation of the noise, which a chain accepts or rejects with the scenario. This is an
+    independent proposal of the noise, so that the chain keeps its distribution.
     """
     unlike, run = OUTCOMES.index(UNLIKE), 0
 
@@ -126,7 +127,7 @@ def rare_failure(
 
 
 def spread_beyond_formula(rare: SubsetSimulation) -> bool:
-    """Whether replicates differ by far more than one run's chains can explain."""
+    """Return whether replicates differ by far more than the formula for one run's chains predicts."""
     return rare.coefficient_of_variation > FAR_ABOVE * rare.formula_coefficient_of_variation
 
 

@@ -1,12 +1,10 @@
-"""What is known of a sweep while it runs: outcomes counted, errors sorted into bins, the worst scenarios, and
-the intervals that follow.
+"""Statistics of a running sweep: counts of outcomes, bins of errors, worst scenarios, and intervals.
 
-A tally is made of parts in any order, and is the same for the same parts; only one that is looked at again
-and again, to stop when enough is known, needs them by index. It takes as much memory for a million parts as
-for one.
+A tally does not depend on the order of the parts, unless it is evaluated after each part in order to stop
+early. Its memory does not depend on the number of parts.
 
-The replicates of Sobol sampling are compared at equal numbers of points: where the sweep's scenarios are no
-multiple of them, the last few, fewer than there are replicates, count as outcomes and among the worst, but
+The replicates of Sobol sampling are compared at equal numbers of points. If the number of scenarios is no
+multiple of the number of replicates, the last few scenarios count as outcomes and among the worst, but
 neither in the probability nor in the quantiles.
 """
 
@@ -25,14 +23,14 @@ ORDERS = (0.5, 0.95, 0.99, 0.999)
 
 
 class Tally(NamedTuple):
-    """What is known of the scenarios so far."""
+    """Statistics of the scenarios so far."""
 
-    outcomes: tuple[int, ...]  # scenarios of each of `OUTCOMES`
-    whole: int  # number of scenarios, counted from 0, that make whole replicates
-    replicates: tuple[tuple[int, int], ...]  # scenarios and failures of each, of whole replicates
-    errors: tuple[tuple[int, ...], ...]  # bins of the errors of each (`tuning.statistics.quantiles.counts`)
-    worst: tuple[tuple[int, float, int], ...]  # the worst first: how bad the outcome is, |error|, index
-    looks: Running | None = None  # those taken, if it is looked at part by part
+    outcomes: tuple[int, ...]  # number of scenarios of each of `OUTCOMES`
+    whole: int  # number of first scenarios that fill all replicates equally
+    replicates: tuple[tuple[int, int], ...]  # per replicate, scenarios and failures
+    errors: tuple[tuple[int, ...], ...]  # per replicate, error bins (`tuning.statistics.quantiles.counts`)
+    worst: tuple[tuple[int, float, int], ...]  # worst scenarios first: rank of the outcome, |error|, index
+    looks: Running | None = None  # confidence sequence, if the tally is evaluated part by part
 
     @property
     def scenarios(self) -> int:
@@ -44,31 +42,33 @@ class Tally(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """Scenarios that are in no whole replicate."""
+        """Return the number of scenarios that are not in `replicates`."""
         return self.scenarios - sum(number for number, _ in self.replicates)
 
 
 class Probability(NamedTuple):
-    """An estimate with an interval of 95 %."""
+    """Estimated probability with a 95 % interval."""
 
-    value: float  # the estimate [1]
-    low: float  # end of the interval
-    high: float  # end of the interval
-    method: str  # how the interval was made
+    value: float  # estimate [1]
+    low: float  # low end of the interval [1]
+    high: float  # high end of the interval [1]
+    method: str  # name of the interval's method
 
 
 class Quantile(NamedTuple):
-    """The |error| that a share `order` of the scenarios does not exceed, with an interval of 95 %."""
+    """Quantile of |error| over the scenarios, with a 95 % interval."""
 
-    order: float  # share of the scenarios [1]
-    value: float  # the estimate [1]
-    low: float  # end of the interval
-    high: float  # end of the interval
+    order: float  # share of the scenarios that do not exceed the quantile [1]
+    value: float  # estimate [1]
+    low: float  # low end of the interval [1]
+    high: float  # high end of the interval [1]
 
 
 def empty_tally(replicates: int, scenarios: int = MOST, looked_at: bool = False) -> Tally:
-    """Before any of the `scenarios` that there are to be; `looked_at`: `add_rows` gets them by index, and the
-    interval holds whenever one stops."""
+    """Return the tally of no rows, for a sweep of `scenarios`.
+
+    With `looked_at`, rows are added in order of the index, and the interval is valid at any stopping time.
+    """
     return Tally(
         (0,) * len(OUTCOMES),
         scenarios // replicates * replicates,
@@ -80,43 +80,43 @@ def empty_tally(replicates: int, scenarios: int = MOST, looked_at: bool = False)
 
 
 def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
-    """The tally with some more rows; they need `index`, `outcome`, `failed` and `worst_error`."""
+    """Return the tally with more rows, which need `index`, `outcome`, `failed` and `worst_error`."""
     index, outcome, failed = rows["index"], rows["outcome"], rows["failed"]
     outcomes = np.bincount(outcome, minlength=len(OUTCOMES))
     replicates, errors = _replicates(tally, rows)
-    # Within the limit or beyond it, the error itself says how bad it is.
+    # Scenarios that are good or beyond the limit are ranked by their error only.
     badness = np.where(outcome <= OUTCOMES.index(BEYOND), 0, outcome)
     error = np.nan_to_num(np.abs(rows["worst_error"].astype(float)), nan=-1.0, posinf=np.inf)
-    # Only those are sorted that may be among the worst.
+    # Only candidates for the worst scenarios are sorted.
     size = np.where(badness > 0, np.inf, error)
     few = np.flatnonzero(size >= np.partition(size, -WORST)[-WORST] if len(size) > WORST else size >= -1)
     first = few[np.lexsort((index[few], -error[few], -badness[few].astype(int)))[:WORST]]
-    found = [(int(badness[i]), float(error[i]), int(index[i])) for i in first]
+    worst = [(int(badness[i]), float(error[i]), int(index[i])) for i in first]
     looks = tally.looks
     return Tally(
         tuple(a + int(b) for a, b in zip(tally.outcomes, outcomes, strict=True)),
         tally.whole,
         replicates,
         errors,
-        tuple(sorted([*tally.worst, *found], key=lambda one: (-one[0], -one[1], one[2]))[:WORST]),
+        tuple(sorted([*tally.worst, *worst], key=lambda entry: (-entry[0], -entry[1], entry[2]))[:WORST]),
         None if looks is None else updated(looks, int(np.sum(failed)), len(failed)),
     )
 
 
 def error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The worst |error| of every scenario; infinite where not every contact ended."""
+    """Return the worst |error| of every scenario; infinite if a contact did not end."""
     size = np.abs(rows["worst_error"].astype(float))
     return np.where((rows["outcome"] > OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
 
 
 def failure_probability(tally: Tally) -> Probability:
-    """The probability that a scenario fails: `binomial_interval` of independent draws, `replicate_interval`
-    of Sobol replicates, `confidence_sequence` where the tally was looked at; see
-    `tuning.statistics.intervals`.
+    """Estimate the probability that a scenario fails.
 
-    While replicates are of unequal size, the interval is 0 to 1.
+    The interval (`tuning.statistics.intervals`) is `binomial_interval` for independent draws,
+    `replicate_interval` for Sobol replicates, 0 to 1 while these are of unequal size, and
+    `confidence_sequence` if the tally is evaluated part by part.
     """
-    numbers, failures = (np.array(each) for each in zip(*tally.replicates, strict=True))
+    numbers, failures = (np.array(column) for column in zip(*tally.replicates, strict=True))
     number = int(np.sum(numbers))
     value = float(np.sum(failures)) / number if number else float("nan")
     if tally.looks is not None:
@@ -133,9 +133,9 @@ def failure_probability(tally: Tally) -> Probability:
 
 
 def error_quantiles(tally: Tally) -> list[Quantile]:
-    """Quantiles of the worst |error|, of `ORDERS`; by the same sampling's rules as `failure_probability`."""
+    """Estimate the quantiles `ORDERS` of the worst |error|, with intervals as in `failure_probability`."""
     errors = np.array(tally.errors)
-    found = []
+    quantiles = []
     for order in ORDERS:
         if len(errors) == 1:
             interval = binned_quantile(errors[0], order, sequential=tally.looks is not None)
@@ -143,20 +143,20 @@ def error_quantiles(tally: Tally) -> list[Quantile]:
             interval = replicate_quantile(errors, order)
         else:
             interval = binned_estimate(np.sum(errors, axis=0), order), 0.0, np.inf
-        found.append(Quantile(order, *(float(number) for number in interval)))
-    return found
+        quantiles.append(Quantile(order, *(float(number) for number in interval)))
+    return quantiles
 
 
 def _replicates(tally: Tally, rows: Mapping[str, np.ndarray]):
-    """Scenarios and failures, and bins of the errors, of every replicate with the rows added."""
-    kept = rows["index"] < tally.whole
-    of = len(tally.replicates)
-    replicate, sizes, failed = rows["index"][kept] % of, error_sizes(rows)[kept], rows["failed"][kept]
+    """Return (scenarios, failures) and error bins of every replicate with the rows added."""
+    used = rows["index"] < tally.whole
+    replicate = rows["index"][used] % len(tally.replicates)
+    sizes, failed = error_sizes(rows)[used], rows["failed"][used]
     replicates, errors = [], []
     for number, ((n, k), bins) in enumerate(zip(tally.replicates, tally.errors, strict=True)):
-        own = replicate == number
-        replicates.append((n + int(np.sum(own)), k + int(np.sum(failed[own]))))
-        errors.append(tuple((np.array(bins) + counts(sizes[own])).tolist()))
+        mask = replicate == number
+        replicates.append((n + int(np.sum(mask)), k + int(np.sum(failed[mask]))))
+        errors.append(tuple((np.array(bins) + counts(sizes[mask])).tolist()))
     return tuple(replicates), tuple(errors)
 
 
