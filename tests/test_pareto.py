@@ -162,7 +162,7 @@ def test_all_weights_of_all_mechanisms_share_one_program(made):
 
 
 def test_points_begin_at_what_their_neighbours_found():
-    found = [pareto_search._Found({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
+    found = [pareto_search._Candidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
     assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(found)] == [
         [1, 2],
         [2, 1],
@@ -176,11 +176,11 @@ def test_what_a_start_reached_is_distinguished_from_its_noise():
     excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
     start = pareto_search.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
     broken = start._replace(rms=math.nan)
-    (one,) = pareto_search._found(task, 0.003, [broken, start])
+    (one,) = pareto_search._reached_noise(task, 0.003, [broken, start])
     assert one.excess == pytest.approx(excess) and one.error == pytest.approx(0.02, rel=1e-12)
     assert one.value(0.003) == pytest.approx(start.rms, rel=1e-12)
     # Where nothing is usable there are the literature's gains.
-    assert pareto_search._found(task, 0.003, [broken])[0].gains == task.literature
+    assert pareto_search._reached_noise(task, 0.003, [broken])[0].gains == task.literature
 
 
 @pytest.mark.slow

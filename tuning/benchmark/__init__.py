@@ -1,1 +1,1 @@
-"""Every compensator, each tuned to its own best, on the same scenarios."""
+"""Comparison of all compensators, each with its own tuned gains, on the same scenarios."""

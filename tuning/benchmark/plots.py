@@ -1,4 +1,4 @@
-"""Pictures of a comparison: errors with their intervals, and how transparent the laws are."""
+"""Plots of a comparison: errors with their intervals, and transparency of the compensators."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +12,7 @@ from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
 from tuning.benchmark.tables import best
 from tuning.pictures.plots import MARKERS
 
-COLUMNS = 4  # of panels
+COLUMNS = 4  # largest number of panels side by side
 TRANSPARENCY = {
     "early": "transparency, push at 25 % [1]",
     "late": "transparency, push at 75 % [1]",
@@ -23,9 +23,9 @@ TRANSPARENCY = {
 
 @matplotlib.style.context("default")
 def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Picture:
-    """The rms error of every law with its interval, a panel for every mechanism."""
+    """Plot the rms error of every law with its interval, one panel per mechanism."""
     keys = _keys(names, found)
-    laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
+    laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
     across = min(COLUMNS, len(names))
     down = -(-len(names) // across)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
@@ -33,15 +33,15 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
     picture = new_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
     panels = picture.subplots(down, across, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
-        by_law = {one.law: one for one in found[name]}
-        for key, off in zip(keys, _offsets(len(keys)), strict=True):
-            places = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
-            figures = [by_law[laws[i]].figures[key]["rms"] for i in places]
+        by_law = {result.law: result for result in found[name]}
+        for key, offset in zip(keys, _offsets(len(keys)), strict=True):
+            rows = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
+            errors = [by_law[laws[i]].figures[key]["rms"] for i in rows]
             colour = STYLES[key][0] if key in STYLES else GREEN
-            heights = np.array(places) + off
-            for height_, one in zip(heights, figures, strict=True):
-                panel.plot([100 * one.low, 100 * one.high], [height_, height_], color=colour, linewidth=1.5)
-            values = [100 * one.value for one in figures]
+            heights = np.array(rows) + offset
+            for y, error in zip(heights, errors, strict=True):
+                panel.plot([100 * error.low, 100 * error.high], [y, y], color=colour, linewidth=1.5)
+            values = [100 * error.value for error in errors]
             marker = MARKERS.get(key, "D")
             panel.plot(values, heights, marker, color=colour, markersize=4, label=LABELS.get(key, key))
         panel.axvline(
@@ -71,8 +71,8 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
 
 @matplotlib.style.context("default")
 def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
-    """Transparency, slope and peak force of every law, tuned: a point for every mechanism."""
-    laws = list(dict.fromkeys(one.law for name in names for one in found[name]))
+    """Plot transparency, slope and peak force of every law with its best gains, one point per mechanism."""
+    laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
     size = (12.0, 1.75 + 0.34 * len(laws))
     gains = "Tuned gains" if TUNED in _keys(names, found) else "The literature's gains"
     picture = new_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
@@ -80,12 +80,14 @@ def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigu
     picture.subplots_adjust(left=1.6 / size[0], wspace=0.08)
     for panel, (key, title) in zip(panels, TRANSPARENCY.items(), strict=True):
         low, high = (0.3, 100.0) if key == "peak" else (-1.0, 2.5)
-        for place, law in enumerate(laws):
-            values = [best(one)[key].value for name in names for one in found[name] if one.law == law]
-            spread = place + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
-            # What lies beyond is drawn at the edge.
+        for row, law in enumerate(laws):
+            values = [
+                best(result)[key].value for name in names for result in found[name] if result.law == law
+            ]
+            spread = row + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
+            # Values beyond the axis are drawn at its end.
             values = np.clip(values, low, high)
-            label = None if place else "a mechanism each, from above in the order given"
+            label = None if row else "a mechanism each, from above in the order given"
             style = {"color": STYLES[TUNED][0], "markersize": 4, "alpha": 0.6, "clip_on": False}
             panel.plot(values, spread, "o", label=label, **style)
         panel.axvline(1, color=BLACK, linewidth=1.2, linestyle="--", label="1: as in space")
@@ -102,11 +104,11 @@ def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigu
 
 
 def _keys(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> list[str]:
-    """Which gains there are figures of: the literature's, settings, tuned ones."""
-    there = {key: None for name in names for one in found[name] for key in one.figures}
-    last = {LITERATURE: 0, TUNED: 2}
-    return sorted(there, key=lambda key: last.get(key, 1))
+    """Return the names of all evaluated gains: the literature's, settings, tuned ones."""
+    keys = {key: None for name in names for result in found[name] for key in result.figures}
+    rank = {LITERATURE: 0, TUNED: 2}
+    return sorted(keys, key=lambda key: rank.get(key, 1))
 
 
 def _offsets(number: int) -> list[float]:
-    return [0.3 * (place - (number - 1) / 2) / max(number - 1, 1) for place in range(number)]
+    return [0.3 * (index - (number - 1) / 2) / max(number - 1, 1) for index in range(number)]

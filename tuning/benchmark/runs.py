@@ -1,6 +1,6 @@
-"""The runs behind the figures: plain, pushed and damped ones of one mechanism under one law.
+"""Runs of one mechanism under one law for the comparison: plain, pushed and damped ones.
 
-Of a law, all mechanisms that share a program go through one compiled program.
+All mechanisms that share a `CommonProgram` run in one compiled program per law.
 """
 
 from collections.abc import Mapping
@@ -25,17 +25,17 @@ from tuning.transparency.pushes import EARLY, LATE, Space, in_space, probed
 
 
 class Scene(NamedTuple):
-    """What every law is judged on for one mechanism; NumPy arrays."""
+    """Scenarios of one mechanism on which every law is evaluated, as NumPy arrays."""
 
     mechanism: Mechanism
-    common: CommonProgram  # the program that it shares with others
-    plain: Scenario  # its scenarios
-    twins: Scenario  # with damping added (`tuning.transparency.damping_perturbations`)
-    space: Space  # the scenarios' first contacts in space
+    common: CommonProgram  # program that the mechanism shares with others
+    plain: Scenario  # scenarios without perturbation
+    twins: Scenario  # scenarios with damping added (`tuning.transparency.damping_perturbations`)
+    space: Space  # ideal first contacts of the scenarios
 
 
 def build_scene(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> Scene:
-    """So many fresh scenarios of a mechanism."""
+    """Draw the scenarios of a mechanism and compute their ideal contacts."""
     draws = draw(mechanism, scenarios, seed)
     twin, twin_draws = perturb_damping(mechanism, draws)
     plain = common.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
@@ -48,14 +48,14 @@ def build_scene(mechanism: Mechanism, common: CommonProgram, scenarios: int, see
 def judge_gains(
     scene: Scene, law: str, gains: Mapping[str, float], limit: float, seed: int
 ) -> dict[str, Estimate]:
-    """All figures of a law under these gains; `limit` and `seed` of `tuning.transparency.figures.judge`."""
+    """Compute all metrics of a law under these gains; `limit` and `seed` as in `figures.judge`."""
     contacts, space = scene.mechanism.approach.contacts, scene.space
     runs = _runs(scene, law, gains, space)
     if contacts > 1:
-        # Later contacts are entered at the speed that the law left them.
+        # The approach speeds of later contacts depend on the law, and so do their ideal contacts.
         plain: Any = runs.plain
-        entered = np.where(plain.good, plain.metrics.approach_velocity, _nominal(scene.plain))
-        space = in_space(scene.common.law(beforehand=False), scene.plain, entered, contacts)
+        velocity = np.where(plain.good, plain.metrics.approach_velocity, _nominal(scene.plain))
+        space = in_space(scene.common.law(beforehand=False), scene.plain, velocity, contacts)
         runs = _runs(scene, law, gains, space)
     return judge(
         runs,
@@ -69,17 +69,17 @@ def judge_gains(
 
 
 def lanes_judged(scene: Scene) -> int:
-    """How many lanes are run for the figures of one set of gains."""
+    """Return the number of lanes that `judge_gains` runs."""
     return len(Runs._fields) * len(scene.plain.velocity) * (1 + (scene.mechanism.approach.contacts > 1))
 
 
 def _runs(scene: Scene, law: str, gains: Mapping[str, float], space: Space) -> Runs:
-    """All runs that figures take, as one batch, beside these contacts in space."""
+    """Run all scenarios of the metrics as one batch; `space` holds their ideal contacts."""
     pushed = [probed(scene.plain, space, share) for share in (EARLY, LATE)]
     scenarios = join([probed(scene.plain, space), *pushed, probed(scene.twins, space)])
     loop = scene.common.loop(build_loop(scene.mechanism, law, scenarios))
-    every = {name: np.full(len(scenarios.velocity), value) for name, value in gains.items()}
-    return Runs(*cut(evaluate(loop, every, scenarios), len(scene.plain.velocity)))
+    values = {name: np.full(len(scenarios.velocity), value) for name, value in gains.items()}
+    return Runs(*cut(evaluate(loop, values, scenarios), len(scene.plain.velocity)))
 
 
 def _nominal(scenarios: Scenario) -> Any:
@@ -87,7 +87,7 @@ def _nominal(scenarios: Scenario) -> Any:
 
 
 def _amplification(scene: Scene, law: str, gains: Mapping[str, float]) -> float:
-    """The mean over the scenarios, whose control periods may differ."""
+    """Return the noise amplification [1], averaged over the scenarios' control periods."""
     period, clearance = jnp.asarray(scene.plain.control_period), jnp.asarray(scene.plain.clearance)
-    own = {name: jnp.full_like(period, value) for name, value in gains.items()}
-    return float(jnp.mean(COMPENSATORS[law].noise_amplification(own, Constants(period, clearance))))
+    values = {name: jnp.full_like(period, value) for name, value in gains.items()}
+    return float(jnp.mean(COMPENSATORS[law].noise_amplification(values, Constants(period, clearance))))

@@ -1,8 +1,8 @@
-"""The comparison itself: each law tuned to its own best, all judged on the same scenarios and probes.
+"""Comparison of compensators, each with tuned gains, on the same scenarios and probes.
 
-Laws, and groups of mechanisms that share a program, go to as many processes as there are cores, each with
-few devices: compiling takes most of the time, and one process compiles on one core. No figure depends on
-which process computes it. What is found of a law on a group is kept at once, where there is a place for it
+Laws, and groups of mechanisms that share a program, are distributed to as many processes as there are cores,
+each with few devices, since most of the time is compilation, which uses one core per process. Results do not
+depend on the process. The result of a law on a group is cached at once, if there is a cache
 (`tuning.caches.pieces`).
 """
 
@@ -26,8 +26,8 @@ from tuning.caches.worker import setting
 from tuning.statistics.intervals import Estimate
 
 LITERATURE, TUNED = "literature", "tuned"
-SEED = 0xFA1  # of the scenarios to judge on: tuning and its own validation never see them
-SECONDS = 1.0  # between two messages of a process
+SEED = 0xFA1  # offset of the evaluation's seed, which differs from those of tuning and its validation
+SECONDS = 1.0  # least time between two messages of a process [s]
 
 Tell = Callable[[str, float], None]
 
@@ -36,40 +36,42 @@ Tell = Callable[[str, float], None]
 class CompareSettings:
     """Settings of a comparison."""
 
-    scenarios: int = 32  # to tune on
-    starts: int = 3  # of the solver
-    steps: int = 16  # of the solver, at most
-    polish: int = 20  # evaluations without derivatives, for each gain
+    scenarios: int = 32  # number of training scenarios
+    starts: int = 3  # starts of the solver
+    steps: int = 16  # largest number of solver steps per start
+    polish: int = 20  # evaluations without derivatives per gain
     scanned: int = 64  # points of a scan for starts
-    judged: int = 256  # scenarios to judge on
+    judged: int = 256  # number of scenarios for the evaluation
     limit: float = 0.01  # error beyond which a contact counts as a failure [1]
-    seed: int = 0  # of scenarios, starts and resampling
-    tuned: bool = True  # whether to tune at all
+    seed: int = 0  # seed of scenarios, starts and resampling
+    tuned: bool = True  # whether to tune
 
 
 class LawFigures(NamedTuple):
-    """Of one law on one mechanism; a law without gains to tune, or with settings for any mechanism, is not
-    there with tuned gains."""
+    """Metrics of one law on one mechanism.
+
+    There are no tuned gains of a law that has no gains to tune, or that has settings for any mechanism.
+    """
 
     law: str
     mechanism: str
     gains: dict[str, dict[str, float]]  # by "literature", names of settings and "tuned"
-    figures: dict[str, dict[str, Estimate]]  # what is said of each (`tuning.transparency.figures`)
+    figures: dict[str, dict[str, Estimate]]  # metrics under each of `gains` (`tuning.transparency.figures`)
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Names of the settings that it was judged with beside its nominal gains."""
+        """Return the names of the evaluated settings."""
         return tuple(which for which in self.figures if which not in (LITERATURE, TUNED))
 
 
 class Failed(NamedTuple):
-    """A law that could not be judged on some mechanisms, and why; the others are none the worse for it."""
+    """Failure of the evaluation of a law on a group of mechanisms, with its reason."""
 
     law: str
     reason: str
 
 
-Judged = tuple[list[Any], str, list[LawFigures] | Failed]  # a group's scenes, a law, what was found
+Judged = tuple[list[Any], str, list[LawFigures] | Failed]  # scenes of a group, law, result
 
 
 def compare(
@@ -81,56 +83,58 @@ def compare(
     pieces: Pieces = NOTHING_KEPT,
     scheduler: str | None = None,
 ) -> Iterator[LawFigures | Failed]:
-    """What is found of each law on every mechanism, as it is done: in so many processes or, with 0 of them,
-    one after the other in this one, where an error ends all; with a `scheduler`, by the workers of a cluster.
-    `tell` is called with what is going on, how many results are there, shares of those under way counted, and
-    how many were kept from before."""
-    kept = _kept(mechanisms, laws, settings, pieces) if pieces.resumes else []
-    yield from kept
-    there = {(one.mechanism, one.law) for one in kept}
-    # Of a group and a law all mechanisms are kept or none.
-    left = [m for m in mechanisms if any((m.name, law) not in there for law in laws)]
+    """Yield the metrics of each law on every mechanism, in the order in which they are complete.
+
+    They are computed in `processes` processes; with 0 processes, in this one, where an error ends the
+    comparison; or with a `scheduler`, by the workers of a cluster. `tell` is called with a description of the
+    current work, the number of results, with shares of unfinished ones, and the number of cached results.
+    """
+    cached = _cached(mechanisms, laws, settings, pieces) if pieces.resumes else []
+    yield from cached
+    complete = {(result.mechanism, result.law) for result in cached}
+    # Results of a group and a law are cached for all its mechanisms or for none.
+    left = [m for m in mechanisms if any((m.name, law) not in complete for law in laws)]
     if not left:
         return
 
-    def told(text: str, done: float) -> None:
-        tell(text, len(kept) + done, len(kept))
+    def report(text: str, done: float) -> None:
+        tell(text, len(cached) + done, len(cached))
 
-    told(f"{len(kept)} results as kept, contacts in space" if kept else "contacts in space", 0)
+    report(f"{len(cached)} results as kept, contacts in space" if cached else "contacts in space", 0)
 
     def missing(scenes: list[list[Any]]) -> list[tuple[list[Any], str]]:
-        """Those with the most to compile first, so that no process is left with one of them at the end."""
+        """Return the missing tasks, those with the longest compilation first, to balance the processes."""
         order = sorted(laws, key=_gains, reverse=True) if processes or scheduler else laws
-        return [(own, law) for own in scenes for law in order if (own[0].mechanism.name, law) not in there]
+        return [(g, law) for g in scenes for law in order if (g[0].mechanism.name, law) not in complete]
 
     if scheduler is not None:
-        computed = _on_cluster(scheduler, missing(build_scenes(left, settings)), settings, told)
+        computed = _on_cluster(scheduler, missing(build_scenes(left, settings)), settings, report)
     elif processes == 0:
-        computed = _one_by_one(missing(build_scenes(left, settings)), settings, told)
+        computed = _one_by_one(missing(build_scenes(left, settings)), settings, report)
     else:
-        computed = _in_processes(processes, left, settings, missing, told)
-    for group, law, found in computed:
-        if isinstance(found, Failed):
-            yield found
+        computed = _in_processes(processes, left, settings, missing, report)
+    for group, law, result in computed:
+        if isinstance(result, Failed):
+            yield result
             continue
-        pieces.write(*_piece([scene.mechanism for scene in group], law, settings), found)
-        yield from found
+        pieces.write(*_piece([scene.mechanism for scene in group], law, settings), result)
+        yield from result
 
 
-def _kept(
+def _cached(
     mechanisms: Sequence[Mechanism], laws: Sequence[str], settings: CompareSettings, pieces: Pieces
 ) -> list[LawFigures]:
-    """What an earlier comparison kept."""
+    """Return the cached results of an earlier comparison."""
     from tuning.gains.common_program import common_programs
 
     groups = [[mechanisms[i] for i in group] for group, _ in common_programs(mechanisms)]
-    read = (pieces.read(*_piece(own, law, settings), list[LawFigures]) for own in groups for law in laws)
-    return [one for found in read for one in found or ()]
+    read = (pieces.read(*_piece(group, law, settings), list[LawFigures]) for group in groups for law in laws)
+    return [result for results in read for result in results or ()]
 
 
 def _piece(group: list[Mechanism], law: str, settings: CompareSettings) -> tuple[str, Any]:
-    """Name and inputs of what is found of a law on mechanisms that share a program."""
-    return f"compare {law} {group[0].name}", ("compare", law, [to_builtins(one) for one in group], settings)
+    """Return name and inputs of the cached result of a law on mechanisms that share a program."""
+    return f"compare {law} {group[0].name}", ("compare", law, [to_builtins(m) for m in group], settings)
 
 
 def _one_by_one(
@@ -139,10 +143,10 @@ def _one_by_one(
     done = 0
     for group, law in tasks:
 
-        def told(text: str, share: float, group=group, done=done) -> None:
+        def report(text: str, share: float, group=group, done=done) -> None:
             tell(text, done + share * len(group))
 
-        yield group, law, judge_law(group, law, settings, told)
+        yield group, law, judge_law(group, law, settings, report)
         done += len(group)
 
 
@@ -153,15 +157,15 @@ def _on_cluster(
     inputs = [_piece([scene.mechanism for scene in group], law, settings) for group, law in tasks]
     done, what = 0, f"compare-{digest_of(inputs)[:16]}"
     tell(f"{len(tasks)} pieces on the cluster", done)
-    for i, found in on_workers(scheduler, judge_or_say_why, pieces, setting(), what):
+    for i, result in on_workers(scheduler, judge_or_say_why, pieces, setting(), what):
         group, law = tasks[i]
         done += len(group)
         tell(law, done)
-        yield group, law, found
+        yield group, law, result
 
 
 def judge_or_say_why(group: list[Any], law: str, settings: CompareSettings) -> list[LawFigures] | Failed:
-    """`judge_law`; where it cannot be done, why."""
+    """Call `judge_law`; return the failure with its reason if it raises."""
     try:
         return judge_law(group, law, settings)
     except Exception as error:
@@ -179,26 +183,26 @@ def _in_processes(
     missing: Callable[[list[list[Any]]], list[tuple[list[Any], str]]],
     tell: Tell,
 ) -> Iterator[Judged]:
-    # A fresh interpreter each: jax does not survive a fork.
+    # JAX does not work after a fork, so that each process needs a new interpreter.
     context = multiprocessing.get_context("spawn")
-    heard = context.SimpleQueue()
-    with ProcessPoolExecutor(processes, context, _begin, (heard,)) as pool:
+    messages = context.SimpleQueue()
+    with ProcessPoolExecutor(processes, context, _begin, (messages,)) as pool:
         try:
             tasks = missing(pool.submit(build_scenes, mechanisms, settings).result())
-            running = {pool.submit(_judge, i, *task, settings): i for i, task in enumerate(tasks)}
+            running = {pool.submit(_evaluate, i, *task, settings): i for i, task in enumerate(tasks)}
             shares = [0.0 for _ in tasks]
             while running:
                 ended, _ = wait(running, SECONDS, return_when=FIRST_COMPLETED)
-                while not heard.empty():
-                    i, text, shares[i] = heard.get()
-                    tell(text, sum(one * len(tasks[k][0]) for k, one in enumerate(shares)))
+                while not messages.empty():
+                    i, text, shares[i] = messages.get()
+                    tell(text, sum(share * len(tasks[k][0]) for k, share in enumerate(shares)))
                 for future in ended:
                     i = running.pop(future)
                     error = future.exception()
                     shares[i] = 1.0
                     yield *tasks[i], _failed(tasks[i][1], error) if error else future.result()
         except BaseException:
-            # What they compute nobody waits for.
+            # The results of the running processes are no longer needed.
             for child in multiprocessing.active_children():
                 child.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -206,14 +210,14 @@ def _in_processes(
 
 
 def _gains(law: str) -> int:
-    """How many there are: the more, the longer it takes."""
+    """Return the number of a law's gains, with which the time of its compilation increases."""
     from jaxhil.rig import COMPENSATORS
 
     return len(COMPENSATORS[law].gains)
 
 
 def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
-    """What the laws are judged on (`tuning.benchmark.runs.Scene`), grouped by program."""
+    """Build the scenes of all mechanisms (`tuning.benchmark.runs.Scene`), grouped by program."""
     from tuning.benchmark.runs import build_scene
     from tuning.gains.common_program import common_programs
 
@@ -227,8 +231,10 @@ def build_scenes(mechanisms: list[Mechanism], settings: CompareSettings) -> list
 def judge_law(
     scenes: list[Any], law: str, settings: CompareSettings, tell: Tell = lambda text, share: None
 ) -> list[LawFigures]:
-    """All figures of one law on mechanisms of one program, tuned together. `tell` is called with what is
-    going on and the share that is done."""
+    """Tune one law for mechanisms of one program, and compute its metrics on each.
+
+    `tell` is called with a description of the current work and the share that is done.
+    """
     from jaxhil.laws.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import judge_gains, lanes_judged
     from tuning.gains.settings import TuneSettings
@@ -236,23 +242,23 @@ def judge_law(
     from tuning.gains.work import Work
 
     mechanisms = [scene.mechanism for scene in scenes]
-    others = [
+    further = [
         name
         for name in COMPENSATORS[law].settings
-        if any(literature_gains(one, law, name) != literature_gains(one, law) for one in mechanisms)
+        if any(literature_gains(m, law, name) != literature_gains(m, law) for m in mechanisms)
     ]
     gains = [
-        {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *others)}
+        {which or LITERATURE: literature_gains(mechanism, law, which) for which in (None, *further)}
         for mechanism in mechanisms
     ]
-    # Settings are for any mechanism: what they leave is what such a law leaves.
+    # A law with settings for any mechanism is used without tuning.
     tuned = settings.tuned and not COMPENSATORS[law].settings
     tuned = tuned and any(
         gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
     )
     work = Work(lambda text, share, _: tell(f"{law}, {text}", share))
     lanes = {scene.mechanism.name: lanes_judged(scene) for scene in scenes}
-    work.later = (1 + len(others) + tuned) * sum(lanes.values())
+    work.later = (1 + len(further) + tuned) * sum(lanes.values())
     if tuned:
         tuning = TuneSettings(
             settings.scenarios,
@@ -265,47 +271,47 @@ def judge_law(
         )
         for index, result in tune_all(mechanisms, law, tuning, work, common=scenes[0].common):
             gains[index][TUNED] = result.gains
-    found = []
-    for scene, own in zip(scenes, gains, strict=True):
-        figures = {}
-        for which, one in own.items():
+    results = []
+    for scene, by_name in zip(scenes, gains, strict=True):
+        metrics = {}
+        for which, values in by_name.items():
             work.say(f"{scene.mechanism.name}: judging {which} gains")
-            figures[which] = judge_gains(scene, law, one, settings.limit, settings.seed)
+            metrics[which] = judge_gains(scene, law, values, settings.limit, settings.seed)
             work.ran(lanes[scene.mechanism.name])
-        found.append(LawFigures(law, scene.mechanism.name, own, figures))
-    return found
+        results.append(LawFigures(law, scene.mechanism.name, by_name, metrics))
+    return results
 
 
-def _judge(number: int, scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
-    """`judge_law` in a worker, which tells the parent of it, once in a while."""
+def _evaluate(number: int, scenes: list[Any], law: str, settings: CompareSettings) -> list[LawFigures]:
+    """Call `judge_law` in a worker process, which reports its progress to the parent."""
     last = 0.0
 
     def tell(text: str, share: float) -> None:
         nonlocal last
         if (now := time.monotonic()) - last >= SECONDS:
             last = now
-            _heard.put((number, text, share))
+            _messages.put((number, text, share))
 
     return judge_law(scenes, law, settings, tell)
 
 
-_heard: Any = None  # the parent's queue, in a worker
+_messages: Any = None  # queue to the parent, in a worker
 
 
-def _begin(heard: Any) -> None:
-    """A worker: few devices, so that as many workers as there are cores share the machine."""
-    global _heard
-    _heard = heard
-    # The parent hears of an interruption, and ends the workers; one that is killed cannot.
+def _begin(messages: Any) -> None:
+    """Initialise a worker process with few devices, since there are as many workers as cores."""
+    global _messages
+    _messages = messages
+    # On an interrupt the parent ends the workers; if the parent is killed, they end themselves.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    given = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = f"{given} {DEVICES}={FEWEST_DEVICES}".strip()
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} {DEVICES}={FEWEST_DEVICES}".strip()
     prepare()
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, whatever ended it."""
+    """End this process when its parent has ended for any reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,4 +1,4 @@
-"""Tables of a comparison: one of every mechanism, and the leaderboard of all."""
+"""Tables of a comparison: one per mechanism, and the leaderboard of all."""
 
 from collections.abc import Mapping, Sequence
 
@@ -24,32 +24,32 @@ HEADINGS = {
     "trajectory": "path %",
     "noise": "noise",
 }
-UNBOUNDED = 10_000  # characters
-MARK = "*"  # of what is better than all others by more than its interval
+UNBOUNDED = 10_000  # console width [characters] that does not limit a table
+MARK = "*"  # marks a metric whose interval is better than those of all other laws
 
 
 def winners(found: Sequence[LawFigures], which: str = TUNED) -> dict[str, str | None]:
-    """Of every figure the law that wins on one mechanism, each with the gains `best` of it."""
-    figures = {one.law: best(one, which) for one in found}
-    return {name: winner(name, {law: own[name] for law, own in figures.items()}) for name in HEADINGS}
+    """Return for every metric the law that wins on one mechanism, each law with its `best` gains."""
+    by_law = {result.law: best(result, which) for result in found}
+    return {name: winner(name, {law: m[name] for law, m in by_law.items()}) for name in HEADINGS}
 
 
 def best(found: LawFigures, which: str = TUNED) -> dict[str, Estimate]:
-    """Its figures with tuned gains; of a law without gains to tune, the only ones there are."""
+    """Return the metrics with tuned gains or, if there are none, with the literature's."""
     return found.figures.get(which) or found.figures[LITERATURE]
 
 
 def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
-    """Every law with the literature's and with tuned gains."""
-    won = winners(found)
+    """Return the table of every law with the literature's gains, settings and tuned gains."""
+    winning = winners(found)
     rows = []
-    for one in found:
-        for which, figures in one.figures.items():
-            own = figures is best(one)
+    for result in found:
+        for which, metrics in result.figures.items():
+            is_best = metrics is best(result)
             rows.append(
                 [
-                    one.law if which == LITERATURE else f"  {which}",
-                    *(shown(key, figures[key], own and won[key] == one.law) for key in HEADINGS),
+                    result.law if which == LITERATURE else f"  {which}",
+                    *(shown(key, metrics[key], is_best and winning[key] == result.law) for key in HEADINGS),
                 ]
             )
     tuned = ", then tuned, but for those with settings" * _tuned(found)
@@ -58,56 +58,55 @@ def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
 
 
 def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
-    """rms error [%] of every law, tuned if any is, on every mechanism; a column for each of its settings."""
-    every = [one for name in names for one in found[name]]
-    laws = list(dict.fromkeys(one.law for one in every))
-    columns = dict.fromkeys((one.law, which) for one in every for which in ("", *one.settings))
+    """Return the table of rms errors [%] of every law and setting (columns) on every mechanism (rows)."""
+    results = [result for name in names for result in found[name]]
+    laws = list(dict.fromkeys(result.law for result in results))
+    columns = dict.fromkeys((result.law, which) for result in results for which in ("", *result.settings))
     columns = sorted(columns, key=lambda column: laws.index(column[0]))
-    won = {name: winners(found[name])["rms"] for name in names}
+    winning = {name: winners(found[name])["rms"] for name in names}
     rows = []
     for name in names:
         cells = []
-        by_law = {one.law: one for one in found[name]}
+        by_law = {result.law: result for result in found[name]}
         for law, which in columns:
-            own = by_law.get(law)
-            figures = own and (own.figures.get(which) if which else best(own))
-            cells.append(shown("rms", figures["rms"], won[name] == law and not which) if figures else "-")
+            result = by_law.get(law)
+            metrics = result and (result.figures.get(which) if which else best(result))
+            cells.append(shown("rms", metrics["rms"], winning[name] == law and not which) if metrics else "-")
         rows.append([name.removeprefix("suite-"), *cells])
     headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
     tuned = any(map(_tuned, found.values()))
     how = "each law tuned, but for those with settings" if tuned else "each law with the literature's gains"
-    made = _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
-    made.padding = (0, 0)
-    made.width = Console(width=UNBOUNDED).measure(made).maximum
-    return made
+    table = _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+    table.padding = (0, 0)
+    table.width = Console(width=UNBOUNDED).measure(table).maximum
+    return table
 
 
 def least(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> str:
-    """Which law has the least rms error, mechanism by mechanism, by more than the intervals or not."""
+    """Return a sentence with the law of least rms error per mechanism, regardless of the intervals."""
     led: dict[str, list[str]] = {}
     for name in names:
-        errors = {one.law: best(one)["rms"].value for one in found[name]}
-        known = {law: value for law, value in errors.items() if np.isfinite(value)}
-        if len(known) > 1:
-            led.setdefault(min(known, key=lambda law: known[law]), []).append(name.removeprefix("suite-"))
-    texts = (
-        f"{law} ({', '.join(names)})" for law, names in sorted(led.items(), key=lambda one: -len(one[1]))
-    )
+        errors = {result.law: best(result)["rms"].value for result in found[name]}
+        finite = {law: value for law, value in errors.items() if np.isfinite(value)}
+        if len(finite) > 1:
+            led.setdefault(min(finite, key=lambda law: finite[law]), []).append(name.removeprefix("suite-"))
+    ordered = sorted(led.items(), key=lambda item: -len(item[1]))
+    texts = (f"{law} ({', '.join(names)})" for law, names in ordered)
     return f"Least rms error: {'; '.join(texts)}." if led else ""
 
 
 def _tuned(found: Sequence[LawFigures]) -> bool:
-    return any(TUNED in one.figures for one in found)
+    return any(TUNED in result.figures for result in found)
 
 
-def _unfolded(made: Table) -> Table:
-    """Names in one piece, columns close together."""
-    made.columns[0].no_wrap = True
-    made.padding = (0, 1, 0, 0)
-    return made
+def _unfolded(table: Table) -> Table:
+    """Keep names of a table on one line and its columns close together."""
+    table.columns[0].no_wrap = True
+    table.padding = (0, 1, 0, 0)
+    return table
 
 
 def shown(key: str, figure: Estimate, wins: bool = False) -> str:
-    """A figure in three digits, with a mark where it wins."""
+    """Return a metric with three digits, and with a mark if it wins."""
     value = 100 * figure.value if key in PERCENT else figure.value
     return terminal.figure(value, 3) + MARK * wins

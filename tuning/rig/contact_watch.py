@@ -1,7 +1,7 @@
-"""Where contacts begin and end, tick by tick, and their restitution, in plain floats.
+"""Detection of onset and end of contacts, and their restitution, in plain floats.
 
-The rules are those of `notebooks/guide/model.md`, section 2. `jaxhil.simulation.metrics` follows batches by
-the same ones; a loop in real time cannot wait for it.
+The rules are those of `notebooks/guide/model.md`, section 2. `jaxhil.simulation.metrics` applies the same
+rules to batches, but is too slow for a loop in real time.
 """
 
 import math
@@ -9,29 +9,29 @@ from typing import NamedTuple
 
 from jaxhil.mechanism.structs import Mechanism
 
-FADED = 1e-6  # of the command's peak: it has died out
-LONGEST_FADING = 0.1  # s, waited for that
-LONGEST_CONTACT = 10.0  # s
-RUNAWAY = 1e3  # of the approach speed
+FADED = 1e-6  # command over its peak [1] below which it has died out
+LONGEST_FADING = 0.1  # longest wait for the command to die out [s]
+LONGEST_CONTACT = 10.0  # longest contact [s], after which it times out
+RUNAWAY = 1e3  # speed over the approach speed [1] beyond which a contact diverges
 
 
 class ContactResult(NamedTuple):
-    """One contact."""
+    """Result of one contact."""
 
-    number: int  # in the mechanism's lists
+    number: int  # index in the mechanism's lists
     approach_velocity: float  # [m/s]
-    restitution: float  # not a number where the contact did not end
-    peak_force: float  # the largest sample of the real force [N]
+    restitution: float  # NaN if the contact did not end
+    peak_force: float  # largest sample of the real force [N]
     duration: float  # time in contact [s]
     status: str  # as in `jaxhil.simulation.metrics`, or "tripped"
-    begun: int  # the tick of the run at which it began
-    # numbers of the first and last packet about it, filled in by who exchanges them
+    begun: int  # tick of the run at the onset
+    # numbers of the first and last packet of the contact, set by `RigTask`
     packets: tuple[int, int] = (0, 0)
-    oldest_command: int = 0  # age of the oldest command used [periods], likewise
+    oldest_command: int = 0  # age of the oldest command used [periods], set by `RigTask`
 
 
 class ContactWatch:
-    """Follows one run, contact by contact. A two-sided mechanism's run may have several."""
+    """Contact detector of one run, which may have several contacts if the mechanism is two-sided."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         rig, sensor = mechanism.rig, mechanism.rig.force_sensor
@@ -48,7 +48,7 @@ class ContactWatch:
         self.begin(0)
 
     def begin(self, number: int) -> None:
-        """A fresh run, whose first contact is `number` in the mechanism's lists."""
+        """Begin a new run, whose first contact has index `number` in the mechanism's lists."""
         self._number, self._tick = number, 0
         self._quiet, self._left = 1_000_000, 0.0
         self._approach = self._rebound = 0.0
@@ -57,9 +57,15 @@ class ContactWatch:
     def observe(
         self, position: float, velocity: float, command: float, force: float, reading: float
     ) -> ContactResult | None:
-        """One tick: the model's position [m] and velocity [m/s], the force F_c [N] it feels, the real force
-        and what the sensor reads [N]. The contact that is over with this tick, if one is; the next of the run
-        may follow."""
+        """Process one tick; return the contact that ends with it, if any.
+
+        Args:
+            position: position of the numerical model [m].
+            velocity: velocity of the numerical model [m/s].
+            command: force command F_c [N].
+            force: real contact force [N].
+            reading: reading of the force sensor [N].
+        """
         magnitude, speed, size = abs(command), abs(velocity), abs(force)
         in_contact = size > 0.0
         if self._begun < 0:
@@ -69,7 +75,7 @@ class ContactWatch:
                 begins = in_contact or magnitude > self._left
             if begins:
                 self._begun = self._tick
-                # The hardware may follow the numerical model late.
+                # The hardware may still be behind the numerical model, so that waiting starts anew.
                 self._quiet = -1
                 self._side = 1.0 if position > -self._clearance / 2 else -1.0
         if self._begun < 0:
@@ -82,7 +88,7 @@ class ContactWatch:
         self._quiet = 0 if in_contact else self._quiet + 1
         self._tick += 1
         faded = magnitude <= FADED * self._peak_command or self._quiet >= self._patience
-        # Between two surfaces a contact is over in the middle of the gap at the latest.
+        # Between two surfaces a contact ends at the latest in the middle of the gap.
         faded = faded or self._side != (1.0 if position > -self._clearance / 2 else -1.0)
         quiet = self._quiet >= self._quiet_ticks and faded
         if self._begun >= 0 and self._side * velocity < 0.0 and quiet:
@@ -91,7 +97,7 @@ class ContactWatch:
         return self._failed(magnitude)
 
     def cut(self, status: str) -> ContactResult | None:
-        """End the contact under way, if there is one, with a status that says why."""
+        """End the current contact, if there is one, with the given status."""
         return self._end(status, 0.0) if self._begun >= 0 else None
 
     def _failed(self, magnitude: float) -> ContactResult | None:
@@ -119,7 +125,7 @@ class ContactWatch:
             status=status,
             begun=self._begun,
         )
-        # What is left of the last contact's command does not begin the next one.
+        # The rest of this contact's command must not begin the next one.
         self._number, self._left, self._approach = self._number + 1, left, self._rebound
         self._clear()
         return result

@@ -1,9 +1,9 @@
-"""The rig's side of the loop: what it sends at every tick, and what it does with the answers.
+"""Rig's side of the loop: readings for every tick, and the effect of the answers on the hardware.
 
-It stands for the drives, the contact and the sensors of a rig, in the rig's process, whose clock is `loop`.
-`RigTask` knows nothing of networks and clocks: `reading` is what to send at a tick, `take` an answer that
-came in time or late, `advance` ends the tick. Ticks that no answer came for go on at the rate of the newest
-command for up to `EXTRAPOLATED` periods, and hold it from then on.
+It simulates drives, contact and sensors in the rig's process, whose clock is `loop`. `RigTask` is independent
+of network and clock: `reading` returns the packet of a tick, `take` accepts an answer, in time or late, and
+`advance` ends the tick. Without an answer the newest command is extrapolated at its rate for up to
+`EXTRAPOLATED` periods, and then held.
 """
 
 import math
@@ -15,32 +15,31 @@ from tuning.rig.contact_watch import ContactResult, ContactWatch
 from tuning.rig.plant import Plant
 from tuning.rig.udp_protocol import APPROACH, PREPARE, READY, RESET, TICK, TRIPPED, Answer, Reading
 
-EXTRAPOLATED = 10  # periods for which a command goes on at its rate
-BRIDGED = 3  # periods: what follows from an older command is not the controller's doing
-EXPLAINED = ("tripped: restitution", "tripped: missed_tick")  # what may follow from one
+EXTRAPOLATED = 10  # periods for which a command is extrapolated at its rate
+BRIDGED = 3  # age of a command [periods] beyond which its effects are not the controller's fault
+EXPLAINED = ("tripped: restitution", "tripped: missed_tick")  # trips that an old command may cause
 PAUSE = 5  # ticks between two runs
-STALLED = "stalled"  # a contact that the machine left without new commands
+STALLED = "stalled"  # status of a contact for which the machine delayed the commands too long
 
 
 class Commanded(NamedTuple):
-    """What the controller has commanded."""
+    """Range of the controller's commands."""
 
-    lowest: float  # position command [m]
-    highest: float  # likewise [m]
-    not_finite: int  # how many were not finite; these do not reach the drives
-    beyond_limits: int  # how many were beyond the drives' stroke; neither do these
-    largest_force: float  # the largest |F_c| [N]
+    lowest: float  # lowest position command [m]
+    highest: float  # highest position command [m]
+    not_finite: int  # number of non-finite commands, which do not reach the drives
+    beyond_limits: int  # number of position commands beyond the drives' stroke, which are clipped
+    largest_force: float  # largest |F_c| [N]
 
 
 class RigTask:
-    """Run after run of a mechanism's contacts, until the controller says that it is enough.
+    """Endless series of runs of a mechanism's contacts, without network and clock.
 
-    One-sided, every contact is a run of its own at the nominal approach speed; between two surfaces a run has
-    as many contacts as the mechanism asks for. The lists of stiffness and damping are gone through again and
-    again; after the first round, each run meets its first surface at a phase of its own. `stroke`: the lowest
-    and highest position [m] that the drives take. With `resets`, a controller that trips by one of the
-    faults `EXPLAINED` where a command was older than `BRIDGED` periods is reset, and the session goes on.
-    `tripped` says why the controller has; it is empty as long as it has not.
+    With one surface every contact is a run at the nominal approach speed; between two surfaces a run has the
+    mechanism's number of contacts. The lists of stiffness and damping are repeated; after the first cycle
+    each run has a random phase. `stroke` is the lowest and highest position [m] of the drives. With `resets`,
+    a controller that trips by one of the faults `EXPLAINED` after a command was older than `BRIDGED` periods
+    is reset, and the session continues. `tripped` is the reason of a trip, empty without one.
     """
 
     def __init__(
@@ -67,21 +66,21 @@ class RigTask:
 
     @property
     def contacts(self) -> tuple[ContactResult, ...]:
-        """Contacts that are over."""
+        """Return the contacts that have ended."""
         return tuple(self._contacts)
 
     @property
     def forgiven(self) -> tuple[str, ...]:
-        """Why the controller has tripped where the machine had left the rig with old commands."""
+        """Return the reasons of trips after which the controller was reset, since commands were old."""
         return tuple(self._forgiven)
 
     @property
     def commanded(self) -> Commanded:
-        """What has been commanded so far."""
+        """Return the range of the commands so far."""
         return Commanded(self._lowest, self._highest, self._not_finite, self._beyond, self._largest)
 
     def reading(self) -> Reading:
-        """What to send at this tick; every call is another packet."""
+        """Return the next packet to send; each call has a new sequence number."""
         self._sequence += 1
         self._force, position = self._plant.read()
         time = self._sequence * self._period
@@ -90,7 +89,7 @@ class RigTask:
         return Reading(event, self._sequence, self._run, tick, time, self._force, position, *self._start)
 
     def take(self, answer: Answer) -> bool:
-        """Take in an answer; whether it is the one to this tick."""
+        """Accept an answer; return whether it belongs to this tick."""
         if answer.run != self._run:
             return False
         if answer.flags & TRIPPED:
@@ -112,7 +111,7 @@ class RigTask:
         return answer.tick == self._tick
 
     def advance(self) -> None:
-        """The tick is over: its command, or what stands for it, moves the rig one period."""
+        """End the tick and move the rig one period by its command or the extrapolated one."""
         explained = self._resets and self.tripped.startswith(EXPLAINED)
         if explained and self._last_oldest() > BRIDGED:
             self._reset()
@@ -129,43 +128,43 @@ class RigTask:
         command = min(max(command, self._stroke[0]), self._stroke[1])
         plant, watch = self._plant, self._watch
         if newest.tick >= 0:
-            felt = newest.position, newest.velocity, newest.force_command
+            model = newest.position, newest.velocity, newest.force_command
         else:
-            felt = *self._start, 0.0
-        over = watch.observe(*felt, plant.force, self._force)
+            model = *self._start, 0.0
+        contact = watch.observe(*model, plant.force, self._force)
         plant.move(command)
         self._tick += 1
-        if over is not None:
-            self._over(over)
+        if contact is not None:
+            self._ended(contact)
 
     def finish(self) -> None:
-        """No tick follows. A contact that a trip has cut short is one of the contacts."""
-        if self._tick >= 0 and self.tripped and all(one.status != "tripped" for one in self._contacts):
+        """End the session; the current contact is added to the contacts if the controller has tripped."""
+        if self._tick >= 0 and self.tripped and all(c.status != "tripped" for c in self._contacts):
             cut = self._watch.cut("tripped")
             if cut is not None:
                 self._contacts.append(cut)
 
     def _last_oldest(self) -> int:
-        """The age [periods] of the oldest command of the contact under way or, between runs, of the last."""
+        """Return the age [periods] of the oldest command of the current or, between runs, last contact."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest
 
     def _reset(self) -> None:
-        """Another run instead of this one, with a controller that starts anew."""
+        """Start another run instead of this one, and request a reset of the controller."""
         self._forgiven.append(self.tripped)
         self.tripped = ""
         number = self._number
         if self._tick >= 0:
             cut = self._watch.cut(STALLED)
             if cut is not None:
-                self._keep(cut)
+                self._store(cut)
                 number = 0 if self._two_sided else (cut.number + 1) % self._mechanism.approach.contacts
         self._next_run(number)
         self._resetting = True
 
     def _wait(self) -> None:
-        """Between runs the mechanism is held, free, at the start of the next one."""
+        """Hold the mechanism at the start of the next run until the controller is ready."""
         self._pause -= 1
         newest = self._newest
         if newest is None or self._pause > 0 or self.tripped:
@@ -174,22 +173,23 @@ class RigTask:
         self._watch.begin(self._number)
         self._tick = 0
 
-    def _over(self, over: ContactResult) -> None:
+    def _ended(self, contact: ContactResult) -> None:
+        """Store a contact that has ended and prepare the next one."""
         if self.tripped:
-            # Once tripped, the rig plays on, and what becomes of the contact says nothing.
-            if all(one.status != "tripped" for one in self._contacts):
-                self._keep(over._replace(status="tripped", restitution=math.nan))
+            # After a trip the rig continues, but the contact's result has no meaning.
+            if all(c.status != "tripped" for c in self._contacts):
+                self._store(contact._replace(status="tripped", restitution=math.nan))
             return
-        self._keep(over)
-        following = over.number + 1
-        if self._two_sided and over.status == "ok" and following < self._mechanism.approach.contacts:
+        self._store(contact)
+        following = contact.number + 1
+        if self._two_sided and contact.status == "ok" and following < self._mechanism.approach.contacts:
             self._plant.expect(following)
             return
         self._next_run(0 if self._two_sided else following % self._mechanism.approach.contacts)
 
-    def _keep(self, over: ContactResult) -> None:
+    def _store(self, contact: ContactResult) -> None:
         self._contacts.append(
-            over._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
+            contact._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
         )
         self._first, self._oldest = self._sequence + 1, 0
 
@@ -203,5 +203,5 @@ class RigTask:
         self._start, self._number = (position, approach.velocity), number
         self._tick, self._pause, self._newest = -1, PAUSE, None
         self._oldest, self._resetting = 0, False
-        # Until the run begins, the sensors see the mechanism free and at rest.
+        # Before the run the mechanism is free and at rest.
         self._plant.begin(position, 0.0, position, number)

@@ -1,11 +1,10 @@
-"""The rig's loop in real time: absolute deadlines on the monotonic clock, one packet per control period.
+"""Real-time loop of the rig's process, with absolute deadlines and one packet per control period.
 
-This is the clock of the rig's process. At t_n the sensors' packet leaves for the controller's process; the
-answer counts if it is there within `ANSWER_SHARE` of the period, the rest of which is the rig's own. A tick
-without an answer by then is a missed one: the rig goes on with what it has (`RigTask.advance`), and takes the
-answer in when it comes. A rig that was itself held up catches up: every tick whose time has passed is played
-at once, and missed. Only where it was held up for more than `MOST_BEHIND` periods has its clock stood still:
-nothing of it went on meanwhile.
+At t_n the sensors' packet is sent to the controller's process. Its answer is in time within `ANSWER_SHARE` of
+the period; the rig needs the rest. A tick without an answer by then is missed: the rig continues with the
+newest command (`RigTask.advance`), and accepts the answer when it arrives. If the rig itself was delayed, it
+plays all due ticks at once, as missed ones. Only after a delay of more than `MOST_BEHIND` periods its clock
+is shifted, as if it had stopped.
 """
 
 import gc
@@ -17,15 +16,15 @@ from typing import Protocol
 from tuning.rig.network import Network
 from tuning.rig.udp_protocol import EMPTY, TICK, Answer, PacketError, Reading, decode_answer, encode_reading
 
-ANSWER_SHARE = 0.8  # of a period, within which the answer has to be there
-MOST_BEHIND = 10  # periods that the rig catches up with
-SPIN = 100_000  # ns before a tick from which the clock is watched without sleeping
-AHEAD = 50_000_000  # ns before the first tick
-AFTER_TRIP = 1.0  # s for which the rig plays on after a trip
+ANSWER_SHARE = 0.8  # share of a period within which the answer must arrive
+MOST_BEHIND = 10  # largest delay [periods] for which the rig catches up
+SPIN = 100_000  # time before a tick [ns] in which the loop polls the clock without sleeping
+AHEAD = 50_000_000  # time until the first tick [ns]
+AFTER_TRIP = 1.0  # time for which the rig continues after a trip [s]
 
 
 class RealTimeTask(Protocol):
-    """The rig's side, without network and clock: see `tuning.rig.hardware.RigTask`."""
+    """Rig's side of the loop without network and clock, such as `tuning.rig.hardware.RigTask`."""
 
     @property
     def tripped(self) -> str: ...
@@ -35,7 +34,7 @@ class RealTimeTask(Protocol):
 
 
 class EmptyTask:
-    """The rig's side of an empty loop: packets, and nothing else."""
+    """Rig's side of an empty loop, which only exchanges packets."""
 
     tripped = ""
 
@@ -43,7 +42,7 @@ class EmptyTask:
         self._sequence = -1
 
     def reading(self) -> Reading:
-        """A packet of zeros."""
+        """Return a packet of zeros."""
         self._sequence += 1
         return Reading(
             event=TICK,
@@ -58,17 +57,20 @@ class EmptyTask:
         )
 
     def take(self, answer: Answer) -> bool:
-        """Whether it answers the last packet."""
+        """Return whether it answers the last packet."""
         return bool(answer.flags & EMPTY) and answer.sequence == self._sequence
 
     def advance(self) -> None:
-        """Nothing moves."""
+        """Do nothing, since nothing moves."""
 
 
 class Timing:
-    """By the number of the packet: how late it left [ns], when its answer arrived after it left [ns; 0 if it
-    never did], and whether both were in time. `ticks` were played; `stood` is for how long the clock of the
-    rig has stood still [ns]."""
+    """Times of the packets, arrays by packet number.
+
+    `late` is the delay of sending [ns], `round_trip` the time from sending to the answer [ns] (0 without an
+    answer), and `met` whether both were in time. `ticks` is the number of played ticks, `stood` the time by
+    which the rig's clock was shifted [ns].
+    """
 
     def __init__(self, ticks: int) -> None:
         self.late, self.round_trip = (array("q", bytes(8 * ticks)) for _ in range(2))
@@ -84,11 +86,10 @@ def play(
     timing: Timing,
     tell: Callable[[int], None],
 ) -> None:
-    """Play `len(timing.met)` ticks of `period` [s] in the session of that number, or until 1 s after a trip.
+    """Play `len(timing.met)` ticks of `period` [s] in the given session, or until 1 s after a trip.
 
-    `tell` is called once a second with how many are done.
-
-    Interrupted, `timing` holds what was played until then.
+    `tell` is called once a second with the number of completed ticks. After an interruption `timing` holds
+    the ticks played so far.
     """
     step, total = round(1e9 * period), len(timing.met)
     allowance, second = round(ANSWER_SHARE * step), max(1, round(1 / period))
@@ -109,8 +110,8 @@ def play(
             if late > MOST_BEHIND * step:
                 timing.stood += late
                 due += late
-            met = _answered(task, network, session, due + allowance, left, timing)
-            timing.met[number] = met and late <= step
+            is_answered = _answered(task, network, session, due + allowance, left, timing)
+            timing.met[number] = is_answered and late <= step
             task.advance()
             timing.ticks = number + 1
             if number % second == 0:
@@ -127,9 +128,9 @@ def play(
 def _answered(
     task: RealTimeTask, network: Network, session: int, deadline: int, left: array, timing: Timing
 ) -> bool:
-    """Take in what arrives, until this tick's answer does or the deadline has passed."""
+    """Receive packets until this tick's answer arrives or the deadline [ns] passes; return if it arrived."""
     while True:
-        met = False
+        is_answered = False
         for arrived, packet in network.receive():
             try:
                 answer = decode_answer(packet, session)
@@ -138,8 +139,8 @@ def _answered(
             number = answer.sequence
             if number < len(left) and left[number] and not timing.round_trip[number]:
                 timing.round_trip[number] = arrived - left[number]
-            met = task.take(answer) or met
-        if met:
+            is_answered = task.take(answer) or is_answered
+        if is_answered:
             return True
         if time.monotonic_ns() >= deadline:
             return False
@@ -147,7 +148,7 @@ def _answered(
 
 
 def _until(network: Network, due: int) -> None:
-    """Wait until `due` [ns], sending what was held back; the last of it awake."""
+    """Wait until `due` [ns] and send delayed packets; the last `SPIN` ns the loop does not sleep."""
     while time.monotonic_ns() < due - SPIN:
         network.wait(due - SPIN, for_arrivals=False)
     while time.monotonic_ns() < due:
@@ -155,7 +156,7 @@ def _until(network: Network, due: int) -> None:
 
 
 def answered_by(packet: bytes) -> int | None:
-    """The number of the packet that this one answers; None if it answers none."""
+    """Return the number of the packet that this one answers; None if it is no answer."""
     try:
         return decode_answer(packet, None).sequence
     except PacketError:

@@ -1,7 +1,7 @@
-"""What stands for the network card: a socket to the controller, and faults that can be put in between.
+"""Simulated network card: a socket to the controller, with injected faults.
 
-Each packet, either way, is lost with a probability; what is not lost is held back for a constant delay and a
-random one, so that packets overtake one another. All draws come from one seed.
+Each packet in either direction is lost with a probability; other packets are delayed by a constant and a
+random time, so that they may overtake one another. All draws come from one seed.
 """
 
 import heapq
@@ -17,24 +17,24 @@ LONGEST_PACKET = 512
 
 
 class Injection(NamedTuple):
-    """Faults put into the network, of each packet and each way."""
+    """Faults injected into the network, per packet and direction."""
 
-    drops: float = 0.0  # probability of a loss
-    jitter: float = 0.0  # width of a delay drawn uniformly from 0 on [s]
+    drops: float = 0.0  # probability of a loss [1]
+    jitter: float = 0.0  # upper end of a uniformly distributed delay from 0 [s]
     delay: float = 0.0  # constant delay [s]
 
     @property
     def any(self) -> bool:
-        """Whether there are any faults."""
+        """Return whether there are any faults."""
         return self.drops > 0.0 or self.jitter > 0.0 or self.delay > 0.0
 
 
 class Network:
-    """Packets to one address and back. Times are those of `time.monotonic_ns`. `number_of(answer)` is the
-    number of the packet that bytes from there answer, None if they answer none.
+    """Connection to one address with injected faults; times are those of `time.monotonic_ns`.
 
-    `lost` and `held_back` say by the packet's number what was injected: 1 where the packet or its answer was
-    lost; the time for which both together were held back [ns].
+    `number_of(answer)` returns the number of the packet that an answer belongs to, None if to none. The
+    injected faults are stored by packet number: `lost` is 1 if the packet or its answer was lost, `held_back`
+    is the total delay of both [ns].
     """
 
     def __init__(
@@ -56,30 +56,30 @@ class Network:
         self.held_back = array("q", bytes(8 * packets))
 
     def close(self) -> None:
-        """Give the socket back."""
+        """Close the socket."""
         self._socket.close()
 
     def send(self, number: int, packet: bytes) -> None:
-        """Send packet `number`, or let happen to it what the injection says."""
-        held = self._fate(number)
-        if held is None:
+        """Send packet `number` with the injected faults."""
+        delay = self._draw_delay(number)
+        if delay is None:
             return
-        if held <= 0:
+        if delay <= 0:
             self.send_plainly(packet)
         else:
             self._count += 1
-            heapq.heappush(self._going, (time.monotonic_ns() + held, self._count, packet))
+            heapq.heappush(self._going, (time.monotonic_ns() + delay, self._count, packet))
 
     def send_plainly(self, packet: bytes) -> None:
-        """Send a packet past all injection."""
+        """Send a packet without injected faults."""
         try:
             self._socket.send(packet)
         except OSError:
-            # Nobody listens: the tick will be a missed one.
+            # No process listens, so that the tick will be missed.
             pass
 
     def ask(self, packet: bytes, wait: float) -> bytes | None:
-        """What comes back within `wait` [s] after a packet, past all injection; None if nothing does."""
+        """Send a packet without faults; return the answer within `wait` [s], None if there is none."""
         self.send_plainly(packet)
         if not select.select([self._socket], [], [], wait)[0]:
             return None
@@ -89,7 +89,7 @@ class Network:
             return None
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """What has arrived by now: when [ns], and the packet."""
+        """Return the packets that have arrived by now, each with its time of arrival [ns]."""
         self._drain()
         now, ready = time.monotonic_ns(), []
         while self._coming and self._coming[0][0] <= now:
@@ -98,7 +98,7 @@ class Network:
         return ready
 
     def wait(self, until: int, for_arrivals: bool = True) -> None:
-        """Wait until something may have arrived, at the longest until `until` [ns]; send what is due."""
+        """Wait until a packet may have arrived, at most until `until` [ns]; send due delayed packets."""
         now = time.monotonic_ns()
         while self._going and self._going[0][0] <= now:
             self.send_plainly(heapq.heappop(self._going)[2])
@@ -110,32 +110,32 @@ class Network:
             self._drain()
 
     def _drain(self) -> None:
-        """Take over what the socket has, to be received once it has been held back."""
+        """Read all packets from the socket and queue them with their injected delays."""
         while True:
             try:
                 packet = self._socket.recv(LONGEST_PACKET)
             except OSError:
-                # Nothing there, or nobody listens (yet).
+                # There is no further packet, or no process listens yet.
                 return
-            held: int | None = 0
+            delay: int | None = 0
             if self._any:
                 number = self._number_of(packet)
-                held = None if number is None else self._fate(number)
-            if held is not None:
+                delay = None if number is None else self._draw_delay(number)
+            if delay is not None:
                 self._count += 1
-                heapq.heappush(self._coming, (time.monotonic_ns() + held, self._count, packet))
+                heapq.heappush(self._coming, (time.monotonic_ns() + delay, self._count, packet))
 
-    def _fate(self, number: int) -> int | None:
-        """For how long a packet is held back [ns], or None for one that is lost."""
+    def _draw_delay(self, number: int) -> int | None:
+        """Draw and record the delay [ns] of a packet; return None if it is lost."""
         if not self._any:
             return 0
-        drops, jitter, delay = self._injection
-        known = 0 <= number < len(self.lost)
+        drops, jitter, constant = self._injection
+        in_range = 0 <= number < len(self.lost)
         if self._random.random() < drops:
-            if known:
+            if in_range:
                 self.lost[number] = 1
             return None
-        held = round(1e9 * (delay + jitter * self._random.random()))
-        if known:
-            self.held_back[number] += held
-        return held
+        delay = round(1e9 * (constant + jitter * self._random.random()))
+        if in_range:
+            self.held_back[number] += delay
+        return delay

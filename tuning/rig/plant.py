@@ -1,13 +1,12 @@
-"""A rig's hardware in plain floats: motion simulator, contact and sensors, one control period per call.
+"""Simulated hardware of a rig in plain floats: motion simulator, contact and sensors.
 
     plant = Plant(mechanism, seed=0)
-    plant.begin(position, velocity, command, number)  # a run of uniform motion, contact `number` ahead
-    force, position = plant.read()                    # what the sensors read at this tick
-    plant.move(command)                               # the position command of the next tick; a period passes
+    plant.begin(position, velocity, command, number)  # begin a run in uniform motion towards contact `number`
+    force, position = plant.read()                    # readings of the sensors at this tick
+    plant.move(command)                               # apply the next position command for one period
 
-The physics of `jaxhil.simulation.loop` stages 1, 4 and 5 without jax, fast enough for a loop in real time:
-linear parts are discretised exactly, once; delays are read at their places within a sampling interval
-(`tuning.rig.propagation`), and nothing is rounded to ticks.
+The physics are stages 1, 4 and 5 of `jaxhil.simulation.loop` without JAX, fast enough for real time. Linear
+parts are discretised exactly, and delays are exact fractions of a period (`tuning.rig.propagation`).
 """
 
 import math
@@ -19,13 +18,16 @@ from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
 from tuning.rig.sensor_lag import Motion, deepest_within, lagged
 
-# Motion where the force is sampled, at the interval's start, at its end.
+# Motion at the sample of the force, at the interval's start and at its end.
 SamplingInterval = tuple[Motion, Motion | None, Motion | None]
 
 
 class Plant:
-    """Everything on the rig but the controller. `force` [N]: the newest sample of the real contact force that
-    has happened by this tick; `shortfall` [m]: how far limits keep the command from what was wanted."""
+    """Hardware of the rig without the controller.
+
+    `force` [N] is the newest sample of the real contact force at this tick, `shortfall` [m] the distance by
+    which rate limits keep the command from the wanted one.
+    """
 
     def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
         rig = mechanism.rig
@@ -40,17 +42,17 @@ class Plant:
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._limited = math.isfinite(min(self._limits))
         self._rows = propagation(simulator, period, rig.command_hold, force_place, position_place)
-        # A sample happens `real` intervals after its command, and is read so many intervals later.
+        # A sample is taken `_real` intervals after its command, and is read `_force_intervals` later.
         self._real = math.ceil(simulator.delay / period + force_place - WHOLE) - 1
         self._force_intervals, self._position_intervals = force_intervals - self._real, position_intervals
         self._size = 1 << (max(self._force_intervals, position_intervals, self._real) + 2).bit_length()
         self.begin(-1.0, 0.0, -1.0, 0)
 
     def begin(self, position: float, velocity: float, command: float, number: int) -> None:
-        """A fresh run at its tick 0: contact `number` (from 0) ahead of a uniform motion.
+        """Begin a run at its tick 0, in uniform motion towards contact `number` (from 0).
 
-        The numerical model is at `position` [m] with `velocity` [m/s], the position command of this tick is
-        `command` [m]; before it, all have been in that motion for ever, and there was no force.
+        The numerical model is at `position` [m] with `velocity` [m/s], and this tick's position command is
+        `command` [m]. Before the run, the motion was uniform for an infinite time, without a force.
         """
         self._law, self._number, self._wanted_number = _law(self._contact, number), number, number
         stride = self._period * velocity
@@ -69,14 +71,14 @@ class Plant:
         size = self._size
         self._forces = [0.0] * size
         self._intervals: list[SamplingInterval | None] = [None] * size
-        # Interval -1 is the newest before the run, and lies at the ring's end.
-        self._positions = [first + (place - size + 1) * stride for place in range(size)]
+        # Interval -1, the newest before the run, is at the end of the ring buffer.
+        self._positions = [first + (index - size + 1) * stride for index in range(size)]
         self._tick = 0
         self._lag = self.force = 0.0
         self._in_contact, self._deepest = False, 0.0
 
     def read(self) -> tuple[float, float]:
-        """Measured force [N] and position [m] at this tick, just before its command acts. Draws noise."""
+        """Read force [N] and position [m] at this tick, just before its command acts; noise is drawn."""
         last = self._size - 1
         sensor, noise = self._force_sensor, self._noise
         force = self._forces[(self._tick - 1 - self._force_intervals) & last] + sensor.bias
@@ -92,7 +94,7 @@ class Plant:
         return force, _quantised(position, self._position_sensor.quantum)
 
     def move(self, command: float) -> None:
-        """One control period under the position command [m] of the tick at its end."""
+        """Advance by one control period with the position command [m] of the tick at its end."""
         if self._limited:
             command = self._limit(command)
         commands = self._commands
@@ -117,13 +119,13 @@ class Plant:
         self.expect(self._wanted_number)
 
     def expect(self, number: int) -> None:
-        """The next contact of the run is `number` (from 0): its law holds once the mechanism is free."""
+        """Set the number (from 0) of the run's next contact, whose law applies once the mechanism is free."""
         self._wanted_number = number
         if number != self._number and not self._in_contact:
             self._law, self._number = _law(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
-        """What happens in the interval whose motion arrives now; what the sensor makes of its force [N]."""
+        """Compute the contact in the interval whose motion arrives now; return the lagged force [N]."""
         if interval is None:
             return 0.0
         sample, start, end = interval
@@ -150,27 +152,27 @@ class Plant:
         return reading
 
     def _deeper(self, deepest: float, start: Motion, end: Motion, duration: float) -> float:
-        """Deepest penetration [m] by the end of a stretch; a surface that has been left is as new."""
+        """Return the deepest penetration [m] up to the end of a stretch; it is reset when contact is lost."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
-        if duration <= 0.0:  # delays of whole periods: the stretch before ends here
+        if duration <= 0.0:  # With delays of whole periods the second stretch is empty.
             return deepest
         return max(deepest, deepest_within(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
-        """Rate limits on the command: see `jaxhil.simulation.rate_limits.limit_command`."""
+        """Apply the rate limits to a position command [m] (`jaxhil.simulation.rate_limits.limit_command`)."""
         velocity_limit, acceleration_limit = self._limits
         previous, before = self._commands[0], self._wanted
         largest, change = velocity_limit * self._period, acceleration_limit * self._period**2
         step = unlimited = wanted - previous
-        own_step = wanted - before
+        wanted_step = wanted - before
         if math.isfinite(change):
             behind = before - previous
             more = math.floor((math.sqrt(1 + 8 * abs(behind) / change) - 1) / 2)
-            step = own_step + behind / (more + 1) + math.copysign(change * more / 2, behind)
+            step = wanted_step + behind / (more + 1) + math.copysign(change * more / 2, behind)
             step = min(max(step, self._step - change), self._step + change)
         step = min(max(step, -largest), largest)
-        rounding = 2 * math.ulp(1.0) * (abs(wanted) + abs(previous) + abs(own_step))
+        rounding = 2 * math.ulp(1.0) * (abs(wanted) + abs(previous) + abs(wanted_step))
         if abs(step - unlimited) <= rounding:
             command, step = wanted, unlimited
         else:
@@ -180,7 +182,7 @@ class Plant:
 
 
 def _law(contact: Contact, number: int) -> FloatLaw:
-    """Return the law of successive contact `number` (from 0); the last entry of every list repeats."""
+    """Return the law of contact `number` (from 0); the last entry of every list repeats."""
     stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
     damping = contact.damping[min(number, len(contact.damping) - 1)]
     return contact_law(contact.law).in_floats(contact, stiffness, damping)

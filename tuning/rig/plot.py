@@ -1,4 +1,4 @@
-"""Histograms of the latencies of a session: what the controller takes, and what the rig sees."""
+"""Histograms of a session's latencies: the controller's computing time and the round trip."""
 
 import matplotlib.style
 import numpy as np
@@ -15,9 +15,9 @@ BINS_PER_DECADE = 20
 
 @matplotlib.style.context("default")
 def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
-    """Share of ticks by the controller's own time per tick, and by round trip; both axes logarithmic.
+    """Plot the shares of ticks over the controller's time per tick and over the round trip.
 
-    `period` [s] is the control period: the time that an answer has is drawn too.
+    Both axes are logarithmic. `period` [s] is the control period, which is drawn with the answer's deadline.
     """
     figure = new_figure((10, 4.6), title)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -45,7 +45,7 @@ def _histogram(axes: Axes, times: np.ndarray, label: str) -> None:
     first, last = np.floor(BINS_PER_DECADE * np.log10([micro.min(), micro.max()]))
     edges = 10 ** (np.arange(first, last + 2) / BINS_PER_DECADE)
     counts, _ = np.histogram(micro, edges)
-    # An empty bin has no place on a logarithmic axis.
+    # A logarithmic axis cannot show an empty bin.
     shares = np.where(counts > 0, counts / len(micro), np.nan)
     style = {"color": colour, "linestyle": line, "linewidth": 1.5, "label": label}
     axes.stairs(shares, edges, baseline=None, **style)

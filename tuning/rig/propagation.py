@@ -1,9 +1,9 @@
-"""The motion simulator G(s) from tick to tick in plain floats, exact: one matrix exponential, then products.
+"""Exact discretisation of the motion simulator G(s) in plain floats, by one matrix exponential.
 
-A transport delay commutes with a linear system: G is driven by the undelayed command, a straight line within
-each control period ("sampling interval"), and every delay is how long ago its response is read. The response
-at the fraction s of a sampling interval is a fixed row of numbers times (state, command at its start, at its
-end).
+A transport delay commutes with a linear system. So G is driven by the undelayed command, which is linear
+within each control period ("sampling interval"), and a delayed reading is its response at an earlier time.
+The response at the fraction s of a sampling interval is a constant row of numbers times (state, command at
+the interval's start, command at its end).
 """
 
 import math
@@ -15,30 +15,30 @@ from scipy.linalg import expm
 from jaxhil.mechanism.structs import Simulator
 
 Row = tuple[float, ...]
-WHOLE = 1e-9  # periods by which a delay may miss a whole number of them
+WHOLE = 1e-9  # rounding error [periods] within which a delay is a whole number of periods
 
 
 class Place(NamedTuple):
-    """Rows that give position [m] and velocity [m/s] at one place of a sampling interval."""
+    """Rows for position [m] and velocity [m/s] at one fraction of a sampling interval."""
 
     position: Row
     velocity: Row
 
 
 class Propagation(NamedTuple):
-    """The response over one period: rows of numbers, see the module's text."""
+    """Rows of the response over one period (see the module's text)."""
 
-    transition: tuple[Row, ...]  # the state one period later
-    start: Place  # of an interval, from within
-    sample: Place  # where the force is read
-    end: Place  # of an interval, from within
-    measured: Row  # where the position is read
-    steady_command: Row  # the state of a uniform motion, per command now [m]
-    steady_step: Row  # the same, per growth of the command in a period [m]
+    transition: tuple[Row, ...]  # state one period later
+    start: Place  # start of the interval, as a limit from inside
+    sample: Place  # sample of the force
+    end: Place  # end of the interval, as a limit from inside
+    measured: Row  # position at the sample of the position sensor
+    steady_command: Row  # state of a uniform motion per current command [1/m]
+    steady_step: Row  # state of a uniform motion per increment of the command in a period [1/m]
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
-    """Whole sampling intervals to look back from the newest one, and the place in (0, 1] within that one."""
+    """Return the whole sampling intervals of a delay [s], and the fraction in (0, 1] of that interval."""
     periods = delay / period
     whole = math.floor(periods + WHOLE)
     return whole, min(1.0, 1.0 - (periods - whole))
@@ -47,16 +47,17 @@ def split_delay(delay: float, period: float) -> tuple[int, float]:
 def propagation(
     simulator: Simulator, period: float, hold: str, force_place: float, position_place: float
 ) -> Propagation:
-    """Exact discretisation of G(s): the exponential of the system augmented by its input (Van Loan 1978).
+    """Discretise G(s) exactly by the exponential of the system augmented by its input (Van Loan 1978).
 
     With z' = A z + B u, z(s T) = E(s) (z, u(0), u(1) - u(0)), E the exponential of s T [[A, B, 0],
-    [0, 0, 1/T], [0, 0, 0]]. `hold` is "linear" or "zoh"; places are fractions of the period [s].
+    [0, 0, 1/T], [0, 0, 0]]. `hold` is "linear" or "zoh"; `force_place` and `position_place` are the fractions
+    of the period [s] at which the sensors sample.
     """
     numerator, denominator = transfer_function(simulator)
     order = len(denominator) - 1
     if order == 0:
         return _ideal(period, hold, force_place, position_place)
-    # Time in periods: components of the state are then of like size.
+    # With time in periods the components of the state have similar magnitudes.
     powers = period ** np.arange(order + 1.0)
     system = np.eye(order, k=1)
     system[-1] = -(denominator[::-1] / denominator[0])[:order] * powers[:0:-1]
@@ -72,7 +73,7 @@ def propagation(
         generator[order - 1, order] = 1.0
         generator[order, order + 1] = 1.0
         rows = expm(place * generator)[: order + 1]
-        # Columns for (z, u(0), u(1)) instead of (z, u(0), u(1) - u(0)).
+        # This changes the columns from (z, u(0), u(1) - u(0)) to (z, u(0), u(1)).
         rows[:, order] -= rows[:, order + 1]
         return rows
 
@@ -86,7 +87,7 @@ def propagation(
     if hold == "linear":
         steady_step = np.linalg.solve(system, steady_command)
     else:
-        # A staircase: z(k) = alpha u(k+1) + beta step and z(k+1) = Ad z(k) + Bd u(k+1).
+        # With a stepwise command, z(k) = alpha u(k+1) + beta step and z(k+1) = Ad z(k) + Bd u(k+1).
         steady_step = -np.linalg.solve(np.eye(order) - transition[:, :order], steady_command)
     return Propagation(
         transition=tuple(_row(row) for row in transition),
@@ -100,7 +101,7 @@ def propagation(
 
 
 def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator of G(s) in descending powers of s; order 0 is the ideal simulator."""
+    """Return numerator and denominator of G(s) in descending powers of s; order 0 is the ideal simulator."""
     if simulator.model == "ideal":
         return np.ones(1), np.ones(1)
     if simulator.model == "transfer_function":
@@ -115,7 +116,7 @@ def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apply(row: Row, state: list[float], start: float, end: float) -> float:
-    """One row times (state, command at the sampling interval's start, command at its end)."""
+    """Return one row times (state, command at the sampling interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for weight, component in zip(row, state, strict=False):
         total += weight * component

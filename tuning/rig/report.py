@@ -1,4 +1,4 @@
-"""What a session comes to: every contact beside the same one in space, and a verdict with its reasons."""
+"""Report of a session: every contact compared with its ideal contact, and a verdict with reasons."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from tuning.rig.session import CONTROLLER, LoopReport, SessionReport, Setup
 
 
 def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResult]) -> list[float]:
-    """Restitution e* of each contact in space, entered at the speed it had on the rig; imports jax."""
+    """Return e* of the ideal contact of each contact, with the approach speed on the rig; imports JAX."""
     if not contacts:
         return []
     from jaxhil.simulation.environment import prepare
@@ -26,20 +26,20 @@ def reference_restitutions(mechanism: Mechanism, contacts: Sequence[ContactResul
     from jaxhil.simulation.scenario import build_scenarios
 
     scenario = build_scenarios(mechanism)
-    number = np.array([one.number for one in contacts])
+    number = np.array([contact.number for contact in contacts])
     parameters = jax.tree.map(lambda leaf: leaf[number], scenario.contact)
-    speeds = [one.approach_velocity for one in contacts]
+    speeds = [contact.approach_velocity for contact in contacts]
     velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
     mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
     law = contact_law(mechanism.contact.law).simulated
-    in_space = jax.jit(lambda contact, *entered: law.reference(parameters_by_slot(contact), *entered))
-    return [float(value) for value in np.asarray(in_space(parameters, mass, velocity).restitution)[:, 0]]
+    ideal = jax.jit(lambda contact, *motion: law.reference(parameters_by_slot(contact), *motion))
+    return [float(value) for value in np.asarray(ideal(parameters, mass, velocity).restitution)[:, 0]]
 
 
 def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> bool:
-    """Whether the machine, and nobody else, left a contact with commands older than `BRIDGED` periods.
+    """Return whether only the machine caused commands older than `BRIDGED` periods in a contact.
 
-    Such a contact says nothing of the controller. Where faults are injected there are none of the kind.
+    Such a contact does not evaluate the controller. With injected faults the result is always False.
     """
     if run is None or setup.injection.any or contact.oldest_command <= BRIDGED:
         return False
@@ -50,19 +50,18 @@ def stalled(contact: ContactResult, setup: Setup, run: LoopReport | None) -> boo
 def judge(
     setup: Setup, session: SessionReport, references: Sequence[float], limit: float, compensator: str
 ) -> dict[str, Any]:
-    """The session as a document, in SI units: loops, contacts, what was commanded, verdict and reasons."""
+    """Return the session as a document in SI units: loops, contacts, commands, verdict and reasons."""
     contacts = [
         {
-            **one._asdict(),
-            "status": STALLED if stalled(one, setup, session.run) else one.status,
+            **contact._asdict(),
+            "status": STALLED if stalled(contact, setup, session.run) else contact.status,
             "reference_restitution": reference,
-            "error": one.restitution - reference if one.status == "ok" else None,
+            "error": contact.restitution - reference if contact.status == "ok" else None,
         }
-        for one, reference in zip(session.contacts, references, strict=True)
+        for contact, reference in zip(session.contacts, references, strict=True)
     ]
-    ended = [one for one in contacts if one["status"] == "ok"]
-    errors = [one["error"] for one in ended]
-    reasons = _reasons(setup, session, [one["status"] for one in contacts], errors, limit)
+    errors = [contact["error"] for contact in contacts if contact["status"] == "ok"]
+    reasons = _reasons(setup, session, [contact["status"] for contact in contacts], errors, limit)
     good = f"no missed tick is the controller's fault, every error is within {limit:g}."
     if session.tripped:
         good = "tripped with a cause under injected faults, every command finite and within its limits."
@@ -78,7 +77,7 @@ def judge(
         "run": _figures(session.run),
         "contacts": contacts,
         "judged": len(errors),
-        "stalled": sum(one["status"] == STALLED for one in contacts),
+        "stalled": sum(contact["status"] == STALLED for contact in contacts),
         "largest_error": max(errors, key=abs, default=None),
         "commanded": None if session.commanded is None else session.commanded._asdict(),
         "stroke": setup.stroke,
@@ -98,15 +97,15 @@ def _figures(loop: LoopReport | None) -> dict[str, Any] | None:
     figures = loop.figures._asdict()
     for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
         figures[name] = figures[name]._asdict()
-    said = {key: loop.controller[key] for key in ("ended", "status", "ignored", "stale", "made_up", "jax")}
-    # A bundle brings the process that it was exported with, which may be too old to tell.
-    said["doubts"] = loop.controller.get("doubts", {})
-    again = loop.controller["replayed"]["cpu"]
+    record = {key: loop.controller[key] for key in ("ended", "status", "ignored", "stale", "made_up", "jax")}
+    # The process of an older bundle may not report quality flags ("doubts").
+    record["doubts"] = loop.controller.get("doubts", {})
+    times = loop.controller["replayed"]["cpu"]
     return {
         **figures,
-        "controller": said,
-        "replayed": len(again),
-        "replayed_most": max(again, default=0) * 1e-9,
+        "controller": record,
+        "replayed": len(times),
+        "replayed_most": max(times, default=0) * 1e-9,
     }
 
 

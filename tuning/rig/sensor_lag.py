@@ -1,7 +1,7 @@
-"""What a force sensor with a first-order lag reads of a contact, stretch by stretch of smooth motion.
+"""Reading of a force sensor with a first-order lag, T_s y' = F - y, over stretches of smooth motion.
 
-T_s y' = F - y. Within a stretch the motion is the cubic through its exact ends (Hermite); the contact begins
-and ends at roots on that cubic, and the force in between is taken along parabolas, whose lag is exact.
+Within a stretch the motion is the cubic Hermite polynomial through its exact ends. The contact begins and
+ends at roots of that cubic, and the force in between is interpolated by parabolas, whose lag is exact.
 """
 
 import math
@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from jaxhil.contact.float_law import FloatLaw
 
-ARCS = 2  # parabolas that stand for the force of one stretch
-MOST_STEPS = 50  # of false position
-CLOSE = 1e-13  # of a stretch
-SHORT = 1e-2  # time constants below which the closed form of an arc cancels
+ARCS = 2  # number of parabolas that interpolate the force of one stretch
+MOST_STEPS = 50  # largest number of steps of false position
+CLOSE = 1e-13  # tolerance of a root as a fraction of a stretch
+SHORT = 1e-2  # duration of an arc [time constants] below which the closed form suffers from cancellation
 
 
 class Motion(NamedTuple):
@@ -33,10 +33,10 @@ def lagged(
     time_constant: float,
     deepest: float = 0.0,
 ) -> float:
-    """The lag's output [N] at the end of a stretch of `duration` [s], `reading` [N] at its start.
+    """Return the lag's output [N] at the end of a stretch of `duration` [s], from `reading` [N] at its start.
 
-    Surfaces at 0 and, pushing the other way, at -clearance [m] (may be infinite). `deepest` [m]: what a law
-    that remembers does at the start of the stretch.
+    The surfaces are at 0 and, with the opposite direction, at -clearance [m], which may be infinite.
+    `deepest` [m] is the deepest penetration up to the start of the stretch, for laws with memory.
     """
     if duration <= 0.0:
         return reading
@@ -58,7 +58,7 @@ def lagged(
 
 
 def deepest_within(start: Motion, end: Motion, duration: float, clearance: float) -> float:
-    """Deepest penetration [m] of either surface along a smooth stretch of motion; 0 where there is none."""
+    """Return the deepest penetration [m] of either surface along a smooth stretch of motion; 0 if none."""
     side, surface = _surface(start.position, end.position, clearance)
     if side == 0.0:
         return 0.0
@@ -71,9 +71,9 @@ def deepest_within(start: Motion, end: Motion, duration: float, clearance: float
 
 
 class _Stretch:
-    """One stretch of motion at one surface, by the fraction s of it: where it presses, and with what force.
+    """Contact force along one stretch of motion at one surface, as a function of its fraction s.
 
-    A law that remembers holds, at s, after the deepest penetration so far.
+    A law with memory uses the deepest penetration up to s.
     """
 
     def __init__(self, path: "_Cubic", side: float, surface: float, law: FloatLaw, deepest: float) -> None:
@@ -83,7 +83,7 @@ class _Stretch:
         self._bottom = max(self._before, bottom)
 
     def pressed(self) -> tuple[float, float, list[float]]:
-        """From which s until which there is a force; its values [N] at the ends of `ARCS` arcs and within."""
+        """Return the interval of s with a force, and its values [N] at the ends and middles of the arcs."""
         enters, leaves = _span(self._depth)
         catches, lets_go = _span(self._hold)
         first, last = max(enters, catches), min(leaves, lets_go)
@@ -110,14 +110,14 @@ class _Stretch:
     def _force(self, s: float, at_surface: bool) -> float:
         rate = self._side * self._path.velocity(s)
         if at_surface:
-            # At the surface the force has a limit from inside.
+            # At the surface the force is the limit from inside.
             return self._law.edge(rate)
         penetration = self._depth(s)
         return self._law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
 
 
 def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
-    """Side (1, -1, or 0 for none) and position [m] of the surface that a stretch reaches."""
+    """Return side (1, -1, or 0 for none) and position [m] of the surface that a stretch reaches."""
     for position in (start, end):
         if position > 0.0:
             return 1.0, 0.0
@@ -127,7 +127,7 @@ def _surface(start: float, end: float, clearance: float) -> tuple[float, float]:
 
 
 def _turn(path: "_Cubic", depth: Callable[[float], float], side: float) -> tuple[float, float]:
-    """The fraction of a stretch at which it turns round on its way in, and how deep; else its end."""
+    """Return fraction and depth [m] of the turning point of a stretch; those of its end if there is none."""
 
     def inward(s: float) -> float:
         return side * path.velocity(s)
@@ -138,7 +138,7 @@ def _turn(path: "_Cubic", depth: Callable[[float], float], side: float) -> tuple
 
 
 class _Cubic:
-    """The cubic through both ends of a stretch, over the fraction s of it."""
+    """Cubic Hermite polynomial through both ends of a stretch, over its fraction s."""
 
     __slots__ = ("_bend", "_duration", "_rate", "_start", "_twist")
 
@@ -156,7 +156,7 @@ class _Cubic:
 
 
 def _span(function: Callable[[float], float]) -> tuple[float, float]:
-    """From which s in [0, 1] and until which a function is positive, if it changes its sign at most once."""
+    """Return the interval of s in [0, 1] in which a function with at most one sign change is positive."""
     at_0, at_1 = function(0.0), function(1.0)
     if at_0 <= 0.0 and at_1 <= 0.0:
         return 1.0, 0.0
@@ -167,8 +167,8 @@ def _span(function: Callable[[float], float]) -> tuple[float, float]:
 
 
 def _root(function: Callable[[float], float], at_0: float, at_1: float) -> float:
-    """Where a function changes its sign in [0, 1]: false position, the Illinois way."""
-    low, high, kept = 0.0, 1.0, 0
+    """Return the root of a function in [0, 1] by false position with the Illinois modification."""
+    low, high, last_side = 0.0, 1.0, 0
     s = 1.0
     for _ in range(MOST_STEPS):
         before, s = s, low + (high - low) * at_0 / (at_0 - at_1)
@@ -177,17 +177,20 @@ def _root(function: Callable[[float], float], at_0: float, at_1: float) -> float
             break
         if (value > 0.0) == (at_1 > 0.0):
             high, at_1 = s, value
-            at_0 = at_0 / 2 if kept == 1 else at_0
-            kept = 1
+            at_0 = at_0 / 2 if last_side == 1 else at_0
+            last_side = 1
         else:
             low, at_0 = s, value
-            at_1 = at_1 / 2 if kept == -1 else at_1
-            kept = -1
+            at_1 = at_1 / 2 if last_side == -1 else at_1
+            last_side = -1
     return s
 
 
 def _arc(span: float) -> tuple[float, float, float]:
-    """What is left after `span` time constants of y, of an input s/span, and of 4 s/span (1 - s/span)."""
+    """Return three weights of an arc of `span` time constants for the exact lag of a parabola.
+
+    They are the decay of y, the mean of that decay, and the response to 4 s/span (1 - s/span).
+    """
     decay = math.exp(-span)
     if span < SHORT:
         mean = -math.expm1(-span) / span if span > 0.0 else 1.0

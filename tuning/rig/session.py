@@ -1,10 +1,10 @@
-"""A session: the controller's process, an empty loop for comparison, the run, and whose fault what was.
+"""Session of a rehearsal: the controller's process, an empty loop for comparison, the run, and its faults.
 
-The rig's process, which is this one, starts the controller's, plays the rig to it and stops it. Whose fault a
-missed tick is, is found out afterwards. It is the controller's if its process took more than `CPU_SHARE` of
-the period of CPU time for that tick, live and when the same packets were gone through again, or if it follows
-such a tick without one in between that was met; else it is an injected fault's, if one hit its packets; else
-the machine's: the operating system, or another machine on the same processor, ran something else.
+The rig's process, which is this one, starts the controller's process, simulates the rig and stops it. The
+cause of each missed tick is determined afterwards. It is the controller if its process took more than
+`CPU_SHARE` of the period of CPU time for the tick, both live and in a replay of the packets, or if only
+missed ticks lie between such a tick and this one. Otherwise it is an injected fault, if one affected its
+packets; otherwise it is the machine: another process or virtual machine used the processor.
 """
 
 import json
@@ -38,10 +38,10 @@ from tuning.rig.udp_protocol import (
     encode_reading,
 )
 
-STARTING = 30.0  # s in which the controller's process has to listen, and to answer
-ASKING = 0.1  # s to wait for an answer, before asking again
-ENDING = 120.0  # s in which it has to end, going through its packets again included
-SILENCE = 2.0  # s without a packet, after which it ends by itself
+STARTING = 30.0  # limit on the time in which the controller's process must listen, and answer [s]
+ASKING = 0.1  # wait for an answer before the next request [s]
+ENDING = 120.0  # limit on the time in which the process must end, its replay included [s]
+SILENCE = 2.0  # time without a packet after which the process ends by itself [s]
 
 SOURCE = Path(__file__).parent
 LAST = Reading(
@@ -58,7 +58,7 @@ LAST = Reading(
 
 
 class Quantiles(NamedTuple):
-    """Of a time [s]."""
+    """Quantiles of a time [s]."""
 
     median: float
     p999: float  # 99.9th percentile
@@ -66,78 +66,79 @@ class Quantiles(NamedTuple):
 
 
 class LoopFigures(NamedTuple):
-    """One loop in figures."""
+    """Metrics of one loop."""
 
-    ticks: int  # played
-    missed: int  # of these
-    missed_by_controller: int  # of the missed, by whose fault
-    missed_by_injection: int  # likewise
-    missed_by_machine: int  # likewise
-    stood_still: float  # for how long the rig's clock stood still [s]
-    tick_time: Quantiles  # the controller's own time per tick [s]
-    tick_cpu: Quantiles  # the CPU time in it [s]
-    round_trip: Quantiles  # from a packet to its answer [s]
-    lateness: Quantiles  # by how much packets left late [s]
+    ticks: int  # number of played ticks
+    missed: int  # number of missed ticks
+    missed_by_controller: int  # number of ticks missed because of the controller
+    missed_by_injection: int  # number of ticks missed because of injected faults
+    missed_by_machine: int  # number of ticks missed because of the machine
+    stood_still: float  # time by which the rig's clock was shifted [s]
+    tick_time: Quantiles  # controller's time per tick [s]
+    tick_cpu: Quantiles  # controller's CPU time per tick [s]
+    round_trip: Quantiles  # time from a packet to its answer [s]
+    lateness: Quantiles  # delay with which packets were sent [s]
 
 
 class LoopTimes(NamedTuple):
-    """What `LoopFigures` are made of, for pictures."""
+    """Times behind `LoopFigures`, for plots."""
 
-    tick_time: np.ndarray  # the controller's time per tick [s]
-    round_trip: np.ndarray  # [s]
+    tick_time: np.ndarray  # controller's time per tick [s]
+    round_trip: np.ndarray  # time from a packet to its answer [s]
 
 
 class LoopReport(NamedTuple):
-    """One loop."""
+    """Report of one loop."""
 
-    figures: LoopFigures  # what it comes to
-    times: LoopTimes  # for pictures
-    causes: np.ndarray  # whose fault each tick was (`attribute`)
-    controller: dict[str, Any]  # what the controller's process said at its end
+    figures: LoopFigures  # metrics
+    times: LoopTimes  # times for plots
+    causes: np.ndarray  # cause of each missed tick (`attribute`)
+    controller: dict[str, Any]  # record that the controller's process wrote at its end
 
 
 class SessionReport(NamedTuple):
-    """A session."""
+    """Report of a session."""
 
-    empty: LoopReport | None  # the empty loop; None where it was not reached
-    run: LoopReport | None  # the run against the rig, likewise
-    contacts: tuple[ContactResult, ...]  # those that are over
-    commanded: Commanded | None  # what was commanded
-    tripped: str  # why the controller tripped; empty if it did not
-    interrupted: bool  # whether the session was
-    # why the controller tripped and was reset, where the machine had left it without time
+    empty: LoopReport | None  # empty loop; None if it was not reached
+    run: LoopReport | None  # run against the rig; None if it was not reached
+    contacts: tuple[ContactResult, ...]  # contacts that ended
+    commanded: Commanded | None  # range of the commands
+    tripped: str  # reason of the controller's trip; empty without one
+    interrupted: bool  # whether the session was interrupted
+    # reasons of trips after which the controller was reset, since the machine had delayed its commands
     resets: tuple[str, ...] = ()
 
 
 class Setup(NamedTuple):
-    """What a session is to be."""
+    """Settings of a session."""
 
-    folder: Path  # with the controller's process, as in a bundle, or `SOURCE`
-    gains: Path  # its gain file
-    mechanism: Mechanism  # the one in that
-    stroke: tuple[float, float]  # lowest and highest position that the drives take [m]
-    duration: float  # of the run [s]
-    empty_duration: float  # of the empty loop before it [s]
-    injection: Injection  # faults put into the run
-    seed: int  # of all draws
-    priority: bool = False  # whether to ask the system for a real-time priority for both processes
+    folder: Path  # folder of the controller's process: that of a bundle, or `SOURCE`
+    gains: Path  # gain file of the controller
+    mechanism: Mechanism  # mechanism in the gain file
+    stroke: tuple[float, float]  # lowest and highest position of the drives [m]
+    duration: float  # duration of the run [s]
+    empty_duration: float  # duration of the empty loop before it [s]
+    injection: Injection  # faults injected into the run
+    seed: int  # seed of all draws
+    priority: bool = False  # whether to request a real-time priority for both processes
 
 
 def run_session(
     setup: Setup, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
 ) -> SessionReport:
-    """Play an empty loop, then the rig. Records go to the folder `scratch`; `say` is called with what begins,
-    and `progress` once a second how many ticks of how many are done.
+    """Play an empty loop, then the rig.
 
-    Raises InputError when the controller's process does not start.
+    Records are written to the folder `scratch`. `say` is called with a description of each stage, `progress`
+    once a second with the completed and the total number of ticks. Raise InputError if the controller's
+    process does not start or does not write its record.
     """
     task = RigTask(setup.mechanism, setup.seed, setup.stroke, resets=not setup.injection.any)
     period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
     try:
         if setup.empty_duration >= period:
             say(f"empty loop at {1 / period:g} Hz, {setup.empty_duration:g} s")
-            none = Injection()
-            empty, interrupted = _play(setup, EmptyTask(), setup.empty_duration, none, scratch, progress)
+            faultless = Injection()
+            empty, interrupted = _play(setup, EmptyTask(), setup.empty_duration, faultless, scratch, progress)
         if not interrupted:
             say(f"{setup.mechanism.name} at {1 / period:g} Hz, {setup.duration:g} s")
             run, interrupted = _play(setup, task, setup.duration, setup.injection, scratch, progress)
@@ -155,7 +156,7 @@ def _play(
     scratch: Path,
     progress: Callable[[int, int], None],
 ) -> tuple[LoopReport, bool]:
-    """One loop against a process of its own, and whether it was interrupted."""
+    """Play one loop against a new controller's process; return its report and whether it was interrupted."""
     period = setup.mechanism.rig.control_period
     ticks, record = max(1, round(duration / period)), scratch / f"{type(task).__name__}.json"
     options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
@@ -173,7 +174,7 @@ def _play(
         except KeyboardInterrupt:
             interrupted = True
         finally:
-            # Past all injection; twice, as a full buffer may swallow one.
+            # Stop packets are sent twice, since a full buffer may drop one.
             for _ in range(2):
                 network.send_plainly(encode_reading(LAST, session))
             network.close()
@@ -193,7 +194,7 @@ def _play(
 
 @contextmanager
 def real_time(wanted: bool) -> Iterator[None]:
-    """A real-time priority for this thread while it lasts. Raises OSError where that is not to be had."""
+    """Give this thread a real-time priority in the context, if `wanted`; raise OSError if refused."""
     if not wanted:
         yield
         return
@@ -206,8 +207,8 @@ def real_time(wanted: bool) -> Iterator[None]:
 
 
 def start_controller(folder: Path, arguments: Sequence[str]) -> subprocess.Popen:
-    """The controller's process, isolated, in the folder that holds `udp_controller.py`."""
-    # A session of its own: an interruption from the keyboard is the rig's, which stops it in order.
+    """Start the controller's process, isolated, in the folder that holds `udp_controller.py`."""
+    # In a new session, the process gets no keyboard interrupt; the rig's process stops it in order.
     return subprocess.Popen(
         [sys.executable, "-I", "udp_controller.py", *arguments],
         cwd=folder,
@@ -217,7 +218,7 @@ def start_controller(folder: Path, arguments: Sequence[str]) -> subprocess.Popen
 
 
 def listening_port(process: subprocess.Popen) -> int:
-    """The port that the process says it listens on. Raises InputError if it does not."""
+    """Return the port that the process prints when it listens; raise InputError if it does not."""
     stream = process.stdout
     assert stream is not None
     ready = select.select([stream], [], [], STARTING)[0]
@@ -228,8 +229,10 @@ def listening_port(process: subprocess.Popen) -> int:
 
 
 def open_session(network: Network) -> int:
-    """The number of a session with the controller's process, asked for until it answers. Raises InputError if
-    it does not."""
+    """Request a session from the controller's process until it answers; return the session's number.
+
+    Raise InputError if it does not answer.
+    """
     number = secrets.randbits(64)
     until = time.monotonic() + STARTING
     while time.monotonic() < until:
@@ -243,26 +246,26 @@ def open_session(network: Network) -> int:
 
 
 def loop_report(timing: Timing, network: Network, controller: dict[str, Any], period: float) -> LoopReport:
-    """Join what the rig and the controller's process have recorded."""
+    """Combine the records of the rig and of the controller's process."""
     ticks = timing.ticks
     record = {name: np.array(values, np.int64) for name, values in controller.pop("ticks").items()}
     within = record["sequence"] < ticks
     wall, cpu = (1e-9 * record[name][within] for name in ("wall", "cpu"))
     overspent = np.zeros(ticks, bool)
-    again = controller["replayed"]
-    for number, took in zip(again["sequence"], again["cpu"], strict=True):
-        if number < ticks and 1e-9 * took > CPU_SHARE * period:
+    replay = controller["replayed"]
+    for number, time_ns in zip(replay["sequence"], replay["cpu"], strict=True):
+        if number < ticks and 1e-9 * time_ns > CPU_SHARE * period:
             overspent[number] = True
-    met = np.array(timing.met[:ticks], bool)
+    in_time = np.array(timing.met[:ticks], bool)
     round_trip = 1e-9 * np.array(timing.round_trip[:ticks], float)
-    held = 1e-9 * np.array(network.held_back[:ticks], float)
+    delay = 1e-9 * np.array(network.held_back[:ticks], float)
     lost = np.array(network.lost[:ticks], bool)
-    causes = attribute(met, overspent, round_trip, held, lost, ANSWER_SHARE * period)
+    causes = attribute(in_time, overspent, round_trip, delay, lost, ANSWER_SHARE * period)
     late = 1e-9 * np.array(timing.late[:ticks], float)
     trips = round_trip[round_trip > 0]
     figures = LoopFigures(
         ticks=ticks,
-        missed=int(np.sum(~met)),
+        missed=int(np.sum(~in_time)),
         missed_by_controller=int(np.sum(causes == CONTROLLER)),
         missed_by_injection=int(np.sum(causes == INJECTED)),
         missed_by_machine=int(np.sum(causes == MACHINE)),
@@ -286,15 +289,21 @@ def attribute(
     lost: np.ndarray,
     allowance: float,
 ) -> np.ndarray:
-    """Whose fault each missed tick is, (ticks,): `MET`, `CONTROLLER`, `INJECTED` or `MACHINE`.
+    """Return the cause of each missed tick, (ticks,): `MET`, `CONTROLLER`, `INJECTED` or `MACHINE`.
 
-    `overspent`: the controller took more CPU time than its share; `round_trip` [s], 0 without an answer;
-    `held` back by injection [s]; `lost` by it; `allowance` [s] for an answer. Injection is to blame for what
-    was lost, for what would have come in time had it not been held back, and for what was held back and never
-    answered (a newer packet overtook it).
+    Injection is the cause if it lost the packet, if the answer would have been in time without the delay, or
+    if a delayed packet was never answered, since a newer one overtook it.
+
+    Args:
+        met: whether the answer was in time.
+        overspent: whether the controller took more CPU time than its share.
+        round_trip: time to the answer [s], 0 without an answer.
+        held: injected delay [s].
+        lost: whether injection lost the packet or its answer.
+        allowance: time in which the answer must arrive [s].
     """
-    in_time_but_for_it = np.where(round_trip > 0, round_trip - held <= allowance, True)
-    injected = lost | ((held > 0) & in_time_but_for_it)
+    in_time_without_delay = np.where(round_trip > 0, round_trip - held <= allowance, True)
+    injected = lost | ((held > 0) & in_time_without_delay)
     causes = np.where(met, MET, np.where(overspent, CONTROLLER, np.where(injected, INJECTED, MACHINE)))
     for number in np.flatnonzero(causes == CONTROLLER):
         following = number + 1
@@ -305,7 +314,7 @@ def attribute(
 
 
 def quantiles(values: np.ndarray) -> Quantiles:
-    """Median, 99.9th percentile and maximum; not a number where there are no values."""
+    """Return median, 99.9th percentile and maximum; NaN without values."""
     if not len(values):
         return Quantiles(math.nan, math.nan, math.nan)
     return Quantiles(*(float(value) for value in (*np.quantile(values, (0.5, 0.999)), np.max(values))))

@@ -1,25 +1,25 @@
-"""The controller as a process of its own: sensor packets in, position commands out, over UDP on loopback.
+"""Process of the controller, which answers sensor packets with position commands over UDP on loopback.
 
     python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
 
-It runs from a bundle's folder with that bundle's `gains.json`, `jaxhil_runtime.py` and `udp_protocol.py`,
-which says what is in a packet; nothing else is needed. Standard output says `port NUMBER` once it listens.
-Whoever plays the rig asks for a session (`ask_for_session`) until the answer is there, then sends
+It runs in a bundle's folder and needs only that bundle's `gains.json`, `jaxhil_runtime.py` and
+`udp_protocol.py`, which defines the packets. It prints `port NUMBER` to standard output when it listens. The
+rig requests a session (`ask_for_session`) until it gets an answer, then sends
 
-    PREPARE  the mechanism is free: tare, then stand ready at the start of a run; repeated until READY
+    PREPARE  the mechanism is free: tare, then prepare the start of a run; repeated until READY
     RESET    as PREPARE, after a reset of a controller that has tripped
-    TICK     what the sensors read at tick n = 0, 1, ... of the run; answered by the command for tick n + 1
-    STOP     the session is over
+    TICK     readings of the sensors at tick n = 0, 1, ... of the run; the answer is the command of tick n + 1
+    STOP     the end of the session
 
-and a silent rig (`--silence`) ends it too. This process serves one session, which belongs to the address and
-port that its first packet came from. Packets from elsewhere or without the session's number are ignored and
-counted; neither they nor packets that came before break the silence. A rig that begins anew starts another
-process. This one holds the numerical model: M x'' = -F_c, integrated once per period.
+The session also ends if the rig is silent (`--silence`). This process serves one session, with the address
+and port of its first packet. Packets from other addresses, or without the session's number, are ignored and
+counted; neither these nor old packets end the silence. A new session needs another process.
+This process holds the numerical model M x'' = -F_c, integrated once per period.
 
-Its own time per tick (from the return of recv to that of send) and the CPU time in it are kept in arrays
-allocated beforehand and written at the end. Where a tick took more CPU time than its share of the period, all
-packets are gone through again at the end: the same work takes as long again, what an interrupt or another
-machine on the same processor took does not. With `--empty` it answers at once and computes nothing.
+The time per tick (from the return of recv to that of send) and its CPU time are stored in preallocated arrays
+and written at the end. If a tick took more CPU time than its share of the period, all packets are replayed at
+the end. The controller's work takes equally long again, whereas an interrupt or another virtual machine on
+the processor does not occur again. With `--empty` the process answers at once and computes nothing.
 """
 
 import argparse
@@ -37,41 +37,43 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 HERE = Path(__file__).resolve().parent
-# An isolated interpreter (-I) does not look beside the script.
+# An isolated interpreter (-I) does not search the script's folder.
 if (HERE / "jaxhil_runtime.py").is_file():
     sys.path.insert(0, str(HERE))
-    # A bundle stays as it is.
+    # No files may be added to a bundle.
     sys.dont_write_bytecode = True
     import udp_protocol as udp  # pyright: ignore[reportMissingImports]
     from jaxhil_runtime import Controller  # pyright: ignore[reportMissingImports]
 else:
-    # Not in a bundle but in the source tree.
+    # The script is in the source tree, not in a bundle.
     if not __package__:
         sys.path.insert(0, str(HERE.parents[1]))
     from jaxhil.rig import Controller
     from tuning.rig import udp_protocol as udp
 
-CPU_SHARE = 0.5  # of the period, that is the controller's
-REPLAYS = 3
-PRIORITY = 20  # of the real-time class, where asked for
+CPU_SHARE = 0.5  # share of the period that the controller may use as CPU time
+REPLAYS = 3  # number of replays, of which the least time counts
+PRIORITY = 20  # requested priority of the real-time class
 
 
 class Empty:
-    """An empty loop: every packet is answered, nothing is computed."""
+    """Task of an empty loop, which answers every packet and computes nothing."""
 
     stale = made_up = 0
     status = "ok"
     doubts: ClassVar[dict[str, int]] = {}
 
     def answer(self, reading: udp.Reading) -> udp.Answer:
-        """Zeros, and the reading's own numbers."""
+        """Return an answer with the reading's numbers and zeros."""
         _, sequence, run, tick, *_ = reading
         return udp.Answer(udp.EMPTY | udp.READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, "")
 
 
 class TickRecord:
-    """Sequence number, own time [ns] and CPU time [ns] of every tick, and the packets, in memory allocated
-    beforehand. What does not fit is not kept."""
+    """Record of every tick in preallocated memory: sequence number, time [ns], CPU time [ns] and packet.
+
+    Ticks and packets beyond the capacity are not recorded.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.sequence, self.wall, self.cpu = (array("q", bytes(8 * capacity)) for _ in range(3))
@@ -80,75 +82,77 @@ class TickRecord:
         self.capacity = capacity
 
     def keep(self, packet: bytes | bytearray) -> None:
-        """Keep a packet, of whatever kind."""
-        kept = self.kept
-        if kept < self.capacity:
-            self._packets[kept * self._size : (kept + 1) * self._size] = packet
-            self.kept = kept + 1
+        """Store a packet of any kind."""
+        count = self.kept
+        if count < self.capacity:
+            self._packets[count * self._size : (count + 1) * self._size] = packet
+            self.kept = count + 1
 
     def add(self, sequence: int, wall: int, cpu: int) -> None:
-        """Keep the times of one tick."""
+        """Store the times of one tick."""
         count = self.count
         if count < self.capacity:
             self.sequence[count], self.wall[count], self.cpu[count] = sequence, wall, cpu
             self.count = count + 1
 
     def readings(self) -> Iterator[udp.Reading]:
-        """The readings of the packets kept."""
-        for place in range(self.kept):
-            packet = self._packets[place * self._size : (place + 1) * self._size]
+        """Yield the readings of the stored packets."""
+        for index in range(self.kept):
+            packet = self._packets[index * self._size : (index + 1) * self._size]
             yield udp.decode_reading(packet, None)
 
     def above(self, limit: float) -> dict[int, int]:
-        """CPU time [ns] of the ticks that took more than `limit` [ns], by their sequence number."""
+        """Return the CPU time [ns] of the ticks above `limit` [ns] by sequence number."""
         return {self.sequence[i]: self.cpu[i] for i in range(self.count) if self.cpu[i] > limit}
 
     def document(self) -> dict[str, list[int]]:
-        """As JSON can express it."""
+        """Return the times as JSON data."""
         return {name: list(getattr(self, name)[: self.count]) for name in ("sequence", "wall", "cpu")}
 
 
 def replayed(make: Callable[[], udp.ControllerTask], record: TickRecord, limit: float) -> dict[int, int]:
-    """CPU time [ns], the least of a few replays, of the ticks that took more than `limit` [ns] when live."""
-    found, cpu_now = record.above(limit), time.thread_time_ns
-    for _ in range(REPLAYS if found else 0):
+    """Return the least CPU time [ns] in live run and replays of the ticks above `limit` [ns] when live."""
+    times, cpu_now = record.above(limit), time.thread_time_ns
+    for _ in range(REPLAYS if times else 0):
         task = make()
         for reading in record.readings():
-            begun = cpu_now()
+            start = cpu_now()
             task.answer(reading)
-            took = cpu_now() - begun
-            if reading.sequence in found:
-                found[reading.sequence] = min(found[reading.sequence], took)
-    return found
+            duration = cpu_now() - start
+            if reading.sequence in times:
+                times[reading.sequence] = min(times[reading.sequence], duration)
+    return times
 
 
 class Ended(NamedTuple):
-    """How a session ended."""
+    """End of a session."""
 
     why: str  # "stopped", "silent" or "interrupted"
-    ignored: int  # packets that were not of it
+    ignored: int  # number of ignored packets
 
 
 def serve(
     receiver: socket.socket, task: udp.ControllerTask | Empty, record: TickRecord, wait: float, silence: float
 ) -> Ended:
-    """Answer the packets of one session until the rig stops it, or `silence` [s] have passed without one;
-    `wait` [s] for its first."""
+    """Answer the packets of one session until the rig stops it or is silent for `silence` [s].
+
+    `wait` [s] is the longest time until the first packet.
+    """
     packet = bytearray(udp.READING.size + 1)
     now, cpu_now, clock = time.monotonic_ns, time.thread_time_ns, time.monotonic
     sessions, peer, session, ignored = udp.Sessions(), None, 0, 0
     until = clock() + wait
     while True:
-        # Not the time since the last packet: anyone may send some.
+        # Only packets of the session extend this deadline, since others can come from any process.
         left = until - clock()
         if left <= 0.0 or not select.select([receiver], [], [], left)[0]:
             return Ended("silent", ignored)
         try:
             size, sender = receiver.recvfrom_into(packet)
         except OSError:
-            # A refusal that an earlier answer met: its addressee is gone.
+            # An earlier answer was refused, since its receiver no longer exists.
             continue
-        begun, cpu_begun = now(), cpu_now()
+        start, cpu_start = now(), cpu_now()
         if peer is None:
             session = sessions.number(sender)
             opening = sessions.answer(packet[:size], sender)
@@ -172,14 +176,14 @@ def serve(
         if answer is not None:
             until = clock() + silence
             sent = _send(receiver, udp.encode_answer(answer, session), peer)
-        took, cpu_took = now() - begun, cpu_now() - cpu_begun
+        wall, cpu = now() - start, cpu_now() - cpu_start
         record.keep(packet[:size])
         if sent and reading.event == udp.TICK:
-            record.add(reading.sequence, took, cpu_took)
+            record.add(reading.sequence, wall, cpu)
 
 
 def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
-    """Whether a packet left: not where the rig does not listen, or the network is full."""
+    """Send a packet; return False if the rig does not listen or the network's buffer is full."""
     try:
         receiver.sendto(packet, peer)
     except OSError:
@@ -188,7 +192,7 @@ def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The process's options."""
+    """Parse the process's options."""
     parser = argparse.ArgumentParser(description="Answer a rig's sensor packets over UDP on loopback.")
     parser.add_argument("--gains", default=str(HERE / "gains.json"), help="gain file; by default beside this")
     parser.add_argument("--port", type=int, default=0, help="UDP port on 127.0.0.1; 0: any that is free")
@@ -204,7 +208,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Serve one session; 0 when it was ended by the rig, 1 by its silence, 2 for a file that does not fit."""
+    """Serve one session; return 0 if the rig stopped it, 2 for an invalid gain file or option, else 1."""
     options = parse(arguments)
     limit = math.inf
     try:
@@ -219,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"udp_controller: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
     record = TickRecord(max(options.ticks, 0))
-    # From here on nothing is made that a collector would have to look for.
+    # Collections would delay ticks, and the loop creates no reference cycles.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -230,7 +234,7 @@ def main(arguments: list[str] | None = None) -> int:
             ended = serve(receiver, task, record, options.wait, options.silence)
         except KeyboardInterrupt:
             ended = Ended("interrupted", 0)
-    again = replayed(lambda: load(options.gains), record, limit)
+    replay = replayed(lambda: load(options.gains), record, limit)
     document = {
         "ended": ended.why,
         "ignored": ended.ignored,
@@ -240,7 +244,7 @@ def main(arguments: list[str] | None = None) -> int:
         "doubts": task.doubts,
         "jax": "jax" in sys.modules,
         "ticks": record.document(),
-        "replayed": {"sequence": list(again), "cpu": list(again.values())},
+        "replayed": {"sequence": list(replay), "cpu": list(replay.values())},
     }
     if options.record is not None:
         Path(options.record).write_text(json.dumps(document), encoding="utf-8")
@@ -248,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def load(path: str) -> udp.ControllerTask:
-    """The task of a gain file. Raises ValueError, OSError, KeyError, TypeError for one that does not fit."""
+    """Load the task of a gain file; raise ValueError, OSError, KeyError or TypeError if it is invalid."""
     controller = Controller.from_file(path)
     document = json.loads(Path(path).read_text(encoding="utf-8"))
     limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
@@ -256,7 +260,7 @@ def load(path: str) -> udp.ControllerTask:
 
 
 def realtime() -> None:
-    """Ask for a real-time priority. Raises OSError where that is not to be had."""
+    """Request a real-time priority; raise OSError if it is refused."""
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("this system has no real-time priorities")
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))

@@ -1,18 +1,19 @@
-"""What a rig and a controller's process say to each other over UDP, and what the controller's side answers.
+"""UDP protocol between a rig and the controller's process, and the controller's side without a network.
 
-The rig sends a `Reading`, what its sensors read at a tick; the controller's process sends back an `Answer`,
-the command for the next one. Both are packets of fixed size. `ControllerTask` makes the one of the other: it
-holds the controller and the numerical model of the docking, and knows nothing of networks and clocks.
+The rig sends a `Reading` with the sensors' readings at a tick; the controller's process returns an `Answer`
+with the command for the next tick. Both are packets of fixed size. `ControllerTask` computes the answer from
+the reading: it holds the controller and the numerical model of the docking, but no network or clock.
 
-First the rig asks for a session, with a number drawn at random, until it is answered: by that number and the
-session's, which every later packet carries, either way. It is one that only who receives at the rig's address
-and port can know, and begins with the first packet from there that has it (`Sessions`).
+First the rig requests a session with a random number until it gets an answer with that number and the
+session's number, which every later packet in either direction contains. Only a receiver at the rig's address
+and port can know the session's number. The session begins with the first packet from there with that number
+(`Sessions`).
 
-Packets may be lost, late or out of order: one that is not newer than the last is dropped and counted
-(`Sequence`). Ticks that no packet came for are made up once the next one is there, from readings on the
-straight line between, and answered with the fault `missed_tick`. Where more are missing than the gain file's
-limit `missed_in_a_row` (without one, `MOST_MADE_UP`), the controller sees the gap in the rig's time and
-judges it, and the model goes on under the last F_c: its time stays the rig's.
+Packets may be lost, late or out of order. A packet that is not newer than the last one is dropped and counted
+(`Sequence`). Missing ticks are computed when the next packet arrives, from linearly interpolated readings,
+and answered with the fault `missed_tick`. If more ticks are missing than the gain file's limit
+`missed_in_a_row` (by default `MOST_MADE_UP`), they are not interpolated: the controller detects the gap in
+the rig's time, and the model continues under the last F_c, so that its time remains the rig's.
 """
 
 import hmac
@@ -29,72 +30,73 @@ FLAGS = READY | TRIPPED | TARING | EMPTY
 # Little-endian: mark, version, kind, session, sequence, run, tick; time [s], force [N], position [m],
 # start [m, m/s].
 READING = struct.Struct("<4sBBxxQIIIxxxx5d")
-# Mark, version, flags, session, sequence, run, tick; positions, velocity, forces; faults; words on a trip.
+# Mark, version, flags, session, sequence, run, tick; position command, rate, position, velocity, force;
+# faults; reason of a trip.
 ANSWER = struct.Struct("<4sBBxxQIII4xdddddQ96s")
-# Mark, version, the rig's number, the session's: 0 in the question.
+# Mark, version, the rig's number, the session's number, which is 0 in the request.
 OPENING = struct.Struct("<4sBxxxQQ")
 MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 2
 MARK_ASK, MARK_OPEN = b"JHas", b"JHop"
 
-NUMBERS = 0xFFFFFFFF  # the largest number of a packet: 0 follows it
-WINDOW = 100  # packets in a row that may be lost without costing one more
-APPROACH = 0.02  # s of free approach before a contact
-MOST_MADE_UP = 10  # ticks in a row, without a limit in the gain file
-MOST_PASSED = 10_000  # periods that the model goes on under the last force
-MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # the runtime's faults of these names
+NUMBERS = 0xFFFFFFFF  # largest number of a packet, which is followed by 0
+WINDOW = 100  # largest step of the packet number that is accepted at once
+APPROACH = 0.02  # time of free approach before a contact [s]
+MOST_MADE_UP = 10  # largest number of missing ticks in a row that are interpolated, by default
+MOST_PASSED = 10_000  # largest number of periods that the model continues under the last force
+MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # bits of the runtime's faults with these names
 
 
 class PacketError(ValueError):
-    """Bytes that are no packet of this protocol."""
+    """Error for bytes that are no packet of this protocol."""
 
 
 class Reading(NamedTuple):
-    """From the rig, at one tick."""
+    """Packet from the rig at one tick."""
 
-    event: int  # the kind of packet, one of `EVENTS`
-    sequence: int  # its number in the session
-    run: int  # the number of the run
-    tick: int  # the tick of the run
-    time: float  # the rig's time [s]
+    event: int  # kind of packet, one of `EVENTS`
+    sequence: int  # number of the packet in the session
+    run: int  # number of the run
+    tick: int  # tick of the run
+    time: float  # rig's time [s]
     force: float  # measured force [N]
     position: float  # measured position [m]
-    start_position: float  # position [m] of the numerical model at the run's tick 0
-    start_velocity: float  # its velocity [m/s] there
+    start_position: float  # position of the numerical model at the run's tick 0 [m]
+    start_velocity: float  # velocity of the numerical model at the run's tick 0 [m/s]
 
 
 class Answer(NamedTuple):
-    """To the rig, about one reading."""
+    """Packet to the rig in answer to one reading."""
 
     flags: int  # any of `FLAGS`
-    sequence: int  # the reading's
-    run: int  # the reading's
-    tick: int  # the reading's
-    position_command: float  # position [m] to command at the next tick; while preparing, at tick 0
-    command_rate: float  # its rate [m/s]
-    position: float  # the numerical model's position [m] at this tick
-    velocity: float  # its velocity [m/s]
-    force_command: float  # the force F_c [N] that it feels
-    faults: int  # the bits of the controller's faults
-    words: str  # why the controller has tripped; empty if it has not
+    sequence: int  # number of the reading
+    run: int  # run of the reading
+    tick: int  # tick of the reading
+    position_command: float  # position command of the next tick [m]; while preparing, of tick 0
+    command_rate: float  # rate of the position command [m/s]
+    position: float  # position of the numerical model at this tick [m]
+    velocity: float  # velocity of the numerical model at this tick [m/s]
+    force_command: float  # force F_c on the numerical model [N]
+    faults: int  # bits of the controller's faults
+    words: str  # reason of the controller's trip; empty without one
 
 
 def encode_reading(reading: Reading, session: int) -> bytes:
-    """The packet of a reading."""
+    """Return the packet of a reading."""
     return READING.pack(MARK_IN, VERSION, reading.event, session, *reading[1:])
 
 
 def decode_reading(packet: bytes | bytearray, session: int | None) -> Reading:
-    """The reading in a packet of the session, or of any; sensor values may be anything, NaN included.
+    """Decode the reading in a packet of the session (None: any); sensor values may be NaN.
 
-    Raises PacketError.
+    Raise PacketError for any other packet.
     """
     if len(packet) != READING.size:
         raise PacketError(f"{len(packet)} bytes, allowed {READING.size}")
-    mark, version, event, own, *fields = READING.unpack(packet)
+    mark, version, event, packet_session, *fields = READING.unpack(packet)
     reading = Reading(event, *fields)
     if mark != MARK_IN or version != VERSION or event not in EVENTS:
         raise PacketError("not a packet from the rig of this version")
-    if session is not None and own != session:
+    if session is not None and packet_session != session:
         raise PacketError("a packet of another session")
     if not math.isfinite(reading.time):
         raise PacketError("a time that is not finite")
@@ -102,19 +104,19 @@ def decode_reading(packet: bytes | bytearray, session: int | None) -> Reading:
 
 
 def encode_answer(answer: Answer, session: int) -> bytes:
-    """The packet of an answer; words are cut to 96 ASCII characters."""
+    """Return the packet of an answer; its words are cut to 96 ASCII characters."""
     words = answer.words.encode("ascii", "replace")
     return ANSWER.pack(MARK_OUT, VERSION, answer.flags, session, *answer[1:-1], words)
 
 
 def decode_answer(packet: bytes, session: int | None) -> Answer:
-    """The answer in a packet of the session, or of any. Raises PacketError."""
+    """Decode the answer in a packet of the session (None: any); raise PacketError for any other packet."""
     if len(packet) != ANSWER.size:
         raise PacketError(f"{len(packet)} bytes, allowed {ANSWER.size}")
-    mark, version, flags, own, *fields, words = ANSWER.unpack(packet)
+    mark, version, flags, packet_session, *fields, words = ANSWER.unpack(packet)
     if mark != MARK_OUT or version != VERSION or flags & ~FLAGS:
         raise PacketError("not an answer of this version")
-    if session is not None and own != session:
+    if session is not None and packet_session != session:
         raise PacketError("an answer of another session")
     text = words.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
@@ -123,49 +125,49 @@ def decode_answer(packet: bytes, session: int | None) -> Answer:
 
 
 def ask_for_session(number: int) -> bytes:
-    """The rig's question for a session, with a number of 64 bits drawn at random."""
+    """Return the rig's request for a session, with a random number of 64 bits."""
     return OPENING.pack(MARK_ASK, VERSION, number, 0)
 
 
 def decode_session(packet: bytes, number: int) -> int:
-    """The session's number, from the answer to the question with this number. Raises PacketError."""
+    """Decode the session's number in the answer to request `number`; raise PacketError if it is none."""
     if len(packet) == OPENING.size:
-        mark, version, asked, session = OPENING.unpack(packet)
-        if (mark, version, asked) == (MARK_OPEN, VERSION, number):
+        mark, version, requested, session = OPENING.unpack(packet)
+        if (mark, version, requested) == (MARK_OPEN, VERSION, number):
             return session
     raise PacketError("not the answer to that question for a session")
 
 
 class Sessions:
-    """Session numbers, for each address and port its own: what a secret hash makes of them.
+    """Session numbers, computed from address and port by a keyed hash.
 
-    Nothing is kept of those who ask, so that asking costs nothing, and the answer is no longer than the
-    question. Who cannot receive at an address cannot know its number.
+    Requests need no memory, and an answer is not longer than the request. Only a receiver at an address can
+    know its number.
     """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(32)
 
     def number(self, sender: tuple[str, int]) -> int:
-        """The session's number of an address and port."""
+        """Return the session's number of an address and port."""
         code = hmac.digest(self._secret, repr(sender).encode(), "sha256")
         return int.from_bytes(code[:8], "little")
 
     def answer(self, packet: bytes | bytearray, sender: tuple[str, int]) -> bytes | None:
-        """The answer to who asks for a session; None for any other packet."""
+        """Return the answer to a request for a session; None for any other packet."""
         if len(packet) != OPENING.size:
             return None
-        mark, version, asked, _ = OPENING.unpack(packet)
+        mark, version, requested, _ = OPENING.unpack(packet)
         if mark != MARK_ASK or version != VERSION:
             return None
-        return OPENING.pack(MARK_OPEN, VERSION, asked, self.number(sender))
+        return OPENING.pack(MARK_OPEN, VERSION, requested, self.number(sender))
 
 
 class Sequence:
-    """Which packets are newer than all before, by their numbers of 32 bits (RFC 1982).
+    """Filter for packets that are newer than all before, by numbers of 32 bits (RFC 1982).
 
-    One packet with a wild number must not make all that follow it old: a number further ahead than `WINDOW`
-    counts only once another one has come that follows it (as RFC 3550, A.1).
+    One packet with a wrong number must not make all later packets old. So a number more than `WINDOW` ahead
+    counts only after a second packet that follows it (as in RFC 3550, A.1).
     """
 
     __slots__ = ("_awaited", "_newest")
@@ -175,7 +177,7 @@ class Sequence:
         self._awaited: int | None = None
 
     def is_newer(self, number: int) -> bool:
-        """Whether a packet is; the newest then."""
+        """Return whether a packet is newer; if so, it becomes the newest one."""
         ahead = number - self._newest & NUMBERS
         if not 0 < ahead <= NUMBERS // 2:
             return False
@@ -188,10 +190,10 @@ class Sequence:
 
 
 class NumericalModel:
-    """M x'' = -F_c of the relative motion of two free bodies, once per control period.
+    """Numerical model M x'' = -F_c of the relative motion of two free bodies, one step per control period.
 
-    Mass [kg], period [s] and integrator are the mechanism's, which the gain file holds, and so is the first
-    start: in uniform motion at x(0) = min(plane, 0) - v (0.02 s + phase T).
+    Mass [kg], period [s] and integrator are those of the gain file's mechanism, and so is the first `start`,
+    in uniform motion at x(0) = min(plane, 0) - v (0.02 s + phase T).
     """
 
     __slots__ = ("_integrator", "_mass", "_period", "acceleration", "position", "start", "velocity")
@@ -211,11 +213,11 @@ class NumericalModel:
         self.place(*self.start)
 
     def place(self, position: float, velocity: float) -> None:
-        """Uniform motion: position [m], velocity [m/s]."""
+        """Set a uniform motion with this position [m] and velocity [m/s]."""
         self.position, self.velocity, self.acceleration = position, velocity, 0.0
 
     def integrate(self, force: float) -> None:
-        """One period under the force F_c [N]."""
+        """Integrate one period under the force F_c [N]."""
         period, velocity = self._period, self.velocity
         acceleration = -force / self._mass
         self.velocity = velocity + period * acceleration
@@ -229,11 +231,11 @@ class NumericalModel:
 
 
 class ControllerTask:
-    """What is done with one packet, without a network: readings in, answers out.
+    """Controller and numerical model, which answer readings without a network.
 
-    `bridged`: how many missing ticks in a row are made up. Counts `made_up` and `stale`, packets of no
-    use, and in `doubts` the contacts of which the law said that it did not know them, by what it said.
-    `period` is the control period [s].
+    `bridged` is the largest number of missing ticks in a row that are interpolated, `period` the control
+    period [s]. `made_up` counts interpolated ticks, `stale` unusable packets, and `doubts`, by the law's
+    status, contacts with the fault `law_in_doubt`.
     """
 
     __slots__ = (
@@ -246,7 +248,7 @@ class ControllerTask:
         self._model, self._bridged = NumericalModel(mechanism), min(bridged, MOST_MADE_UP)
         self.period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
-        # Before tick 0 there is no force, though a noisy sensor reads some.
+        # Before tick 0 there is no force, although a noisy sensor reads one.
         self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
         self._sequence, self._run, self._tared = Sequence(), -1, False
         self._command = self._force = 0.0
@@ -257,14 +259,13 @@ class ControllerTask:
 
     @property
     def status(self) -> str:
-        """What the controller says of itself."""
+        """Return the status of the controller."""
         return str(self._controller.status)
 
     def answer(self, reading: Reading) -> Answer | None:
-        """The answer to a reading, or None for one that is of no use: not newer than the last, or of a run
-        that was not prepared."""
-        unknown = reading.event == TICK and reading.run != self._run
-        if unknown or not self._sequence.is_newer(reading.sequence):
+        """Return the answer to a reading; None if it is not newer than the last or its run is unprepared."""
+        unprepared = reading.event == TICK and reading.run != self._run
+        if unprepared or not self._sequence.is_newer(reading.sequence):
             self.stale += 1
             return None
         if reading.event == RESET and reading.run != self._run and self._controller.reset():
@@ -282,7 +283,7 @@ class ControllerTask:
         return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, faults)
 
     def _begin(self, reading: Reading) -> int:
-        """A fresh run; the faults of the last one's end."""
+        """Begin a new run; return the faults at the end of the last one."""
         model, faults = self._model, 0
         if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
             model.place(reading.start_position, reading.start_velocity)
@@ -296,7 +297,7 @@ class ControllerTask:
         return faults
 
     def _reported_faults(self) -> int:
-        """The controller's faults now, a contact of which the law says that it did not know it counted."""
+        """Return the controller's current faults; count a contact with the fault `law_in_doubt`."""
         controller = self._controller
         if controller.faults & LAW_IN_DOUBT:
             status = controller.last_contact.status
@@ -317,12 +318,12 @@ class ControllerTask:
         position, velocity, before = model.position, model.velocity, self._command
         faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
         self._last = reading
-        # After a trip the command goes its own way.
+        # After a trip the position command does not follow the numerical model.
         rate = (self._command - before) / self.period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
     def _make_up(self, missed: int, reading: Reading) -> int:
-        """The ticks since the last reading, from readings on the line to this one; their faults."""
+        """Compute the missing ticks from interpolated readings; return their faults."""
         self.made_up += missed
         faults = 0
         last = self._last
@@ -332,12 +333,12 @@ class ControllerTask:
             force = before.force + share * (reading.force - before.force)
             position = before.position + share * (reading.position - before.position)
             tick = reading.tick - missed + number
-            time_then = reading.time - (missed - number) * self.period
-            faults |= self._tick(tick, force, position, time_then)
+            time = reading.time - (missed - number) * self.period
+            faults |= self._tick(tick, force, position, time)
         return faults
 
     def _tick(self, tick: int, force: float, position: float, time: float) -> int:
-        """Controller and numerical model, one period further; the tick's faults."""
+        """Advance controller and numerical model by one period; return the tick's faults."""
         model, controller = self._model, self._controller
         force = controller.step(force, model.position, model.velocity, position, time)
         if self._zeroed and tick == 0:

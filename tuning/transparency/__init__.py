@@ -1,1 +1,4 @@
-"""Whether a run still tests the hardware: pushes and damped twins, and the figures read off them."""
+"""Transparency of a compensator: whether its runs still test the hardware.
+
+It is measured with pushes on the hardware and damping perturbations.
+"""

@@ -1,9 +1,9 @@
-"""Damping perturbations: the same mechanism with more dissipation than it has, by up to a third of the speed.
+"""Damping perturbations: the same mechanism with additional dissipation.
 
-How a compensator answers to dissipation that it was not tuned for is the slope of e against e*; an elastic
-mechanism alone, whose e* is always 1, does not show it. The perturbation of scenario i has the dissipation of
-an oscillator whose damping ratio zeta_i goes evenly through [0, `LARGEST_RATIO`], e* = exp(-pi zeta), in the
-terms of its own contact law (`ContactLaw.perturb_damping`).
+The slope of e against e* measures the response of a compensator to dissipation that it was not tuned for. An
+elastic mechanism alone, with e* = 1 always, does not show it. The perturbation of scenario i dissipates like
+an oscillator with e* = exp(-pi zeta_i), whose damping ratios zeta_i cover [0, `LARGEST_RATIO`] evenly, in
+terms of the mechanism's contact law (`ContactLaw.perturb_damping`).
 """
 
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ LARGEST_RATIO = 0.15  # damping ratio: e* = 0.62
 def perturb_damping(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray]
 ) -> tuple[Mechanism, dict[str, np.ndarray]]:
-    """Return the mechanism and its draws with damping ratios added that are spread over the draws in order.
+    """Return the mechanism and its draws with an additional damping ratio for each draw.
 
-    Raise `InputError` if the contact law does not state how it dissipates.
+    Raise `InputError` if the contact law does not define its dissipation.
     """
     number = len(next(iter(draws.values())))
-    # Neighbouring draws get ratios far apart, so that nothing that goes with their order goes with the ratio.
+    # Multiples of the golden ratio keep the damping ratio uncorrelated with the order of the draws.
     ratio = LARGEST_RATIO * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
     contact, law = mechanism.contact, contact_law(mechanism.contact.law)
     mass = _mass(mechanism, draws)[:, None]
@@ -43,7 +43,7 @@ def perturb_damping(
         return _entries(values, entries) * law.damped if key == "damping" else np.asarray(values)
 
     key, values = law.perturb_damping(drawn, ratio, mass, velocity)
-    # Entries as many as there are draws for.
+    # The list gets as many entries as the draws have.
     listed = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
     changed = {"law": law.damped_as or law.name, "damping": listed} if key == "damping" else {}
     perturbed = msgspec.structs.replace(mechanism, contact=msgspec.structs.replace(contact, **changed))

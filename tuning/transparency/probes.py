@@ -1,19 +1,18 @@
-"""Transparency probes: each scenario once more with an early push, with a late push, and damped.
+"""Transparency probes: copies of each scenario with an early push, with a late push, and with more damping.
 
-A law that anticipates the contact can be tuned into a simulation that ignores the hardware: where all
-contacts are alike, that is the most accurate. So each scenario comes with three probes whose restitution the
-law cannot know beforehand:
+A law that anticipates the contact can be tuned to ignore the hardware, which is most accurate if all contacts
+are alike. So each scenario has three probes whose restitution the law cannot predict:
 
-    early, late   a push on the hardware, which no model knows of (`tuning.transparency.pushes`)
-    damped        the same contact with more dissipation (`tuning.transparency.damping_perturbations`)
+    early, late   with a push on the hardware that is in no model (`tuning.transparency.pushes`)
+    damped        with more dissipation (`tuning.transparency.damping_perturbations`)
 
-Each has its own true restitution e*: that of the pushed, or damped, contact in space. A law that swallows the
-push, or gives back energy that is not there, errs by e - e* as in any other contact: transparency and slope
-are then restitution errors, differentiable, in one unit with all others. The push counts from the hardware's
-first touch, and is the same in space; it acts on the first contact, after which a probe ends.
+Each has its own true restitution e*, that of the pushed or damped ideal contact. A law that ignores the push,
+or returns energy that the contact dissipated, has an error e - e* as in any other contact. Transparency and
+slope are thus restitution errors, which are differentiable and have the same unit as all others. The push's
+time counts from the first touch, on the rig and in the ideal contact. It acts on the first contact, after
+which a probe ends.
 
-Scenario and probes lie side by side, lanes 4 i to 4 i + 3 for scenario i: whatever takes the first few lanes
-has some of each.
+Scenario i and its probes are lanes 4 i to 4 i + 3, so that any first lanes include some of each.
 """
 
 from collections.abc import Mapping
@@ -34,47 +33,47 @@ from tuning.transparency.figures import Runs, transparency_figures
 from tuning.transparency.pushes import EARLY, LATE, in_space, probed
 
 LANES_PER_SCENARIO = 4  # lanes of a scenario: plain, early, late, damped
-# Weights of the objective of a law that anticipates, unless others are given.
+# Default weights of the objective of a law that anticipates.
 ANTICIPATING = {"transparency_weight": 1.0, "command_weight": 0.3}
 
 
 class ProbedScenarios(NamedTuple):
-    """A batch of scenarios with their transparency probes."""
+    """Batch of scenarios with their transparency probes."""
 
     scenarios: Scenario  # (..., scenarios * `LANES_PER_SCENARIO`)
-    plain: Any  # restitution in space without a push (scenarios,)
-    early: Any  # under an early push, integrated alike
-    late: Any  # under a late one
+    plain: Any  # restitution e* of the ideal contact without a push (scenarios,)
+    early: Any  # e* with an early push, by the same integration (scenarios,)
+    late: Any  # e* with a late push, by the same integration (scenarios,)
 
 
 def default_weights(compensator: str) -> dict[str, float]:
-    """Weights of `tuning.gains.objective.Objective` that a compensator has unless others are given, by name.
+    """Return the default weights of `tuning.gains.objective.Objective` for a compensator, by name.
 
-    Where the law anticipates, the errors of the probes count as much as those of the scenarios, and force is
-    dear: what such a law is late by it can pay back by a kick, which the error alone rewards. Where a law can
-    but pass on what it measures, neither counts.
+    For a law that anticipates, errors of probes count as much as those of scenarios, and excess force is
+    penalised, since such a law can correct a late response by a short, large force, which the error alone
+    rewards. For a law that only passes on the measured force, neither counts.
     """
     return dict(ANTICIPATING) if compensator_of(compensator).anticipates else {}
 
 
 def are_probes(lanes: int) -> np.ndarray:
-    """Which of so many lanes, with those of the probes, are of probes."""
+    """Return which of the lanes of probed scenarios are probes, (lanes,) of bool."""
     return np.arange(lanes) % LANES_PER_SCENARIO > 0
 
 
 def probed_scenarios(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> ProbedScenarios:
-    """The scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its probes."""
+    """Build the scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its probes."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
     perturbed, damped = perturb_damping(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
     slots = plain.phase.shape[0]
     velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
     space = in_space(contact_law(mechanism.contact.law).simulated, plain, velocity, 1)
-    own = build_scenarios(perturbed, damped, seed)
+    twins = build_scenarios(perturbed, damped, seed)
     pushes = [_pushed(plain, space, share, e) for share, e in ((EARLY, space.early), (LATE, space.late))]
-    batches = [_pushed(plain, space), *pushes, _pushed(own, space)]
+    batches = [_pushed(plain, space), *pushes, _pushed(twins, space)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)
     side_by_side = jax.tree.map(
         lambda leaf: leaf.reshape(*leaf.shape[:-2], LANES_PER_SCENARIO * number), stacked
@@ -83,23 +82,27 @@ def probed_scenarios(
 
 
 def _pushed(scenarios: Scenario, space: Any, share: float | None = None, restitution: Any = None) -> Scenario:
-    """The scenarios with a push at a share of the first contact's duration in space, where one is given, and
-    what the contact's `restitution` then is."""
-    known = np.full((3, *space.peak_force.shape), np.nan)
+    """Return the scenarios with a push at a `share` of the first ideal contact's duration, if one is given.
+
+    `restitution` is that of the ideal contact with the push.
+    """
+    values = np.full((3, *space.peak_force.shape), np.nan)
     if share is not None:
-        known[:, 0] = restitution, space.peak_force[0], space.duration[0]
+        values[:, 0] = restitution, space.peak_force[0], space.duration[0]
         scenarios = scenarios._replace(contacts=np.minimum(scenarios.contacts, 1))
-    # Nobody asks how far the model is off the motion in space: its two ends will do.
-    own = probed(scenarios, space._replace(depth=space.depth[:, [0, -1]]), share)
-    reference: Any = Reference(*known)
-    return own._replace(reference=reference)
+    # The trajectory error of probes is not used, so that the two ends of the ideal motion suffice.
+    pushed = probed(scenarios, space._replace(depth=space.depth[:, [0, -1]]), share)
+    reference: Any = Reference(*values)
+    return pushed._replace(reference=reference)
 
 
 def probe_figures(probed: ProbedScenarios, outcome: Outcome, seed: int = 0) -> dict[str, Estimate]:
-    """early, late, slope and peak of `tuning.transparency.figures` from the outcome (slots, scenarios,
-    `LANES_PER_SCENARIO`) of `probed` scenarios; the slope over the damped ones."""
+    """Return early, late, slope and peak of `tuning.transparency.figures` for `probed` scenarios.
+
+    `outcome` has leaves (slots, scenarios, `LANES_PER_SCENARIO`).
+    """
     plain, early, late, damped = (
         jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], outcome) for i in range(LANES_PER_SCENARIO)
     )
-    judged = Runs(plain, early, late, damped)
-    return transparency_figures(judged, (probed.early, probed.late), probed.plain, seed)
+    runs = Runs(plain, early, late, damped)
+    return transparency_figures(runs, (probed.early, probed.late), probed.plain, seed)

@@ -1,11 +1,11 @@
-"""What a comparison probes the laws with: pushes on the hardware, and the same contacts in space.
+"""Pushes on the hardware for the measurement of transparency, and the ideal contacts with the same pushes.
 
-    Transparency: a half-sine push that no model knows of, `WIDTH` long, `SIZE` of the reference's peak force,
-    centred at a quarter and at three quarters of the contact's duration in space, acts on the hardware and,
-    as long after the first touch, in space. What it changes in e, over what it changes in space, is 1 for a
-    test of the hardware, and 0 for a law that plays back what it expects.
+A push is a half-sine of duration `WIDTH` that is in no model, with `SIZE` of the ideal contact's peak force.
+It is centred at a quarter or at three quarters of the ideal contact's duration after the first touch, on the
+hardware and in the ideal contact. Transparency is the change of e on the hardware over that of the ideal
+contact: 1 for a test of the hardware, 0 for a law that replays what it expects.
 
-The push is on the first contact alone: what follows a contact differs by its rebound already.
+The push acts on the first contact only, since later contacts already differ by their approach speed.
 """
 
 from functools import partial
@@ -23,23 +23,23 @@ from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import Scenario
 from tuning.batches import join
 
-SIZE, WIDTH = 0.2, 0.02  # of the peak force; s
-EARLY, LATE = 0.25, 0.75  # of the contact's duration
-# What `early` and `late` are, as written files say it; those of another definition do not say so.
+SIZE, WIDTH = 0.2, 0.02  # share of the peak force [1]; duration [s]
+EARLY, LATE = 0.25, 0.75  # centre as share of the contact's duration [1]
+# Definition of `early` and `late` in written files, by which other definitions are recognised.
 PUSHES = f"a push on the hardware at {100 * EARLY:g} and {100 * LATE:g} % of the contact's duration in space"
-SAMPLES = 129  # of a reference's motion
-LANES = 256  # integrated in one call
+SAMPLES = 129  # samples of an ideal contact's motion
+LANES = 256  # lanes integrated in one call
 
 
 class Space(NamedTuple):
-    """Contacts in space."""
+    """Ideal contacts."""
 
     restitution: Float[np.ndarray, "slots scenarios"]  # e* [1]
     peak_force: Float[np.ndarray, "slots scenarios"]  # [N]
     duration: Float[np.ndarray, "slots scenarios"]  # [s]
     depth: Float[np.ndarray, "slots samples scenarios"]  # penetration [m] at `SAMPLES` times
-    early: Float[np.ndarray, "scenarios"]  # restitution of the first contact under an early push [1]
-    late: Float[np.ndarray, "scenarios"]  # under a late one [1]
+    early: Float[np.ndarray, "scenarios"]  # restitution of the first contact with an early push [1]
+    late: Float[np.ndarray, "scenarios"]  # restitution of the first contact with a late push [1]
 
 
 def in_space(
@@ -48,36 +48,38 @@ def in_space(
     velocity: Float[np.ndarray, "slots scenarios"],
     contacts: int,
 ) -> Space:
-    """The first so many contacts of every scenario in space, each entered at its `velocity` [m/s].
+    """Compute the first `contacts` ideal contacts of every scenario, with approach speeds `velocity` [m/s].
 
-    Slots beyond them hold the last one's numbers.
+    Further slots repeat the last contact.
     """
     slots, number = velocity.shape
     contact = jax.tree.map(lambda leaf: np.asarray(leaf)[:contacts], scenarios.contact)
     contact = jax.device_get(parameters_by_slot(contact))
     mass = np.broadcast_to(scenarios.equivalent_mass, (contacts, number))
 
-    def each(parameters, mass, velocity, size, centre) -> Any:
-        """Lane by lane, `LANES` at a time."""
+    def integrate(parameters, mass, velocity, size, centre) -> Any:
+        """Integrate the contacts of all lanes, `LANES` at a time."""
         leaves = parameters, mass, velocity, size, centre
         lanes = mass.size
         flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes), leaves)
         parts = []
         for begin in range(0, lanes, LANES):
-            some = np.minimum(np.arange(begin, begin + LANES), lanes - 1)
-            part = _move(law, *jax.tree.map(lambda leaf, some=some: leaf[..., some], flat))
+            chunk = np.minimum(np.arange(begin, begin + LANES), lanes - 1)
+            part = _move(law, *jax.tree.map(lambda leaf, chunk=chunk: leaf[..., chunk], flat))
             parts.append(
                 jax.tree.map(lambda leaf, lanes=lanes - begin: leaf[..., :lanes], jax.device_get(part))
             )
         return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], lanes // number, number), join(parts))
 
-    entered = np.asarray(velocity[:contacts])
-    none = np.zeros_like(entered)
-    plain = each(contact, mass, entered, none, none)
-    first = jax.tree.map(lambda leaf: leaf[..., :1, :], contact), mass[:1], entered[:1]
+    speed = np.asarray(velocity[:contacts])
+    zero = np.zeros_like(speed)
+    plain = integrate(contact, mass, speed, zero, zero)
+    first = jax.tree.map(lambda leaf: leaf[..., :1, :], contact), mass[:1], speed[:1]
     size = SIZE * plain.peak_force[:1]
-    # Both by the same integration: what is left of its error cancels in the difference.
-    early, late = (each(*first, size, share * plain.duration[:1]).restitution[0] for share in (EARLY, LATE))
+    # With the same integration as for `plain`, its error cancels in the difference.
+    early, late = (
+        integrate(*first, size, share * plain.duration[:1]).restitution[0] for share in (EARLY, LATE)
+    )
 
     def by_slot(leaf):
         return leaf[np.minimum(np.arange(slots), contacts - 1)]
@@ -93,8 +95,10 @@ def in_space(
 
 
 def probed(scenarios: Scenario, space: Any, share: float | None = None) -> Scenario:
-    """The scenarios with the reference beside each contact; with a push at a `share` of the first contact's
-    duration in space, if one is given."""
+    """Return the scenarios with the ideal motion of each contact and, with a `share`, a push.
+
+    The push is centred at that share of the first ideal contact's duration.
+    """
     size: Any = np.zeros_like(space.peak_force)
     centre: Any = np.zeros_like(space.peak_force)
     width: Any = np.full_like(size, WIDTH)
@@ -105,7 +109,7 @@ def probed(scenarios: Scenario, space: Any, share: float | None = None) -> Scena
 
 
 class _ReferencePath(NamedTuple):
-    """A batch of contacts in space; the position at `SAMPLES` times."""
+    """Batch of ideal contacts, with the position at `SAMPLES` times."""
 
     restitution: Array
     peak_force: Array

@@ -1,1 +1,1 @@
-"""The controller of the rig held against the simulation: runs recorded tick by tick, and replayed."""
+"""Verification of the rig's controller against the simulation, by replay and in closed loop."""

@@ -1,7 +1,7 @@
-"""The loop closed over the runtime's controller: the contacts of one scenario as the rig will run them.
+"""Closed loop of the rig runtime's controller with the simulation: contacts of one scenario.
 
-Sensors, motion simulator and contact are those of the simulation, in jax; in the place of its controller
-stands that of `jaxhil.rig`, in plain Python, called tick by tick.
+Sensors, motion simulator and contact are those of the simulation, in JAX. Its controller is replaced by that
+of `jaxhil.rig`, in plain Python, which is called at every tick.
 """
 
 import dataclasses
@@ -29,22 +29,19 @@ from tuning.verification.stops import Stop, Witness
 
 
 def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> tuple[Metrics, Stop | None]:
-    """Run the batch's first lane under the runtime's controller made of `gain_file`.
+    """Run the batch's first lane with the runtime's controller built from `gain_file`.
 
-    Returns its metrics (slots, 1), and what the controller's guards or its watchdog acted on first.
-
-    Sensors, motion simulator, contact and bookkeeping are the loop's own, in jax; the controller and the
-    position command from the numerical model are the runtime's, in plain Python, tick by tick as on the rig.
+    Return its metrics (slots, 1), and the first stop by the controller's guards or its watchdog, if any.
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
     gains = as_arrays(loaded.gains)
-    # A batch begins as it does with the jax controller in the loop, which is then compiled already.
+    # The run begins with the JAX controller in the loop, whose program is compiled already.
     rig, run = _first_lane(begin(loop, gains, batch))
     program = _compiled(dataclasses.replace(loop, compensator=OnTheRig(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
     controller = Witness(gain_file)
     started = False
-    # A controller that has tripped commands nothing any more: no contact of it would end.
+    # A tripped controller commands no force, so that no contact would end.
     while np.any(run.active) and not controller.controller.tripped:
         for _ in range(stretch_length(loop)):
             signals, plant_signals = program.sense(rig, run)
@@ -52,7 +49,7 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
             if age == 0 and started:
                 controller.next_contact()
             if age == 0:
-                # As a rig does that has been brought there: drives in motion are read behind the model.
+                # The first position command tells the controller that the model is moving already.
                 controller.start(position, velocity)
             command = controller.step(force, position, velocity, measured)
             if age == 0 and zeroed:
@@ -63,16 +60,16 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
             run = program.advance(rig, gains, run, signals, plant_signals, force_command, np.array([sent]))
             started = True
         run = program.turn_over(rig, gains, run)
-    # The last contact is audited too, as on a rig that goes on.
+    # Announcing a further contact makes the watchdog audit the last one.
     controller.next_contact()
     return jax.device_get(run.metrics), controller.stop()
 
 
 class OnTheRig(Compensator):
-    """Stands in the loop for a controller that runs outside it.
+    """Placeholder in the loop for a controller that runs outside it.
 
-    A run's history before its first tick is commanded by the law itself, whose initial state is all that is
-    carried; from then on the commands come from outside, as `Sent`.
+    The law itself commands the history before a run's first tick, and its initial state does not change.
+    Afterwards the commands come from outside, as `Sent`.
     """
 
     law: Compensator
@@ -91,15 +88,15 @@ class OnTheRig(Compensator):
 
     def position_command(self, gains, state, position, velocity, acceleration):
         if isinstance(state, Sent):
-            return state.position, state.kept
+            return state.position, state.state
         return self.law.position_command(gains, state, position, velocity, acceleration)
 
 
 class Sent(NamedTuple):
-    """A position command [m] from outside, and the state to go on with."""
+    """Position command [m] from outside, and the unchanged state of the law."""
 
     position: Array
-    kept: Any
+    state: Any
 
 
 @jax.jit
@@ -108,7 +105,7 @@ def _first_lane(started: tuple[RigConstants, RunState]) -> tuple[RigConstants, R
 
 
 class _Program(NamedTuple):
-    """The steps of one loop, compiled when first called."""
+    """Steps of one loop, which are compiled at the first call."""
 
     sense: Callable[..., tuple[Signals, PlantSignals]]
     integrate: Callable[..., Model]
@@ -140,7 +137,7 @@ def _advance(
     command: Array,
     sent: Array,
 ) -> RunState:
-    """Stages 3 to 6 of a tick under the command and the position sent to the drives."""
+    """Compute stages 3 to 6 of a tick with the force command and the position sent to the drives."""
     state, now = run.state, run.tick
     model = integrate(loop, rig, state, command)
     actuated = actuate(loop, rig, gains, state, now, model, Sent(sent, state.controller))

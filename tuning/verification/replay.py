@@ -1,14 +1,14 @@
-"""Verification: does the runtime that goes to the rig do what was simulated and tuned?
+"""Verification that the rig's runtime behaves like the simulation with which gains were tuned.
 
-Two comparisons under the gains of a gain file. *Replay*: the loop is recorded with jax, for the nominal
-mechanism and some draws of its uncertainty, and what its controller read goes tick by tick through the
-runtime's; their force and position commands are compared. *Closed loop*: the nominal contacts are run once
-more with the runtime in the place of the jax controller, and each contact's restitution is compared.
+There are two comparisons with the gains of a gain file. *Replay*: the loop is recorded in JAX for the nominal
+mechanism and some draws of its uncertainty. The runtime's controller gets the recorded readings at every
+tick, and the force and position commands of both are compared. *Closed loop*: the nominal contacts are run
+with the runtime instead of the JAX controller, and each contact's restitution is compared.
 
-Each side rounds in its own order, so they agree to a fraction of the command's range, but for one thing: a
-decision (in contact or not, force above the contact threshold or not) so close to its threshold that rounding
-decides. Such ticks are counted and compared separately; where the decisions fell differently, the comparison
-of that lane ends.
+The order of operations differs, so that both agree within rounding, a small fraction of the command's range.
+The exception is a decision (in contact or not, force above the contact threshold or not) so close to its
+threshold that rounding decides. Such ticks are counted and compared separately; if the decisions differ, the
+comparison of that lane ends.
 """
 
 import math
@@ -32,56 +32,55 @@ from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
 from tuning.verification.closed_loop import run_closed_loop
 from tuning.verification.stops import Stop
 
-REPLAY_LIMIT = 1e-11  # of the command's range
-CLOSED_LOOP_LIMIT = 1e-9  # of restitution
+REPLAY_LIMIT = 1e-11  # largest difference of commands over their range [1]
+CLOSED_LOOP_LIMIT = 1e-9  # largest difference of restitution [1]
 NEAR = 1e-9  # relative distance from a threshold within which rounding may decide
-PARTED = 1e-6  # relative difference of identified parameters that tells of another decision
-LEAST_COMPARED = 0.5  # of all ticks; with less there is no verdict to speak of
-LANES = 6
+PARTED = 1e-6  # relative difference of identified parameters that shows a different decision
+LEAST_COMPARED = 0.5  # least share of compared ticks for a positive verdict
+LANES = 6  # default number of replayed runs
 
 
 class LaneReplay(msgspec.Struct, frozen=True):
-    """One recorded lane through the runtime."""
+    """Comparison of one recorded lane with its replay in the runtime."""
 
-    ticks: int  # recorded
-    compared: int  # of these
-    near: int  # of those, near a threshold
-    command_range: float  # of the force command, 0 included [N]
-    difference: float  # the largest away from thresholds, as a fraction of that range
-    near_difference: float  # the largest near them, likewise
-    worst_tick: int  # the tick of `difference`
-    found: float  # what the runtime commanded there [N]
-    expected: float  # what the simulation did [N]
-    # the tick at which a decision at a threshold fell differently; the comparison ends there
+    ticks: int  # number of recorded ticks
+    compared: int  # number of compared ticks
+    near: int  # number of recorded ticks near a threshold
+    command_range: float  # range of the force command, 0 included [N]
+    difference: float  # largest difference away from thresholds over that range [1]
+    near_difference: float  # largest difference near thresholds over that range [1]
+    worst_tick: int  # tick of `difference`
+    found: float  # runtime's command at the worst tick [N]
+    expected: float  # simulated command at the worst tick [N]
+    # tick at which a decision at a threshold differs, where the comparison ends; None if there is none
     parted: int | None
-    status: str  # the runtime's
-    position_difference: float = 0.0  # the largest of the position commands, as a fraction of their range
+    status: str  # status of the runtime's controller
+    position_difference: float = 0.0  # largest difference of position commands over their range [1]
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """One nominal contact."""
+    """Comparison of one nominal contact in closed loop with the simulation."""
 
-    restitution: float | None  # with the runtime in the loop
-    simulated_restitution: float | None  # simulated as a whole
+    restitution: float | None  # with the runtime in the loop [1]
+    simulated_restitution: float | None  # with the JAX controller [1]
     status: str
     simulated_status: str
-    # with the runtime in the loop: largest real force over the ideal contact's peak force, and the duration
-    # over that contact's [1]
+    # with the runtime in the loop, peak real force and duration over those of the ideal contact [1]
     peak_force_ratio: float | None = None
     duration_ratio: float | None = None
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
-    """The verdict, and the numbers that it rests on."""
+    """Verdict of a verification and the comparisons that it follows from."""
 
-    verdict: bool  # whether all agree
-    reasons: tuple[str, ...]  # why they do not, if they do not
-    compensator: str  # the law
-    replay_limit: float  # allowed difference of commands, as a fraction of their range
-    closed_loop_limit: float  # allowed difference of a restitution
-    replay: tuple[LaneReplay, ...]  # lane by lane
-    closed_loop: tuple[ContactComparison, ...]  # contact by contact
-    stop: Stop | None = None  # what the gain file's limits acted on in closed loop, if on anything
+    verdict: bool  # whether all comparisons agree
+    reasons: tuple[str, ...]  # reasons of a negative verdict
+    compensator: str  # name of the compensator
+    replay_limit: float  # allowed difference of commands over their range [1]
+    closed_loop_limit: float  # allowed difference of restitution [1]
+    replay: tuple[LaneReplay, ...]  # one per lane
+    closed_loop: tuple[ContactComparison, ...]  # one per contact
+    stop: Stop | None = None  # first stop by the gain file's limits in closed loop, if any
 
 
 def verify(
@@ -92,8 +91,7 @@ def verify(
 ) -> VerificationReport:
     """Replay `scenarios` runs (the nominal one and draws) and run the nominal contacts in closed loop.
 
-    `progress` is called with what begins, in words. Raises RuntimeError unless jax computes in float64,
-    `InputError` never: the gain file is checked when it is loaded.
+    `progress` is called with a description of each stage. Raise RuntimeError unless JAX computes in float64.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError("verification compares to 1e-11: switch jax_enable_x64 on first")
@@ -101,8 +99,8 @@ def verify(
     progress(f"recording {scenarios} runs")
     batch = nominal_and_draws(loaded.mechanism, scenarios, seed)
     metrics, lanes = record_lanes(loaded, batch)
-    # What a draw makes of period and clearance, the controller of that rig knows. It is the law that is
-    # compared: some draw may well be what the limits are there to stop.
+    # The controller knows the drawn period and clearance. Limits are removed, since only the law is compared,
+    # and the limits may rightly stop some draw.
     gain_files = [
         gain_file._replace(control_period=float(period), clearance=float(clearance), limits=NO_LIMITS)
         for period, clearance in zip(batch.control_period, batch.clearance, strict=True)
@@ -118,9 +116,9 @@ def verify(
     comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
     stopped = [] if stop is None else [f"closed loop: {stop.text}"]
     unlike = [
-        f"closed loop, contact {number}: real peak force {one.peak_force_ratio:.3g} times, duration "
-        f"{one.duration_ratio:.3g} times the ideal contact's, allowed {BRIEFLY}"
-        for number, one in enumerate(comparisons, start=1)
+        f"closed loop, contact {number}: real peak force {contact.peak_force_ratio:.3g} times, duration "
+        f"{contact.duration_ratio:.3g} times the ideal contact's, allowed {BRIEFLY}"
+        for number, contact in enumerate(comparisons, start=1)
         if outcome.unlike[number - 1, 0]
     ]
     reasons = (*_replay_reasons(replays), *stopped, *_closed_loop_reasons(comparisons, stop), *unlike)
@@ -137,7 +135,7 @@ def verify(
 
 
 def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
-    """The lane's signals tick by tick through the runtime, and how its commands compare."""
+    """Replay a lane's signals in the runtime and compare its commands with the recorded ones."""
     controller = Controller(gain_file)
     commands, positions, stiffness, damping = replayed(controller, lane)
     near = near_threshold(lane.signals, gain_file)
@@ -163,8 +161,11 @@ def replay(lane: Lane, gain_file: GainFile) -> LaneReplay:
 
 
 def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The runtime's commands [N] and [m] and identified stiffness and damping, (ticks,), for the lane's
-    signals; NaN for a position command after which no motion of the numerical model is recorded."""
+    """Return the runtime's commands and estimates for the lane's signals, four arrays (ticks,).
+
+    They are force command [N], position command [m], stiffness [N/m] and damping [N s/m]. A position command
+    is NaN if the next motion of the numerical model is not recorded.
+    """
     controller.reset()
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
     results = []
@@ -172,23 +173,25 @@ def replayed(controller: Controller, lane: Lane) -> tuple[np.ndarray, np.ndarray
         if age == 0 and tick > 0:
             controller.next_contact()
         if age == 0:
-            # As a rig does that has been brought there: drives in motion are read behind the model.
+            # The first position command tells the controller that the model is moving already.
             controller.position_command(position, velocity, 0.0)
         command = controller.step(force, position, velocity, measured)
         identified, sent = controller.identified, math.nan
         if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
             # Every integrator has v(n+1) = v(n) + T a.
-            moved_to, moved_at = readings[tick + 1][1:3]
-            acceleration = (moved_at - velocity) / controller.control_period
-            sent = controller.position_command(moved_to, moved_at, acceleration)
+            next_position, next_velocity = readings[tick + 1][1:3]
+            acceleration = (next_velocity - velocity) / controller.control_period
+            sent = controller.position_command(next_position, next_velocity, acceleration)
         results.append((0.0 if age == 0 and lane.zeroed else command, sent, *identified))
     commands, positions, stiffness, damping = np.array(results, float).reshape(-1, 4).T
     return commands, positions, stiffness, damping
 
 
 def position_difference(positions: np.ndarray, lane: Lane) -> float:
-    """Largest difference of the position commands, those that are not NaN, from the lane's: a fraction of the
-    range of these."""
+    """Return the largest difference of the position commands from the lane's, over the range of these.
+
+    Commands that are NaN are ignored.
+    """
     if lane.sent is None:
         return 0.0
     expected = np.asarray(lane.sent)[: len(positions)]
@@ -197,16 +200,16 @@ def position_difference(positions: np.ndarray, lane: Lane) -> float:
 
 
 def command_range(commands: np.ndarray) -> float:
-    """From the least to the greatest command [N] that is finite, 0 included."""
+    """Return the range of the finite commands [N], 0 included."""
     finite = commands[np.isfinite(commands)]
     return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
 
 
 def relative_difference(commands: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, float]:
-    """Differences as fractions of the expected range, 0 where nothing (NaN) is expected; that range [N]."""
+    """Return the differences over the expected range, 0 where NaN is expected, and that range [N]."""
     span = command_range(expected)
     error = np.where(np.isnan(expected), 0.0, np.abs(commands - expected))
-    # Of a command that is always 0 no fraction can be taken: there, only equality will do.
+    # If the expected command is always 0, only equal commands pass.
     return error / span if span > 0 else np.where(error == 0, 0.0, np.inf), span
 
 
@@ -216,25 +219,25 @@ def parting(
     expected: Sequence[np.ndarray | jax.Array] | None,
     near: np.ndarray,
 ) -> int | None:
-    """The first tick at which rounding decided at a threshold, and the two sides parted.
+    """Return the tick near a threshold from which both sides differ, by commands or estimates; None if none.
 
-    By `error` of the command, or by what either side identified, where it identifies anything.
+    `error` is that of the commands; `identified` and `expected` are the estimates of both sides, if any.
     """
-    apart = error > REPLAY_LIMIT
-    for mine, other in zip(identified, expected or (), strict=expected is not None):
-        other = np.asarray(other)[: len(error)]
-        apart |= np.abs(mine - other) > PARTED * np.max(np.abs(other), initial=0.0)
-    partings = np.nonzero(near & apart)[0]
-    # Differences grow before they show: a parting counts from the first time the two sides are apart.
-    return int(partings[0]) if len(partings) and not np.any(apart[: partings[0]]) else None
+    differs = error > REPLAY_LIMIT
+    for estimate, recorded in zip(identified, expected or (), strict=expected is not None):
+        recorded = np.asarray(recorded)[: len(error)]
+        differs |= np.abs(estimate - recorded) > PARTED * np.max(np.abs(recorded), initial=0.0)
+    partings = np.nonzero(near & differs)[0]
+    # A difference that existed before the tick near a threshold was not caused by a decision there.
+    return int(partings[0]) if len(partings) and not np.any(differs[: partings[0]]) else None
 
 
 def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
-    """The ticks, (ticks,) of bool, at which a decision of the law is within `NEAR` of its threshold.
+    """Return the ticks, (ticks,) of bool, at which a decision of the law is within `NEAR` of its threshold.
 
-    Two decisions, of laws that identify: on which side of a surface the delay-aligned position is, relative
-    to the size of the measured positions; and, in contact, whether |F| exceeds the contact threshold,
-    relative to either. A force and a threshold that are both 0 are equal on both sides, however it rounds.
+    Laws that identify have two decisions. One is the side of a surface on which the delay-aligned position
+    lies, with a margin relative to the measured positions. The other, in contact, is whether |F| exceeds the
+    contact threshold, with a margin relative to the larger of both. If both are 0, rounding cannot decide.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)
@@ -249,7 +252,7 @@ def near_threshold(signals: Signals, gain_file: GainFile) -> np.ndarray:
 
 
 def _aligned(signals: Signals, delay: float, period: float) -> np.ndarray:
-    """The measured position [m] a `delay` [s] ago, straight between ticks, in uniform motion before a run."""
+    """Return the measured position [m] delayed by `delay` [s], linear between ticks, uniform before a run."""
     measured, velocity, age = signals.position_measured, signals.velocity_desired, signals.age
     tick = np.arange(len(measured))
     begun = tick - age
@@ -308,7 +311,7 @@ def _closed_loop_reasons(comparisons: list[ContactComparison], stop: Stop | None
     for number, contact in enumerate(comparisons, start=1):
         where = f"closed loop, contact {number}"
         if tripped and contact.status == "not reached":
-            # What stopped the run is said already.
+            # The stop is a reason of its own.
             continue
         if contact.restitution is None or contact.simulated_restitution is None:
             yield f"{where}: found {contact.status}, simulated {contact.simulated_status}, allowed ok"

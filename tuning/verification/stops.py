@@ -1,7 +1,7 @@
-"""Stops of runs under the limits of a gain file: fault, value, limit, contact and time, in numbers and words.
+"""Stops of runs by the limits of a gain file: fault, value, limit, contact and time, in numbers and words.
 
-`Witness` is the rig's controller together with all that it was given; asked for its stop, it goes through
-that once more. `find_stop` feeds it a recorded run, `passing_limits` says with which limits that run passes.
+`Witness` is the rig's controller with a record of its inputs, from which it determines its stop. `find_stop`
+runs it on a recorded run, and `passing_limits` returns limits under which that run passes.
 """
 
 import math
@@ -16,11 +16,11 @@ from jaxhil.rig.law_status import STATUSES
 from jaxhil.rig.limits import LIMITS, NO_LIMITS
 from jaxhil.rig.watchdog import Watchdog
 
-if TYPE_CHECKING:  # it stands on JAX, which takes a second that an early refusal need not wait for
+if TYPE_CHECKING:  # It imports JAX, which takes a second; an early error need not wait for that.
     from jaxhil.simulation.recording import Lane
 
 WATCHDOG = faults.RESTITUTION | faults.ENERGY_BALANCE | faults.CONTACT_TOO_LONG
-# The limit of each fault that has one, or two of them: the lower and the upper.
+# Name of the limit of each fault that has one; two names are the lower and the upper limit.
 LIMITS_OF: Mapping[int, tuple[str, ...]] = {
     faults.FORCE_OUT_OF_RANGE: ("force_range",),
     faults.POSITION_OUT_OF_RANGE: ("measured_lowest", "measured_highest"),
@@ -35,65 +35,65 @@ LIMITS_OF: Mapping[int, tuple[str, ...]] = {
     faults.ENERGY_BALANCE: ("energy_balance",),
     faults.CONTACT_TOO_LONG: ("longest_contact",),
 }
-WIDER = 1.25  # times what a run needs: the limit that is proposed for it
-MOST_LIMITS = 24  # changes of limits, tried one after the other until a run passes
+WIDER = 1.25  # proposed limit over the value that the run needs
+MOST_LIMITS = 24  # largest number of changes of limits that are tried until a run passes
 STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 
 
 class Stop(msgspec.Struct, frozen=True, kw_only=True):
-    """What stopped a run, or interfered with it first."""
+    """First stop of a run, or first other action of the controller on a fault."""
 
-    fault: str  # its name, as in `jaxhil.rig.faults`
+    fault: str  # name of the fault, as in `jaxhil.rig.faults`
     by: str  # "watchdog" or "guard"
-    tripped: bool  # whether the controller tripped; else it only flagged a reading or cut a command
-    contact: int  # under way, just audited, or ahead; from 1
-    tick: int  # of the run, from 0
-    time: float  # since the run began [s]
-    found: float | None  # what was compared with the limit [its unit]; None if it is no number
-    limit: str | None  # the limit's name; None if the fault has none
-    allowed: float | None  # the limit's value
-    unit: str | None  # the limit's unit
-    text: str  # all of that in words
+    tripped: bool  # whether the controller tripped; otherwise it only flagged a reading or limited a command
+    contact: int  # number of the current, just audited or next contact, from 1
+    tick: int  # tick of the run, from 0
+    time: float  # time since the run began [s]
+    found: float | None  # value compared with the limit [its unit]; None if it is no number
+    limit: str | None  # name of the limit; None if the fault has none
+    allowed: float | None  # value of the limit
+    unit: str | None  # unit of the limit
+    text: str  # description with all of the above
 
 
 class Tick(NamedTuple):
-    """What the controller was given and gave in a tick."""
+    """Inputs of the controller at a tick, and its command of the tick before."""
 
-    begins: bool  # whether the next contact was announced before it
-    given: float  # force [N] that it gave on the tick before
-    status: int  # what its law said of that
-    force: float  # measured [N]
-    position: float  # of the numerical model [m]
-    velocity: float  # of the numerical model [m/s]
-    measured: float  # position [m]
+    begins: bool  # whether the next contact was announced before the tick
+    given: float  # force command [N] of the tick before
+    status: int  # status of the law at that command
+    force: float  # measured force [N]
+    position: float  # position of the numerical model [m]
+    velocity: float  # velocity of the numerical model [m/s]
+    measured: float  # measured position [m]
 
 
 class Witness:
-    """The rig's controller, and what it was given up to the first fault on which it acted."""
+    """Controller of the rig with a record of its inputs up to the first fault on which it acted."""
 
     def __init__(self, gain_file: GainFile):
         self.controller = Controller(gain_file)
         self._gain_file = gain_file
         self._ticks: list[Tick] = []
-        self._motions: dict[int, tuple[float, float, float]] = {}  # of the numerical model, by tick
+        self._motions: dict[int, tuple[float, float, float]] = {}  # motion of the numerical model by tick
         self._force, self._sent = 0.0, math.nan
         self._begins = self._announced = False
         self._acting = 0
 
     @property
     def stopped(self) -> bool:
-        """Whether the controller has acted on a fault."""
+        """Return whether the controller has acted on a fault."""
         return self._acting != 0
 
     def next_contact(self) -> None:
-        """Announce the next contact; the one under way is audited."""
+        """Announce the next contact, at which the watchdog audits the current one."""
         self.controller.next_contact()
         if not self.stopped:
             self._begins = self._announced = True
         self._look()
 
     def start(self, position: float, velocity: float) -> None:
-        """Tell the controller where a run begins, before its first tick."""
+        """Set the controller's position and velocity at the start of a run, before its first tick."""
         self.controller.position_command(position, velocity, 0.0)
 
     def step(self, force: float, position: float, velocity: float, measured: float) -> float:
@@ -115,12 +115,12 @@ class Witness:
         return sent
 
     def stop(self) -> Stop | None:
-        """Return what the controller acted on first; None if on nothing."""
+        """Return the first stop or other action of the controller on a fault; None if there was none."""
         if not self.stopped:
             return None
-        fault = next(one for one in faults.FAULTS if self._acting & one.bit)
+        fault = next(candidate for candidate in faults.FAULTS if self._acting & candidate.bit)
         watchdog = self._audited()
-        found, limit, words = self._found(fault.bit, watchdog)
+        found, limit, words = self._measured(fault.bit, watchdog)
         allowed = None if limit is None else float(self._gain_file.limits[limit])
         audited = fault.bit & (faults.RESTITUTION | faults.ENERGY_BALANCE)
         contact = watchdog.contacts + (0 if audited else 1)
@@ -141,15 +141,15 @@ class Witness:
         )  # fmt: skip
 
     def _look(self) -> None:
-        """Keep the first faults on which the controller acts; a law in doubt changes no command."""
+        """Store the first faults on which the controller acts; `LAW_IN_DOUBT` changes no command."""
         if not self._acting:
             self._acting = self.controller.cause or self.controller.faults & ~faults.LAW_IN_DOUBT
 
     def _audited(self) -> Watchdog:
-        """Return a watchdog that was given the same, as it is after the last tick."""
-        own = self._gain_file
+        """Return a watchdog in its state after the recorded inputs."""
+        file = self._gain_file
         stated = STATUS_NUMBERS[self.controller.law_status] != STATUS_NUMBERS["unstated"]
-        watchdog = Watchdog(own.limits, own.control_period, own.clearance, stated)
+        watchdog = Watchdog(file.limits, file.control_period, file.clearance, stated)
         for tick in self._ticks:
             if tick.begins:
                 watchdog.conclude(tick.given, tick.status)
@@ -159,15 +159,15 @@ class Witness:
             watchdog.conclude(self._force, STATUS_NUMBERS[self.controller.law_status])
         return watchdog
 
-    def _found(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
-        """Return what was compared with the fault's limit, that limit's name, and words for the former."""
+    def _measured(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
+        """Return the value compared with the fault's limit, that limit's name, and the value as text."""
         names = LIMITS_OF.get(fault)
         if not names:
             return None, None, ""
         if fault == faults.RESTITUTION:
-            found = abs(watchdog.restitution - watchdog.expected)
+            value = abs(watchdog.restitution - watchdog.expected)
             words = f"restitution {watchdog.restitution:.4g} and expected {watchdog.expected:.4g} differ by "
-            return found, names[0], f"{words}{found:.2g}"
+            return value, names[0], f"{words}{value:.2g}"
         if fault == faults.ENERGY_BALANCE:
             return None, names[0], f"{abs(watchdog.balance):.3g} J are out of balance"
         if fault == faults.CONTACT_TOO_LONG:
@@ -178,15 +178,15 @@ class Witness:
             )
         if fault == faults.VELOCITY_LIMIT and math.isfinite(first := self._first_distance()):
             return first, "start_distance", f"{first:.4g} m from where the drives read"
-        found = self._compared(fault)
+        value = self._compared(fault)
         *lower, limit = names
-        if lower and found < self._gain_file.limits[lower[0]]:
+        if lower and value < self._gain_file.limits[lower[0]]:
             limit = lower[0]
         unit = LIMITS[limit].unit
-        return found, limit, f"{found:.4g} {unit}"
+        return value, limit, f"{value:.4g} {unit}"
 
     def _compared(self, fault: int) -> float:
-        """Return what a guard compares with its limit."""
+        """Return the value that a guard compares with its limit."""
         tick, period = self._ticks[-1], self._gain_file.control_period
         if fault in (faults.FORCE_OUT_OF_RANGE, faults.FORCE_IN_FLIGHT):
             return abs(tick.force)
@@ -204,17 +204,19 @@ class Witness:
         return sent if fault == faults.STROKE else abs(sent - before) / period
 
     def _first_distance(self) -> float:
-        """Return how far the last command is from where the drives read, if it is a run's first; else NaN."""
+        """Return |last position command - measured position| [m] if it is a run's first command; else NaN."""
         _, before, sent = self._unlimited()
         return math.nan if math.isfinite(before) else abs(sent - self._ticks[-1].measured)
 
-    def _travel(self, held: str, moving: str, in_contact: bool) -> float:
-        """Return how far one signal has moved [m] since another one stays the same to the bit, which counts
-        everywhere or, by the measured position, `in_contact`."""
+    def _travel(self, constant: str, moving: str, in_contact: bool) -> float:
+        """Return the travel [m] of the signal `moving` since the signal `constant` last changed.
+
+        With `in_contact`, it counts from the last tick at which the measured position was out of contact.
+        """
         travel, clearance = 0.0, self._gain_file.clearance
-        for place in range(len(self._ticks) - 1, 0, -1):
-            now, before = self._ticks[place], self._ticks[place - 1]
-            if getattr(now, held) != getattr(before, held) or now.begins:
+        for tick in range(len(self._ticks) - 1, 0, -1):
+            now, before = self._ticks[tick], self._ticks[tick - 1]
+            if getattr(now, constant) != getattr(before, constant) or now.begins:
                 break
             if in_contact and -clearance <= now.measured <= 0.0:
                 break
@@ -222,7 +224,7 @@ class Witness:
         return travel
 
     def _unlimited(self) -> tuple[float, float, float]:
-        """Return the force that the law commands in the last tick, and its last two position commands."""
+        """Return the law's force command [N] at the last tick, and its last two position commands [m]."""
         free = Controller(self._gain_file._replace(limits=NO_LIMITS))
         force, before, sent = 0.0, math.nan, math.nan
         for number, tick in enumerate(self._ticks):
@@ -236,7 +238,7 @@ class Witness:
 
 
 def find_stop(gain_file: GainFile, lane: "Lane") -> Stop | None:
-    """Return what the controller acts on in a recorded run, its last contact audited too; None if nothing."""
+    """Return the first stop in a recorded run, whose last contact is audited too; None if there is none."""
     witness = Witness(gain_file)
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
     for tick, (*signals, age) in enumerate(readings):
@@ -255,7 +257,7 @@ def find_stop(gain_file: GainFile, lane: "Lane") -> Stop | None:
 
 
 def passing_limits(gain_file: GainFile, lane: "Lane") -> dict[str, float] | None:
-    """Return the limits to change, and their values, for a recorded run to pass; None if no limits do it."""
+    """Return names and values of limits with which a recorded run passes; None if it cannot pass."""
     limits, changed = dict(gain_file.limits), {}
     for _ in range(MOST_LIMITS):
         stop = find_stop(gain_file._replace(limits=limits), lane)
@@ -268,7 +270,7 @@ def passing_limits(gain_file: GainFile, lane: "Lane") -> dict[str, float] | None
 
 
 def advice(passing: Mapping[str, float] | None) -> str:
-    """Return in words what lets a run pass."""
+    """Return a text with the changes of limits with which a run passes."""
     if not passing:
         return "no other limits let it pass"
     changes = " ".join(f"--set {name}={value:g}" for name, value in passing.items())
@@ -276,7 +278,7 @@ def advice(passing: Mapping[str, float] | None) -> str:
 
 
 def _widened(name: str, found: float) -> float:
-    """Return a limit beyond what was found, in two digits."""
+    """Return a limit beyond the found value, rounded outward to two digits."""
     outward = -1.0 if name.endswith("_lowest") else 1.0
     value = found + outward * (WIDER - 1) * abs(found)
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1) if value else 1.0

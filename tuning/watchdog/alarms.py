@@ -1,7 +1,7 @@
-"""What the watchdog and the other guards would do about recorded runs: whom they stop, and whom they miss.
+"""False and missed alarms of the watchdog and the other guards in recorded runs.
 
-A run is good where no contact's error exceeds a limit. Under given limits a good run that is stopped is a
-false alarm, and a bad one that goes on past its bad contact is a missed alarm.
+A run is good if no contact's error exceeds a limit. A good run that is stopped is a false alarm, and a bad
+run that continues after its bad contact is a missed alarm.
 """
 
 from collections.abc import Mapping
@@ -17,25 +17,25 @@ from tuning.watchdog.expectation import Expectation, Features, expected_restitut
 from tuning.watchdog.extent import Extent, extent_of
 from tuning.watchdog.recorded import Chunk
 
-# Of the limit: up to the first a run is good, beyond the second it has to be stopped.
+# Multiples of the limit: a run with errors up to the first is good, beyond the second it must be stopped.
 GOOD_ERROR, BAD_ERROR = 0.5, 1.0
-NOTICED = 0.95  # share of the contacts that are noticed from the stated error on
-FEW = 20  # contacts of which such a share says something
+NOTICED = 0.95  # share of alarms that defines the error from which contacts are noticed
+FEW = 20  # least number of contacts for such a share
 
 
 class JudgedRuns(NamedTuple):
-    """Recorded runs, and what became of them."""
+    """Evaluation of recorded runs."""
 
-    index: Int[np.ndarray, "lanes"]  # of each run, in its sweep
-    error: Float[np.ndarray, "slots lanes"]  # restitution error; NaN where a contact did not end
-    reference: Float[np.ndarray, "slots lanes"]  # the reference's restitution
-    status: Int[np.ndarray, "slots lanes"]  # of each contact, as in `jaxhil.simulation.metrics`
-    audited: Audited  # what the watchdog audits
-    extent: Extent  # how far the signals went
+    index: Int[np.ndarray, "lanes"]  # index of each run in its sweep
+    error: Float[np.ndarray, "slots lanes"]  # restitution error; NaN if the contact did not end
+    reference: Float[np.ndarray, "slots lanes"]  # restitution e* of the ideal contact
+    status: Int[np.ndarray, "slots lanes"]  # status of each contact, as in `jaxhil.simulation.metrics`
+    audited: Audited  # the watchdog's audit of each contact
+    extent: Extent  # extreme values of the signals
 
 
 def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> JudgedRuns:
-    """What became of some recorded runs."""
+    """Evaluate recorded runs; `free_distance` [m] is that of `extent_of`."""
     contacts, slots = chunk.contacts, len(chunk.contacts.status)
     return JudgedRuns(
         chunk.first + np.arange(contacts.status.shape[1]),
@@ -48,19 +48,19 @@ def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> JudgedRuns:
 
 
 def good_runs(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
-    """All contacts ended, none with an error beyond the limit."""
+    """Return the runs whose contacts all ended, with errors within the limit."""
     return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
 
 
 def reached(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
-    """Contacts that the rig would come to: none before them had to be stopped."""
+    """Return the contacts that the rig would reach, since no earlier contact of the run had to be stopped."""
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
     first = first_reached(bad)
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
 
 
 def features_of(audited: Audited) -> Features:
-    """What the expectation is a function of; 0 where there is nothing to identify it from."""
+    """Return the features of the expectation, 0 if a contact gave no estimate."""
     return Features(
         np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
     )
@@ -74,32 +74,32 @@ def watchdog_rates(
     mass: float,
     chosen: Bool[np.ndarray, "lanes"],
 ) -> dict[str, Any]:
-    """False and missed alarms among the chosen runs, with exact intervals of 95 %, and from which error on
-    contacts are noticed.
+    """Return rates of false and missed alarms in the chosen runs, with exact 95 % intervals, as plain data.
 
-    A run is good if no error exceeds half the limit, and a false alarm if the watchdog or another guard stops
-    it. It has to be stopped if some contact does not end or has an error beyond the limit, and is missed if
-    the watchdog has not tripped by the end of that contact. The intervals hold for independent scenarios,
-    whose number may follow from how many of them fail; those of Sobol sequences are spread more evenly.
+    A run is good if no error exceeds half the limit; it is a false alarm if the watchdog or another guard
+    stops it. A run must be stopped if a contact does not end or has an error beyond the limit; it is missed
+    if the watchdog has not tripped by the end of that contact. The intervals are valid for independent
+    scenarios, even if the number of failures decides their number; Sobol points are spread more evenly. The
+    result also holds the error from which contacts are noticed (`noticed_from`).
     """
     alarmed = alarms(runs, expectation, limits, mass)
     first_alarm = first_reached(alarmed)
-    stopped_anyhow = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
+    stopped = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
     good = chosen & good_runs(runs, GOOD_ERROR * limit)
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR * limit)
     first_bad = first_reached(bad)
-    stopped = chosen & np.any(bad, axis=0)
+    bad_runs = chosen & np.any(bad, axis=0)
     use = reached(runs, limit) & (runs.status == OK) & chosen
     expected = expected_restitution(expectation, features_of(runs.audited), mass)
-    apart = np.abs((expected - runs.reference)[use])
+    difference = np.abs((expected - runs.reference)[use])
     return {
         "limit": limit,
         "restitution_margin": limits["restitution_margin"],
         "terms": [term for term, value in expectation.coefficients.items() if value],
-        "expectation_rms": float(np.sqrt(np.mean(apart**2))) if len(apart) else None,
-        "expectation_largest": float(np.max(apart)) if len(apart) else None,
-        "false_alarms": _rate(stopped_anyhow[good]),
-        "missed_alarms": _rate(first_alarm[stopped] > first_bad[stopped]),
+        "expectation_rms": float(np.sqrt(np.mean(difference**2))) if len(difference) else None,
+        "expectation_largest": float(np.max(difference)) if len(difference) else None,
+        "false_alarms": _rate(stopped[good]),
+        "missed_alarms": _rate(first_alarm[bad_runs] > first_bad[bad_runs]),
         "noticed_from": noticed_from(runs.error[use], alarmed[use]),
         "held_out_runs": int(np.sum(chosen)),
     }
@@ -108,7 +108,7 @@ def watchdog_rates(
 def alarms(
     runs: JudgedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
 ) -> Bool[np.ndarray, "slots lanes"]:
-    """Contacts about which the watchdog raises an alarm."""
+    """Return the contacts for which the watchdog raises an alarm."""
     audited = runs.audited
     expected = expected_restitution(expectation, features_of(audited), mass)
     margin, balance, longest = (
@@ -125,7 +125,7 @@ def alarms(
 
 
 def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
-    """Runs that a guard other than the watchdog would stop, or flag readings of."""
+    """Return the runs that a guard other than the watchdog would stop, or whose readings it would flag."""
 
     def limit(name: str, unlimited: float = np.inf) -> float:
         value = limits[name]
@@ -149,9 +149,11 @@ def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.n
 def noticed_from(
     error: Float[np.ndarray, "contacts"], alarmed: Bool[np.ndarray, "contacts"]
 ) -> dict[str, Any]:
-    """The least |error| such that of the contacts with one as large or larger 95 % are `alarmed` about; None
-    where there is none, or only with fewer than 20 such contacts. `contacts`: how many these are; `largest`:
-    the largest |error| of all."""
+    """Return the least |error| from which 95 % of the contacts raise an alarm.
+
+    The result holds this `error` (None if there is none, or fewer than 20 such contacts), the number of these
+    `contacts`, and the `largest` |error| of all contacts.
+    """
     size = np.abs(error)
     order = np.argsort(-size)
     number = np.arange(1, len(size) + 1)

@@ -1,9 +1,9 @@
-"""`calibrate` finds the limits of a gain file, from what good runs did.
+"""Calibration of the limits of a gain file from recorded runs.
 
-The scenarios of a sweep's store are run again, recorded, and judged: a run is good if no contact's error
-exceeds the sweep's limit. To some of the runs the watchdog's expected restitution is fitted, and limits are
-margins on what the good ones among them needed; what shares of the other runs are stopped for nothing, or
-missed, is stated with exact intervals, and with a verdict on them.
+The scenarios of a sweep's store are run again and recorded. A run is good if no contact's error exceeds the
+sweep's limit. The watchdog's expected restitution is fitted to some of the runs; the limits are margins on
+the extreme signals of the good ones among them. The rates of false and missed alarms come from the other
+runs, with exact intervals and a verdict.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,24 +30,24 @@ from tuning.watchdog.margin import restitution_margin
 from tuning.watchdog.recorded import LANES, Scenarios, recorded_chunks
 from tuning.watchdog.verdict import ALLOWED, Allowed, judged
 
-MARGIN = 1.5  # on what good runs did
-FITTED = 2048  # runs that are enough to fit to: all others judge, at least 3 of 4 and at most 15 of 16
-SMALLEST = 0.02  # of the largest force reading: what a limit on forces leaves a sensor at least
-WITHOUT_STORE = 2048  # draws: enough to bound false alarms if a third of the runs is good
-LIMIT = 0.01  # of the restitution error, where no sweep states one
-BRIDGED = 3  # ticks: bad readings, missed ticks, cut rates in a row
-TARE = 0.1  # s
-RETREAT = 0.005  # s of free approach: what counts as out of contact besides what the sensor may err
-BALANCE = 1e-6  # of the approach's energy: what rounding leaves is far below, one wrong force far above
-ENOUGH = 0.01  # of the limit: rms error of an expectation that need not be better
+MARGIN = 1.5  # factor on the extreme signals of good runs
+FITTED = 2048  # runs that suffice for the fit; 3/4 to 15/16 of all runs remain for the rates
+SMALLEST = 0.02  # least limit on forces, as a share of the largest force reading
+WITHOUT_STORE = 2048  # draws without a store; they bound false alarms if a third of the runs is good
+LIMIT = 0.01  # limit of the restitution error [1] if no sweep states one
+BRIDGED = 3  # bad readings, missed ticks or limited rates that are allowed in a row [ticks]
+TARE = 0.1  # duration of the tare [s]
+RETREAT = 0.005  # time of free approach [s] that, with the sensor's error, defines the free distance
+BALANCE = 1e-6  # least limit of the energy balance over the approach's energy [1], far above rounding errors
+ENOUGH = 0.01  # rms error of a sufficient expectation over the limit [1]
 
 
 class Calibration(NamedTuple):
-    """What a gain file says of its limits."""
+    """Limits of a gain file, and the watchdog's rates of alarm."""
 
     # by name [SI units], all of `jaxhil.rig.limits.LIMITS`; None for no limit
     limits: dict[str, float | None]
-    rates: dict[str, Any]  # what is known of the watchdog's alarms under them, plain data
+    rates: dict[str, Any]  # rates of the watchdog's alarms under these limits, as plain data
 
 
 def calibrate(
@@ -61,15 +61,24 @@ def calibrate(
     progress: Callable[[int], None] = lambda runs: None,
     faulty: int = 0,
 ) -> Calibration:
-    """Limits for the rig, and the watchdog's rates of false and missed alarms, judged by what is `allowed`.
+    """Calibrate the limits of a gain file, and evaluate the watchdog's rates of false and missed alarms.
 
-    Args: `loaded`, the gain file; `store`, a sweep's of that gain file, whose scenarios are run again, all of
-    them or the first so many `scenarios`; without a store so many draws of the file's own uncertainty (2048).
-    `limit` of the restitution error: the store's own by default, else 0.01. `replaced` limits are as given,
-    whatever the runs say, and the rates are under them. So many `lanes` are run at a time; `progress` is
-    given how many more runs are done. With `faulty` scenarios of every fault, faults are injected to count
-    missed alarms (`tuning.watchdog.fault_runs`). Raises `InputError` for a store of another gain file, or a
-    number that it does not hold.
+    Args:
+        loaded: the gain file.
+        store: sweep of that gain file whose scenarios are run again; None: draws of its uncertainty.
+        scenarios: number of scenarios; by default all of the store, or 2048 draws.
+        limit: limit of the restitution error [1]; by default the store's, else 0.01.
+        lanes: number of scenarios that run at a time.
+        replaced: limits that replace the calibrated ones, also for the rates.
+        allowed: largest acceptable rates.
+        progress: called with the number of further runs that are complete.
+        faulty: number of scenarios of every injected fault (`tuning.watchdog.fault_runs`); 0: no faults.
+
+    Returns:
+        The limits, and the rates with their verdict.
+
+    Raises:
+        InputError: if the store is of another gain file or holds fewer scenarios, or if no run ends.
     """
     chosen = _chosen(loaded, store, scenarios)
     if limit is None:
@@ -96,11 +105,11 @@ def calibrate(
         "restitution_margin": margin.value,
     }
     replaced = replaced or {}
-    found = {name: limits.get(name) for name in LIMITS} | dict(replaced)
-    rates = watchdog_rates(runs, expectation, found, limit, rules.mass, ~(fitted | margin.runs))
+    final = {name: limits.get(name) for name in LIMITS} | dict(replaced)
+    rates = watchdog_rates(runs, expectation, final, limit, rules.mass, ~(fitted | margin.runs))
     if faulty:
-        known = rules, free_distance, expectation, found
-        rates["fault_runs"] = fault_rates(loaded, *known, limit, faulty, chosen.seed, progress)
+        watchdog = rules, free_distance, expectation, final
+        rates["fault_runs"] = fault_rates(loaded, *watchdog, limit, faulty, chosen.seed, progress)
     rates = judged(rates, allowed, chosen.number)
     rates["widened_from"] = None if "restitution_margin" in replaced else margin.widened_from
     rates["calibrated_on"] = {
@@ -112,16 +121,16 @@ def calibrate(
         "number": int(np.sum(used)),
         "margin": MARGIN,
     }
-    return Calibration({name: _plain(value) for name, value in found.items()}, rates)
+    return Calibration({name: _plain(value) for name, value in final.items()}, rates)
 
 
 def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
-    """By what rules the watchdog audits, worked out from the mechanism alone, and `free_distance` [m]."""
+    """Return the rules of the watchdog's audit, and `free_distance` [m], from the mechanism alone."""
     mechanism = loaded.mechanism
     rig = mechanism.rig
     force, position, period = rig.force_sensor, rig.position_sensor, rig.control_period
     drawn = _largest(loaded)
-    # The loop's own wait for the force to die out, with a margin that a drawn delay cannot use up.
+    # This is the time that the loop waits for the force to die out, at the largest delays of all draws.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
     mass = mechanism.bodies.mass
     noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"]
@@ -142,17 +151,17 @@ def watchdog_rules(loaded: LoadedGains) -> tuple[Rules, float]:
 def fit_reached(
     runs: JudgedRuns, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
 ) -> Expectation:
-    """The expectation, fitted to the contacts reached in the chosen runs."""
+    """Fit the expected restitution to the contacts reached in the chosen runs."""
     use = reached(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
-    place = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
+    run = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
     features = Features(*(leaf[use] for leaf in features_of(runs.audited)))
-    return fit_expectation(features, runs.reference[use], place, mass, ENOUGH * limit)
+    return fit_expectation(features, runs.reference[use], run, mass, ENOUGH * limit)
 
 
 def guard_limits(
     loaded: LoadedGains, runs: JudgedRuns, used: Bool[np.ndarray, "lanes"], rules: Rules, free_distance: float
 ) -> dict[str, float | None]:
-    """The limits of readings and commands: margins on the extent of the runs `used`."""
+    """Return the limits of readings and commands, with margins on the extent of the runs `used`."""
     extent = Extent(*(leaf[used] for leaf in runs.extent))
     rig, period = loaded.mechanism.rig, rules.period
     most = {name: float(np.max(getattr(extent, name))) for name in Extent._fields}
@@ -198,14 +207,14 @@ def guard_limits(
 
 
 def _balance(runs: JudgedRuns, used) -> float:
-    """Rounding is far below `BALANCE`; a drawn mass that is not the file's is not."""
+    """Return the limit of the energy balance [1] from that of the runs `used`; at least `BALANCE`."""
     return max(BALANCE, MARGIN * float(np.nanmax(runs.audited.imbalance[:, used])))
 
 
 def _widened(low: float, high: float, clearance: float) -> tuple[float | None, float]:
-    """A stroke with half as much again on either side; the gap between two surfaces is part of it.
+    """Widen a range of positions [m], which includes the gap between two surfaces, by half on either side.
 
-    Of one surface the far side is free: from how far an approach comes, no run of the simulation says.
+    With one surface there is no lower limit, since the simulation does not show where an approach starts.
     """
     if np.isinf(clearance):
         return None, high + (MARGIN - 1) * (high - low)
@@ -215,7 +224,7 @@ def _widened(low: float, high: float, clearance: float) -> tuple[float | None, f
 
 
 def _largest(loaded: LoadedGains) -> dict[str, float]:
-    """The largest that can be drawn of what the rules go by."""
+    """Return the largest possible draws of the quantities that determine rules and limits."""
     scenarios = build_scenarios(loaded.mechanism, extremes(loaded.mechanism))
     force, position = scenarios.force_sensor, scenarios.position_sensor
     largest = {
@@ -235,16 +244,17 @@ def _largest(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _has_status(loaded: LoadedGains) -> bool:
-    """Return whether the law has a status on the rig, which opens a contact wherever the surface lies."""
+    """Return whether the law has a status on the rig, by which it opens a contact at any surface position."""
     law = COMPENSATORS.get(loaded.compensator)
     if law is None:
         return False
     mechanism = loaded.mechanism
-    made = law(loaded.gains, mechanism.rig.control_period, mechanism.contact.clearance)
-    return made.status != UNSTATED
+    compensator = law(loaded.gains, mechanism.rig.control_period, mechanism.contact.clearance)
+    return compensator.status != UNSTATED
 
 
 def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> Scenarios:
+    """Return the scenarios to run; raise `InputError` for another gain file's store or an invalid number."""
     if scenarios is not None and scenarios < 2:
         raise InputError(f"--scenarios: found {scenarios}, allowed 2 or more")
     if store is None:
@@ -253,27 +263,29 @@ def _chosen(loaded: LoadedGains, store: Store | None, scenarios: int | None) -> 
     if manifest.gains_sha256 != loaded.document["sha256"]:
         found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
         raise InputError(f"{store.folder}: gains_sha256: found {found}..., allowed {allowed}...")
-    held = held_scenarios(store)
-    if scenarios is not None and scenarios > held:
-        raise InputError(f"--scenarios: found {scenarios}, allowed at most the store's {held}")
-    return Scenarios(manifest.sampling, manifest.seed, scenarios or held)
+    stored = held_scenarios(store)
+    if scenarios is not None and scenarios > stored:
+        raise InputError(f"--scenarios: found {scenarios}, allowed at most the store's {stored}")
+    return Scenarios(manifest.sampling, manifest.seed, scenarios or stored)
 
 
 def held_scenarios(store: Store) -> int:
-    """How many scenarios a sweep is of, which may have stopped when enough was known. Raises `InputError` for
-    a part that is damaged."""
-    held = 0
+    """Return the number of scenarios of a sweep, which may have stopped early.
+
+    Raise `InputError` if a part is damaged.
+    """
+    stored = 0
     for part in range(store.manifest.parts):
         if kept_part(store, part) is None:
             break
-        held += store.manifest.part_rows(part)[1]
-    return store.manifest.scenarios if store.manifest.until_width is None else held
+        stored += store.manifest.part_rows(part)[1]
+    return store.manifest.scenarios if store.manifest.until_width is None else stored
 
 
 def _joined(parts: list[JudgedRuns]) -> JudgedRuns:
     def join(leaves):
         if isinstance(leaves[0], tuple):
-            return type(leaves[0])(*(join(each) for each in zip(*leaves, strict=True)))
+            return type(leaves[0])(*(join(column) for column in zip(*leaves, strict=True)))
         return np.concatenate(leaves, axis=-1)
 
     return join(parts)

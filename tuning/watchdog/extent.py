@@ -1,4 +1,4 @@
-"""How far the signals of recorded runs went: what the limits of readings and commands are margins on."""
+"""Extreme values of the signals of recorded runs, from which limits of readings and commands are set."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from tuning.watchdog.recorded import Signals
 
 
 class Extent(NamedTuple):
-    """How far the signals of every run went; all at least 0 but the positions."""
+    """Extreme values of the signals of every run; all but the positions are at least 0."""
 
     reading: Float[np.ndarray, "lanes"]  # largest |force reading| [N]
     measured_lowest: Float[np.ndarray, "lanes"]  # measured position [m]
@@ -17,23 +17,21 @@ class Extent(NamedTuple):
     sent_lowest: Float[np.ndarray, "lanes"]  # position command [m]
     sent_highest: Float[np.ndarray, "lanes"]  # position command [m]
     command: Float[np.ndarray, "lanes"]  # largest |F_c| [N]
-    slew: Float[np.ndarray, "lanes"]  # its fastest change [N/s]
-    start: Float[
-        np.ndarray, "lanes"
-    ]  # largest distance of a run's first command from the measured position [m]
+    slew: Float[np.ndarray, "lanes"]  # fastest change of F_c [N/s]
+    start: Float[np.ndarray, "lanes"]  # largest |first command - measured position| of a run [m]
     sent_speed: Float[np.ndarray, "lanes"]  # fastest change of the position command [m/s]
     speed: Float[np.ndarray, "lanes"]  # fastest change of the desired position [m/s]
     acceleration: Float[np.ndarray, "lanes"]  # fastest change of the desired velocity [m/s^2]
-    force_stuck: Float[np.ndarray, "lanes"]  # longest travel in contact under one force reading [m]
-    position_stuck: Float[np.ndarray, "lanes"]  # longest desired travel under one position reading [m]
+    force_stuck: Float[np.ndarray, "lanes"]  # longest travel in contact with a constant force reading [m]
+    position_stuck: Float[np.ndarray, "lanes"]  # longest desired travel with a constant position reading [m]
     flight_force: Float[np.ndarray, "lanes"]  # largest |force reading| in flight [N]
-    flight_spread: Float[np.ndarray, "lanes"]  # the most by which two of these differ [N]
+    flight_spread: Float[np.ndarray, "lanes"]  # range of the force readings in flight [N]
 
 
 def extent_of(
     signals: Signals, period: float, clearance: float, free_distance: float, settling: float
 ) -> Extent:
-    """The extent of every lane's runs; flight is what `jaxhil.rig.inputs` calls so."""
+    """Return the extent of every lane's runs; flight is defined as in `jaxhil.rig.inputs`."""
     live, begins = signals.live, signals.begins
     force, position, velocity, measured, command, sent = (np.where(live, leaf, 0.0) for leaf in signals[:6])
     goes_on = live[1:] & ~begins[1:]
@@ -44,7 +42,7 @@ def extent_of(
     def least(values):
         return np.min(np.where(live, values, np.inf), axis=0)
 
-    # The force goes on from one run to the next; positions begin anew.
+    # The force command is continuous from one run to the next; positions start again.
     step = np.abs(np.diff(command, axis=0, prepend=0.0))
     flying = _flying(measured, begins, clearance, free_distance, settling / period) & live
     lowest = np.min(np.where(flying, force, np.inf), axis=0, initial=np.inf)
@@ -71,7 +69,7 @@ def extent_of(
 
 
 def _flying(measured, begins, clearance, free_distance, settling):
-    """Out of contact by more than `free_distance` for more than `settling` ticks."""
+    """Return the ticks at which contact has been farther than `free_distance` for over `settling` ticks."""
     free = (measured < -free_distance) & (measured > free_distance - clearance)
     since = np.zeros(measured.shape[1])
     flying = np.empty(measured.shape, bool)
@@ -83,7 +81,7 @@ def _flying(measured, begins, clearance, free_distance, settling):
 
 
 def _stuck(signals: Signals, clearance: float):
-    """Longest travels under readings that stayed the same to the bit, as `InputGuard` sums them."""
+    """Return the longest travels with bit-identical readings of force and position, as `InputGuard` does."""
     zeros = np.zeros(signals.force.shape[1])
     force_travel, position_travel, most_force, most_position = zeros, zeros, zeros, zeros
     for tick in range(1, len(signals.force)):
@@ -92,7 +90,7 @@ def _stuck(signals: Signals, clearance: float):
         in_contact = (now > 0) | (now < -clearance)
         same = counted & in_contact & (signals.force[tick] == signals.force[tick - 1])
         deeper = np.where(now > 0, now - before, before - now)
-        # Without a force only a way deeper counts: a damped mechanism comes out without one.
+        # At zero force only net penetration counts, since a damped mechanism may separate without a force.
         pressed = np.where(signals.force[tick] == 0, np.maximum(force_travel + deeper, 0.0), np.inf)
         force_travel = np.where(same, np.minimum(pressed, force_travel + np.abs(deeper)), 0.0)
         moved = np.abs(signals.position[tick] - signals.position[tick - 1])

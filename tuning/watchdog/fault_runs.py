@@ -1,15 +1,14 @@
-"""Runs with an injected fault, scaled until the true error is just too large: how many the watchdog misses.
+"""Share of missed alarms in runs with an injected fault that makes the error just too large.
 
-With good gains an error beyond the limit is so rare that runs drawn at random cannot bound the share that is
-missed. So a fault is injected of which neither controller nor watchdog knows, and scaled in every scenario
-until the restitution error lies just beyond the limit: up to `BAND` times it. That is the hardest case: a
-larger error is farther from what the watchdog expects. The rate is conditional on such a fault, not the
-probability that one occurs. Scenarios are fresh and independent, others for every fault, so that the exact
-binomial interval holds.
+With good gains an error beyond the limit is so rare that random draws cannot bound the missed share. So a
+fault that neither controller nor watchdog knows is injected, and scaled in every scenario until the
+restitution error is between 1 and `BAND` times the limit. This is the hardest case, since a larger error is
+farther from the expected restitution. The rate is conditional on such a fault, not the probability that one
+occurs. Every fault has fresh and independent scenarios, so that the exact binomial interval is valid.
 
-In a scenario whose error is beyond the limit without the fault, or that no size of the fault up to
-`MOST_MULTIPLES` takes into the band, there is nothing to count. A fault that makes fewer than half of the
-scenarios bad is stated, but not counted: the gains are insensitive to it.
+A scenario does not count if its error exceeds the limit without the fault, or if no fault of up to
+`MOST_MULTIPLES` gives an error within the band. A fault that makes fewer than half of the scenarios bad is
+reported but does not count, since the gains are insensitive to it.
 """
 
 import math
@@ -35,24 +34,24 @@ from tuning.watchdog.audited import Rules, first_reached
 from tuning.watchdog.expectation import Expectation
 from tuning.watchdog.recorded import record_chunk
 
-BAND = 1.25  # of the limit: the largest error of a fault run
-COUNTED = 0.5  # share of the scenarios that a fault has to make bad for it to count
-FIRST = 2**31  # index of the first scenario: those before are a sweep's, or calibrate
-FEWEST, MOST = 64, 4096  # scenarios of a fault
-MOST_MULTIPLES = 32.0  # of the delay that alone, uncompensated, would make an error of the limit
+BAND = 1.25  # largest error of a fault run over the limit [1]
+COUNTED = 0.5  # least share of scenarios that a fault must make bad in order to count
+FIRST = 2**31  # index of the first scenario; lower ones are for sweeps and calibration
+FEWEST, MOST = 64, 4096  # least and largest number of scenarios of a fault
+MOST_MULTIPLES = 32.0  # largest fault over the delay that alone causes an error of the limit, uncompensated
 LADDER = tuple(MOST_MULTIPLES / 2.0**step for step in range(6, -1, -1))
-HALVINGS = 4  # of the interval between two steps of the ladder
-LONGEST = 0.5  # of the ideal contact's duration: the longest delay that is injected
+HALVINGS = 4  # bisections of the interval between two steps of the ladder
+LONGEST = 0.5  # longest injected delay over the ideal contact's duration [1]
 
 Sizes = Float[np.ndarray, "lanes"]
 
 
 class Fault(NamedTuple):
-    """A fault of one size, of which the controller does not know."""
+    """Fault that the controller does not know."""
 
     name: str
-    meaning: str  # in words
-    unit: str  # of its size
+    meaning: str  # description for messages
+    unit: str  # unit of its size
 
 
 FORCE_DELAY = Fault("force_delay", "the force measured later than told", "s")
@@ -63,12 +62,12 @@ FAULTS = (FORCE_DELAY, POSITION_DELAY, SIMULATOR_DELAY, GAINS)
 
 
 class _Case(NamedTuple):
-    """A fault on scenarios of its own."""
+    """Fault with its scenarios and sizes."""
 
     fault: Fault
     scenarios: Scenario
-    unit: float  # size of the fault that is one multiple
-    most: float  # largest size
+    unit: float  # size of one multiple, in the fault's unit
+    most: float  # largest size, in the fault's unit
 
 
 def fault_rates(
@@ -82,34 +81,36 @@ def fault_rates(
     seed: int,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> list[dict[str, Any]]:
-    """Return of every fault how many of its runs the watchdog misses, with an exact interval of 95 %.
+    """Return the share of missed alarms for every fault, with an exact 95 % interval, as plain data.
 
     Args:
         loaded: the gain file.
-        rules: by what the watchdog audits; `free_distance` [m] likewise.
-        free_distance: see `rules`.
-        expectation: of the watchdog.
-        limits: of the gain file, by name.
-        limit: of the restitution error [1], beyond which a run has to be stopped.
-        number: of scenarios for each fault.
-        seed: of the scenarios.
-        progress: is given how many of the `number` x faults runs are done.
+        rules: rules of the watchdog's audit.
+        free_distance: free distance [m] of the guards.
+        expectation: expected restitution of the watchdog.
+        limits: limits of the gain file by name.
+        limit: limit of the restitution error [1], beyond which a run must be stopped.
+        number: number of scenarios for each fault.
+        seed: seed of the scenarios.
+        progress: called with the number of further runs that are complete.
     """
     cases = _cases(loaded, limit, number, seed)
     loop = _widest(loaded, cases)
-    found = []
+    rates = []
     for case in cases:
         sizes, usable = _just_beyond(loop, loaded, case, limit)
-        found.append(
+        rates.append(
             _rate(loop, loaded, case, sizes, usable, rules, free_distance, expectation, limits, limit)
         )
         progress(number)
-    return found
+    return rates
 
 
 def scenarios_needed(allowed: float) -> int:
-    """Return how many scenarios of a fault decide on a share `allowed`, a few missed or useless ones among
-    them."""
+    """Return the number of scenarios of a fault that decides whether at most the share `allowed` is missed.
+
+    It is twice the number for no missed alarm, to allow for a few missed alarms and unusable scenarios.
+    """
     if not 0 < allowed < 1:
         return FEWEST if allowed >= 1 else MOST
     needed = number_to_decide(0, 0, allowed)
@@ -121,27 +122,26 @@ def _cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> list[_C
     cases, duration = [], _ideal_duration(loaded)
     # e = exp(pi omega tau/2) - 1 of a net delay tau, and pi/omega is the duration.
     delay = 2 * duration / math.pi**2 * math.log1p(limit)
-    for place, fault in enumerate(FAULTS):
+    for index, fault in enumerate(FAULTS):
         if fault == GAINS and not _neutral(loaded):
             continue
-        _, scenarios = drawn_scenarios(loaded.mechanism, "random", seed, FIRST + place * number, number)
+        _, scenarios = drawn_scenarios(loaded.mechanism, "random", seed, FIRST + index * number, number)
         unit, most = (1 / MOST_MULTIPLES, 1.0) if fault == GAINS else (delay, LONGEST * duration)
         cases.append(_Case(fault, scenarios, unit, most))
     return cases
 
 
 def _neutral(loaded: LoadedGains) -> dict[str, float]:
-    """Return the gains that can be neutral and are not, with their neutral values."""
-    own = COMPENSATORS[loaded.compensator].gains
+    """Return the neutral values of the gains that have one and differ from it."""
     return {
         gain.name: float(gain.neutral)
-        for gain in own
+        for gain in COMPENSATORS[loaded.compensator].gains
         if gain.neutral is not None and loaded.gains[gain.name] != gain.neutral
     }
 
 
 def _ideal_duration(loaded: LoadedGains) -> float:
-    """Return the duration [s] of the first nominal ideal contact; where bodies stick, half an oscillation."""
+    """Return the duration [s] of the first nominal ideal contact; half an oscillation if it never ends."""
     first = meaning(loaded.mechanism).contacts[0]
     return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
 
@@ -158,8 +158,8 @@ def _injected(loaded: LoadedGains, case: _Case, sizes: Sizes) -> tuple[Mapping[s
         POSITION_DELAY: "position_sensor",
         SIMULATOR_DELAY: "simulator",
     }[fault]
-    own: Any = getattr(scenarios, part)
-    return gains, scenarios._replace(**{part: own._replace(delay=np.asarray(own.delay) + sizes)})
+    device: Any = getattr(scenarios, part)
+    return gains, scenarios._replace(**{part: device._replace(delay=np.asarray(device.delay) + sizes)})
 
 
 def _widest(loaded: LoadedGains, cases: list[_Case]) -> Any:
@@ -168,17 +168,17 @@ def _widest(loaded: LoadedGains, cases: list[_Case]) -> Any:
         _injected(loaded, case, _sizes(case, np.full(lanes_of(case.scenarios), MOST_MULTIPLES)))[1]
         for case in cases
     ]
-    every: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *largest)
-    return build_loop(loaded.mechanism, loaded.compensator, every)
+    joined: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *largest)
+    return build_loop(loaded.mechanism, loaded.compensator, joined)
 
 
 def _sizes(case: _Case, multiples: Sizes) -> Sizes:
-    """Return the sizes of so many multiples, at most the largest."""
+    """Return the sizes of the multiples, limited to the largest size."""
     return np.minimum(multiples * case.unit, case.most)
 
 
 def _just_beyond(loop: Any, loaded: LoadedGains, case: _Case, limit: float) -> tuple[Sizes, np.ndarray]:
-    """Return of every scenario the size that takes its error just beyond the limit, and whether one does."""
+    """Return per scenario the size with an error just beyond the limit, and whether there is such a size."""
     number = lanes_of(case.scenarios)
 
     def errors(multiples: Any) -> Sizes:
@@ -187,7 +187,7 @@ def _just_beyond(loop: Any, loaded: LoadedGains, case: _Case, limit: float) -> t
         size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.wanted, np.inf, 0.0))
         return np.max(size, axis=0)
 
-    # What is within the limit so far, and what is beyond it.
+    # Multiples whose error is within the limit and beyond it bracket the searched size.
     below, above = np.zeros(number), np.full(number, np.nan)
     beyond = np.full(number, np.inf)
     usable = errors(np.zeros(number)) <= limit
@@ -219,7 +219,7 @@ def _rate(
     limits: Mapping[str, float | None],
     limit: float,
 ) -> dict[str, Any]:
-    """Return what is said of a fault."""
+    """Return the rate of missed alarms of a fault and its statistics, as plain data."""
     gains, scenarios = _injected(loaded, case, sizes)
     chunk = record_chunk(loop, loaded._replace(gains=gains), scenarios)  # pyright: ignore[reportArgumentType]
     runs = judge_chunk(chunk, rules, free_distance)

@@ -1,9 +1,9 @@
-"""The restitution's margin: how far from the expected restitution the watchdog lets a contact be.
+"""Restitution margin: the largest difference from the expected restitution without an alarm.
 
-Where the expectation is good the margin leaves room for what it errs: then no bad run is missed. Where
-damping and delay are both unknown it errs by more than the limit leaves room for (an unknown delay looks like
+If the expectation is accurate, the margin plus its error is below the limit, so that no bad run is missed. If
+damping and delay are both unknown, the expectation's error is too large for that (an unknown delay looks like
 damping, `tuning.watchdog.expectation`), and good runs would be stopped. The margin is then widened until they
-pass, and `tuning.watchdog.alarms.noticed_from` says at what price.
+pass, and `tuning.watchdog.alarms.noticed_from` states which errors are still noticed.
 """
 
 from typing import NamedTuple
@@ -16,17 +16,17 @@ from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.alarms import GOOD_ERROR, JudgedRuns, features_of, good_runs, reached
 from tuning.watchdog.expectation import Expectation, expected_restitution
 
-BEYOND = 1.25  # times the largest that was met among some runs: what others may have
-# Of the limit: the least margin of the restitution, and the one that a good expectation has.
+BEYOND = 1.25  # factor on the largest value among some runs, as a bound for other runs
+# Least margin, and margin of a good expectation, over the limit [1].
 LEAST, PLACE = 0.25, 0.75
 
 
 class Margin(NamedTuple):
-    """The margin, and what it was found from."""
+    """Restitution margin and the runs that determine it."""
 
-    value: float
-    widened_from: float | None  # what it would be if only missed alarms counted; None where it is that
-    runs: Bool[np.ndarray, "lanes"]  # those that it follows from
+    value: float  # margin [1]
+    widened_from: float | None  # margin against missed alarms only [1]; None if it was not widened
+    runs: Bool[np.ndarray, "lanes"]  # runs that determine the margin
 
 
 def restitution_margin(
@@ -37,35 +37,37 @@ def restitution_margin(
     fitted: Bool[np.ndarray, "lanes"],
     false_alarms: float,
 ) -> Margin:
-    """At `PLACE` of the limit, nearer to 0 if the expectation errs by more than the rest; but not so near
-    that more than the share `false_alarms` of good runs would be stopped.
+    """Return the restitution margin.
 
-    An error e - e* beyond the limit is seen if the expectation errs by less than limit - margin. To say how
-    far few good runs go takes more runs than to fit the expectation: where that counts, every other one is
-    taken besides the `fitted` ones.
+    It is `PLACE` times the limit, less if the expectation's error exceeds the rest, but so large that at most
+    the share `false_alarms` of good runs is stopped. An error e - e* beyond the limit is detected if the
+    expectation's error is below limit - margin. A small share of good runs needs more runs than the fit of
+    the expectation; in that case every second run is used besides the `fitted` ones.
     """
     expected = expected_restitution(expectation, features_of(runs.audited), mass)
     difference = runs.audited.restitution - expected
     use = reached(runs, limit) & (runs.status == OK) & fitted
-    # Together with what the audit's own restitution differs from the loop's.
-    apart = np.abs((difference - runs.error)[use])
-    narrow = float(np.clip(limit - BEYOND * np.max(apart, initial=0.0), LEAST * limit, PLACE * limit))
+    # This includes the difference between the audit's and the loop's restitution.
+    deviation = np.abs((difference - runs.error)[use])
+    narrow = float(np.clip(limit - BEYOND * np.max(deviation, initial=0.0), LEAST * limit, PLACE * limit))
     good = good_runs(runs, GOOD_ERROR * limit)
     audited = runs.audited.begun & (runs.audited.approach > 0)
     furthest = np.max(np.where(audited, np.abs(difference), 0.0), axis=0)
     if _passing(furthest[good & fitted], false_alarms) <= narrow:
         return Margin(narrow, None, fitted)
-    placed = fitted | (runs.index % 2 == 1)
-    wide = furthest[good & placed]
-    # Of n runs the largest is exceeded by one in n + 1 others.
+    used = fitted | (runs.index % 2 == 1)
+    wide = furthest[good & used]
+    # The largest of n values is exceeded by a further one with probability 1/(n + 1).
     few = (len(wide) + 1) * false_alarms < 1
     margin = max(narrow, (BEYOND if few else 1.0) * _passing(wide, false_alarms))
-    return Margin(margin, narrow if margin > narrow else None, placed)
+    return Margin(margin, narrow if margin > narrow else None, used)
 
 
 def _passing(furthest: Float[np.ndarray, "runs"], share: float) -> float:
-    """The least margin that so few of these runs exceed that, with confidence, no more than the `share` of
-    others does; the largest that one needs, where there are too few to say."""
+    """Return the least margin that, with 95 % confidence, at most a `share` of runs exceeds.
+
+    With too few runs for that it is the largest of these runs.
+    """
     if not len(furthest):
         return 0.0
     high = binomial_interval(np.arange(len(furthest)), len(furthest)).high

@@ -1,7 +1,7 @@
-"""Whether the watchdog's rates of alarm are within what is allowed.
+"""Verdict on the watchdog's rates of alarm.
 
-A rate is good where its interval of 95 % ends at what is allowed or below, bad where it begins above. In
-between it is not known, and it is said which sweep would tell.
+A rate is good if its 95 % interval ends at or below the allowed rate, and bad if the interval begins above.
+Otherwise it is unknown, and the verdict states the size of a sweep that would decide.
 """
 
 import math
@@ -12,71 +12,70 @@ from tuning.statistics.intervals import binomial_interval, number_to_decide
 
 
 class Allowed(NamedTuple):
-    """The largest acceptable rates of wrong alarms."""
+    """Largest acceptable rates of false and missed alarms."""
 
     false_alarms: float = 0.01  # share of the good runs that are stopped
-    missed_alarms: float = 0.02  # share of the runs to be stopped that go on
+    missed_alarms: float = 0.02  # share of the bad runs that are not stopped
 
 
 ALLOWED = Allowed()
 
 
 def judged(rates: Mapping[str, Any], allowed: Allowed, scenarios: int) -> dict[str, Any]:
-    """Return the rates, each with what is `allowed`, and the verdict on them.
+    """Return the rates with their allowed values and the verdict on them.
 
-    Missed alarms are judged by the runs with injected faults, where there are enough of those; by the drawn
-    runs besides where these say that too many are missed.
+    If faults were injected and count, they decide on missed alarms; the drawn runs can only add that too many
+    are missed.
 
     Args:
-        rates: what `tuning.watchdog.alarms.watchdog_rates` found, and `fault_runs` if faults were injected
+        rates: result of `tuning.watchdog.alarms.watchdog_rates`, and `fault_runs` if faults were injected
             (`tuning.watchdog.fault_runs`).
-        allowed: the largest acceptable rates.
-        scenarios: of the drawn runs.
+        allowed: largest acceptable rates.
+        scenarios: number of drawn scenarios.
 
     Returns:
-        The rates with `verdict`: "good", "bad" with `reasons`, or "unknown" with what is not known.
+        The rates with `verdict`: "good", "bad" with `reasons`, or "unknown" with texts of what is `unknown`.
     """
     reasons, unknown = [], []
     kinds = {kind: {**rates[kind], "allowed": most} for kind, most in allowed._asdict().items()}
-    faulty = [{**one, "allowed": allowed.missed_alarms} for one in rates.get("fault_runs", ())]
-    counted = [one for one in faulty if one["counted"]]
-    for kind, one in kinds.items():
-        stated = f"{kind.replace('_', ' ')}: {_interval(one)}"
-        if one["low"] > one["allowed"]:
-            reasons.append(stated)
-        elif one["high"] > one["allowed"] and not (counted and kind == "missed_alarms"):
-            told = _what_tells(kind, one, scenarios, rates["held_out_runs"])
-            unknown.append(f"{stated}; {told}")
-    for one in counted:
-        stated = f"missed alarms with {one['meaning']}: {_interval(one)}"
-        if one["low"] > one["allowed"]:
-            reasons.append(stated)
-        elif one["high"] > one["allowed"]:
-            unknown.append(f"{stated}; {_what_faults_tell(one)}")
+    faulty = [{**rate, "allowed": allowed.missed_alarms} for rate in rates.get("fault_runs", ())]
+    counted = [rate for rate in faulty if rate["counted"]]
+    for kind, rate in kinds.items():
+        text = f"{kind.replace('_', ' ')}: {_interval(rate)}"
+        if rate["low"] > rate["allowed"]:
+            reasons.append(text)
+        elif rate["high"] > rate["allowed"] and not (counted and kind == "missed_alarms"):
+            unknown.append(f"{text}; {_deciding_sweep(kind, rate, scenarios, rates['held_out_runs'])}")
+    for rate in counted:
+        text = f"missed alarms with {rate['meaning']}: {_interval(rate)}"
+        if rate["low"] > rate["allowed"]:
+            reasons.append(text)
+        elif rate["high"] > rate["allowed"]:
+            unknown.append(f"{text}; {_deciding_runs(rate)}")
     verdict = "bad" if reasons else "unknown" if unknown else "good"
-    found = {**rates, **kinds, "verdict": verdict, "reasons": reasons, "unknown": unknown}
-    return {**found, "fault_runs": faulty} if faulty else found
+    result = {**rates, **kinds, "verdict": verdict, "reasons": reasons, "unknown": unknown}
+    return {**result, "fault_runs": faulty} if faulty else result
 
 
-def _interval(one: Mapping[str, Any]) -> str:
-    return f"95 % interval {one['low']:.2g} to {one['high']:.2g}, allowed {one['allowed']:g}"
+def _interval(rate: Mapping[str, Any]) -> str:
+    return f"95 % interval {rate['low']:.2g} to {rate['high']:.2g}, allowed {rate['allowed']:g}"
 
 
-def _what_faults_tell(one: Mapping[str, Any]) -> str:
-    """Return in words what would decide on a rate among runs with injected faults."""
-    runs = number_to_decide(one["alarms"], one["runs"], one["allowed"])
+def _deciding_runs(rate: Mapping[str, Any]) -> str:
+    """Return a text with the number of runs with injected faults that would decide on a rate."""
+    runs = number_to_decide(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
         return "at this rate no number of runs would tell"
-    return f"at this rate about {_rounded_up(runs)} such runs tell, there are {one['runs']}"
+    return f"at this rate about {_rounded_up(runs)} such runs tell, there are {rate['runs']}"
 
 
-def _what_tells(kind: str, one: Mapping[str, Any], scenarios: int, held_out: int) -> str:
-    """Return in words how large a sweep brings enough runs of the kind."""
-    runs = number_to_decide(one["alarms"], one["runs"], one["allowed"])
+def _deciding_sweep(kind: str, rate: Mapping[str, Any], scenarios: int, held_out: int) -> str:
+    """Return a text with the size of a sweep that would decide on a rate."""
+    runs = number_to_decide(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
         return "at this rate no sweep would tell"
-    if one["runs"]:
-        return f"at this rate a sweep of about {_rounded_up(runs / one['runs'] * scenarios)} scenarios tells"
+    if rate["runs"]:
+        return f"at this rate a sweep of about {_rounded_up(runs / rate['runs'] * scenarios)} scenarios tells"
     share = float(binomial_interval(0, held_out).high)
     if kind == "false_alarms" and held_out:
         return f"none of {held_out} runs is good: gains with smaller errors are needed"
@@ -84,6 +83,6 @@ def _what_tells(kind: str, one: Mapping[str, Any], scenarios: int, held_out: int
 
 
 def _rounded_up(number: float) -> int:
-    """To two digits."""
+    """Round up to two digits."""
     unit = 10 ** max(0, math.floor(math.log10(number)) - 1)
     return math.ceil(number / unit) * unit
