@@ -2,8 +2,8 @@
 
     import tuning
 
-offers what the commands of these names do as functions: `tune`, `sweep`, `compare`, `map`, `export`,
-`verify`, `report`. Each is loaded when it is first asked for: nothing here imports jax.
+offers the functions behind the commands of the same names: `tune`, `sweep`, `compare`, `map`, `export`,
+`verify` and `report`. Each function is imported on first use, so that this module does not import jax.
 """
 
 from importlib import import_module
@@ -22,12 +22,14 @@ __all__ = ["compare", "export", "map", "report", "sweep", "tune", "verify"]
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public function on its first use, and store it in the module."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(f"{__name__}.front_door.{name}"), name)
-    globals()[name] = found
-    return found
+    function = getattr(import_module(f"{__name__}.front_door.{name}"), name)
+    globals()[name] = function
+    return function
 
 
 def __dir__() -> list[str]:
+    """Return the module's names, including the functions that are not imported yet."""
     return sorted({*globals(), *__all__})

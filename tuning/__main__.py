@@ -1,7 +1,7 @@
-"""The command `jaxhil`, also `python -m tuning`: from arguments to an exit code, without a traceback.
+"""Command `jaxhil`, also `python -m tuning`: converts arguments to an exit code, without a traceback.
 
-0 done and good; 1 done, and the verdict is bad; 2 unusable input or an impossible write, reported in one
-line; 130 interrupted.
+Exit codes: 0 for success with a good verdict, 1 for success with a bad verdict, 2 for unusable input or
+output that cannot be written (reported in one line), and 130 for an interrupted command.
 """
 
 import gc
@@ -13,21 +13,24 @@ from collections.abc import Sequence
 from jaxhil.errors import InputError, one_line
 
 GOOD, BAD, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
-TRACEBACK = "JAXHIL_TRACEBACK"  # set: what goes wrong inside is shown in full
+TRACEBACK = (
+    "JAXHIL_TRACEBACK"  # environment variable; if it is set, internal errors are shown with a traceback
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code. `--help` and wrong arguments end in `SystemExit`.
+    """Run one command and return its exit code.
 
-    Raises what goes wrong inside when the environment asks for tracebacks.
+    `--help` and wrong arguments raise `SystemExit`. An internal error is raised if the environment variable
+    `JAXHIL_TRACEBACK` is set, and reported in one line otherwise.
     """
     for stream in (sys.stdout, sys.stderr):
-        # A name that the terminal's encoding lacks is no reason to fail.
+        # A character that the terminal's encoding lacks must not make the command fail.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
         if sys.stdout is None:
-            # The next file that is opened would take its place, and what is printed would go into that.
+            # The next opened file would get the descriptor of standard output, and the prints.
             raise InputError("standard output: found it closed, expected it open, or sent to /dev/null")
         from tuning.cli.parser import parse
 
@@ -35,12 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except InputError as error:
-        # What is wrong with an argument of a function is wrong with the option of that name.
+        # An error in an argument of a function is reported as an error in the option of that name.
         return _complain(getattr(error, "option", str(error)), UNUSABLE)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except BrokenPipeError:
-        # Of a text without a verdict, such as a list or the help.
+        # Only output without a verdict, such as a list or the help, ends here.
         _silence()
         return GOOD
     except OSError as error:
@@ -58,17 +61,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command() -> None:
-    """`main` as a process of its own, which ends with its exit code."""
+    """Run `main` as a process of its own, which ends with its exit code."""
     _open_streams()
-    os.environ["MPLBACKEND"] = "agg"  # pictures are files: whatever windows the user has for others
+    os.environ["MPLBACKEND"] = "agg"  # plots are files, so a window system must not be used
     code = main()
-    # The last collection would look at all that jax made: a fifth of a short command's time.
+    # Without freezing, the last garbage collection takes a fifth of a short command's time.
     gc.freeze()
     sys.exit(code)
 
 
 def _open_streams() -> None:
-    """Let the null device stand for a closed standard input or error, in whose place a file would come."""
+    """Open the null device for a closed standard input or error, so that no file gets its descriptor."""
     for number, name, mode in ((0, "stdin", "r"), (2, "stderr", "w")):
         if getattr(sys, name) is None:
             opened = os.open(os.devnull, os.O_RDWR)
@@ -79,6 +82,7 @@ def _open_streams() -> None:
 
 
 def _complain(text: str, code: int) -> int:
+    """Print a message on standard error, if it is open, and return the exit code."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:
@@ -87,11 +91,11 @@ def _complain(text: str, code: int) -> int:
 
 
 def _silence() -> None:
-    """Nobody listens any more: keep the interpreter's own flush at exit from complaining about it."""
+    """Redirect the output streams to the null device, so that the interpreter's last flush does not fail."""
     try:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
+        null = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
-            os.dup2(nowhere, stream.fileno())
+            os.dup2(null, stream.fileno())
     except (OSError, ValueError):
         pass
 

@@ -1,1 +1,1 @@
-"""A bundle: the folder in which gains, controller, test vectors and self-test leave for the rig."""
+"""Bundles: folders with gains, controller, test vectors and self-test for a rig computer."""

@@ -1,7 +1,7 @@
-"""A bundle: the folder in which gains leave for a rig computer that has never heard of jax.
+"""Bundle: folder with gains for a rig computer, which does not need jax.
 
-`build_bundle` makes the content of every file from a checked gain file; equal gains, limits and seed make
-equal files. `write_bundle` puts them in place as a whole or not at all.
+`build_bundle` makes the content of every file from a checked gain document; equal gains, limits and seed give
+equal files. `write_bundle` writes all files atomically.
 """
 
 import errno
@@ -24,17 +24,17 @@ from tuning.verification.stops import Stop
 
 
 class Bundle(NamedTuple):
-    """A bundle in memory, and what its vectors say."""
+    """Bundle in memory, and the results of its test vectors."""
 
     document: dict[str, Any]  # the gain document as exported
     files: dict[str, bytes]  # the content of every file, by its path
-    ticks: int  # of the vectors
-    runs: int  # of the vectors
-    # what ended the comparison with the simulation in each recorded run; None: nothing
+    ticks: int  # number of ticks in the vectors
+    runs: int  # number of runs in the vectors
+    # reason for an early end of the comparison with the simulation, for each recorded run; None if complete
     ended: list[str | None]
-    reasons: list[str]  # what disagrees, in words
-    stop: Stop | None  # what the limits act on in the nominal run; None: nothing
-    passing: dict[str, float] | None  # limits with which that run passes; None if there are none
+    reasons: list[str]  # disagreements, in words
+    stop: Stop | None  # stop of the nominal run by the limits; None if there is none
+    passing: dict[str, float] | None  # limits with which that run is not stopped, or None
 
 
 def build_bundle(
@@ -46,11 +46,23 @@ def build_bundle(
     progress: Callable[[str], None] = lambda message: None,
     sign: Callable[[bytes], bytes] | None = None,
 ) -> Bundle:
-    """The bundle of a checked gain document, with `limits` for the rig [SI units] if there are any.
+    """Build the bundle of a checked gain document.
 
-    `rates`, plain data, say what is known of the watchdog's alarms under these limits. `progress` is given
-    what begins. `sign` makes the signature of the manifest's bytes; None: the bundle is not signed. Raises
-    `InputError` for limits that the runtime refuses or a compensator that a format lacks.
+    Args:
+        document: the gain document.
+        formats: names of the additional formats of the gains.
+        limits: limits for the rig [SI units], None for no limit; without them, those of the document are
+            kept.
+        rates: alarm rates of the watchdog under these limits, as plain data.
+        seed: seed of the test vectors.
+        progress: function that is called with the name of each step.
+        sign: function that signs the manifest's bytes; None leaves the bundle unsigned.
+
+    Returns:
+        The bundle in memory.
+
+    Raises:
+        InputError: If the runtime refuses the limits, or the compensator does not support a format.
     """
     from jaxhil.simulation.gain_file import check_document
     from tuning.bundle.vectors import as_csv, make_vectors
@@ -64,8 +76,8 @@ def build_bundle(
     if sign is not None:
         files[selftest.SIGNATURE] = sign(files[selftest.MANIFEST])
     runs = len({row.run for row in vectors.rows})
-    found = vectors.ended, vectors.reasons, vectors.stop, vectors.passing
-    return Bundle(exported, files, len(vectors.rows), runs, *found)
+    comparison = vectors.ended, vectors.reasons, vectors.stop, vectors.passing
+    return Bundle(exported, files, len(vectors.rows), runs, *comparison)
 
 
 def with_limits(
@@ -73,9 +85,9 @@ def with_limits(
     limits: Mapping[str, float | None] | None,
     rates: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The gain document with these limits, None for no limit, signed anew; without limits as it is.
+    """Return the gain document with these limits, None for no limit, and a new digest.
 
-    The rates become `figures.watchdog`.
+    The rates become `figures.watchdog`. Without limits, the document is returned unchanged.
     """
     if limits is None:
         return dict(document)
@@ -85,14 +97,14 @@ def with_limits(
 
 
 def limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
-    """The `limits` of a gain file: value and unit by name."""
+    """Return the section `limits` of a gain file: value and unit by name."""
     return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
 
 
 def check_target(folder: Path) -> None:
-    """A bundle may be written there: there is nothing, an empty folder, or a bundle as it was exported.
+    """Check that a bundle may be written to a folder: a new or empty one, or one with an unchanged bundle.
 
-    Raises `InputError` otherwise: what someone has changed or added is not to be lost.
+    Raise `InputError` otherwise, so that no changed or additional file is lost.
     """
     where = one_line(str(folder))
     try:
@@ -106,18 +118,18 @@ def check_target(folder: Path) -> None:
 
 
 def check_mechanism(folder: Path, name: str) -> None:
-    """Check that a bundle there is of the mechanism of that name. Raise `InputError` otherwise."""
+    """Raise `InputError` if the folder has a bundle of a mechanism with another name."""
     try:
-        there = read_gain_document(folder / "gains.json")["mechanism"]["name"]
+        earlier = read_gain_document(folder / "gains.json")["mechanism"]["name"]
     except (GainFileError, KeyError, TypeError):
-        return  # nothing, or no bundle as it was exported, which `check_target` refuses
-    if there != name:
-        found = f"found the bundle of mechanism {shown(there)}, expected that of {shown(name)}"
+        return  # nothing there, or a changed bundle, for which `check_target` raises an error
+    if earlier != name:
+        found = f"found the bundle of mechanism {shown(earlier)}, expected that of {shown(name)}"
         raise InputError(f"{one_line(str(folder))}: {found}, or none: name another folder by --output")
 
 
 def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
-    """The bundle is there as a whole or, after an error, what was there before. Raises `InputError`."""
+    """Write all files of the bundle, or keep the previous state after an error. Raise `InputError`."""
     check_target(folder)
     target = folder.resolve()
     new = target.with_name(temporary_name())
@@ -133,8 +145,8 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
-            for place in {(new / name).parent for name in files}:
-                sync_folder(place)
+            for subfolder in {(new / name).parent for name in files}:
+                sync_folder(subfolder)
             _put(new, target)
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)
@@ -143,33 +155,33 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _put(new: Path, target: Path) -> None:
-    """The new folder in the place of the old one, which is removed."""
+    """Move the new folder to the place of the old one, and delete the old one."""
     if not target.exists():
         os.replace(new, target)
         return
     _swap(new, target)
     old = new
     try:
-        # Looked at once more where nobody writes any longer: what was put there in between stays.
-        own = _own_files(old)
+        # The old folder is checked again, so that files added in between are not deleted.
+        names = _own_files(old)
     except BaseException:
         _swap(old, target)
         raise
     with suppress(OSError):
-        for name in own:
+        for name in names:
             (old / name).rmdir() if name.endswith("/") else (old / name).unlink()
         old.rmdir()
 
 
 def _swap(new: Path, target: Path) -> None:
-    """Each of two folders gets the other's name."""
+    """Exchange the names of two folders."""
     try:
         exchange(new, target)
         return
     except OSError as error:
         if error.errno not in (errno.ENOSYS, errno.EINVAL):
             raise
-    # Here a power cut between the two leaves the old one under its other name, which nothing removes.
+    # A power failure between the two steps leaves the old folder under its temporary name.
     old = target.with_name(f".{target.name}.{os.getpid()}.old{TEMPORARY}")
     os.replace(target, old)
     try:
@@ -181,10 +193,10 @@ def _swap(new: Path, target: Path) -> None:
 
 
 def _own_files(folder: Path) -> list[str]:
-    """The paths of an intact bundle's files, then of the folders within it, which end with a stroke, the
-    innermost first; none in an empty folder.
+    """Return the paths of an unchanged bundle's files, then of its folders, the innermost first.
 
-    Raises `InputError` for a folder in which there is anything else.
+    Paths of folders end with a slash. The list is empty for an empty folder. Raise `InputError` if the folder
+    contains anything else.
     """
     where, allowed = one_line(str(folder)), "allowed a new or empty folder, or a bundle as it was exported"
     inside = sorted(os.listdir(folder))
@@ -198,9 +210,9 @@ def _own_files(folder: Path) -> list[str]:
         if not name.endswith(selftest.CACHE):
             raise InputError(f"{where}: {one_line(name, 80)}: {text}; {allowed}")
         for entry in list(os.scandir(folder / name)):
-            # Of Python's own making, and nothing but that.
+            # Python's cache may contain only compiled files.
             if not (entry.is_file(follow_symlinks=False) and entry.name.endswith(".pyc")):
                 raise InputError(f"{where}: {name}{one_line(entry.name, 80)}: no file of a bundle; {allowed}")
             files.append(name + entry.name)
-    folders = {f"{name[:place]}/" for name in files for place, sign in enumerate(name) if sign == "/"}
+    folders = {f"{name[:index]}/" for name in files for index, sign in enumerate(name) if sign == "/"}
     return [*files, *sorted(folders, key=len, reverse=True)]

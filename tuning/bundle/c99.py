@@ -1,10 +1,9 @@
-"""The controller in C99: from a gain document to the sources that a rig computer compiles.
+"""Controller in C99: source files made from a gain document, for a compiler on the rig computer.
 
-`jaxhil.codegen` makes them of the rig's Python: controller, guards and the law of the gain document. What is
-no Python stands here and in `c99_tables`: the header's checks of the compiler, the tables of gains, limits,
-faults and statuses, and `jaxhil_init`, which admits gains and limits. The test program is
-`test_vectors.c`. Where the generated code sizes an array by `JAXHIL_<NAME>_SAMPLES`, that constant
-is the length of a line which delays by the gain or limit of that name.
+`jaxhil.codegen` translates the rig's Python code of the controller, its guards and the compensator. This
+module and `c99_tables` add the rest: checks of the compiler, the tables of gains, limits, faults and
+statuses, and `jaxhil_init`, which checks gains and limits. The test program is `test_vectors.c`. The constant
+`JAXHIL_<NAME>_SAMPLES` is the length of a delay line whose delay is the gain or limit of that name.
 """
 
 import functools
@@ -36,7 +35,7 @@ HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS, TEST = "jaxhil_gains.h", "test_vectors.c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 FOLDER = resources.files("tuning") / "bundle"
-# Methods and properties that are the interface in C, in the header's order.
+# Methods and properties in the C interface, in the header's order.
 PUBLIC = {
     "tare": "tare",
     "step": "step",
@@ -183,14 +182,21 @@ void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, d
 def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:
     """Return the files of the controller in C99 by name: header, source, gains, test program.
 
-    Same document, same texts.
+    Equal documents give equal texts.
+
+    Args:
+        document: the gain document.
+        source: label of the document in error messages.
+
+    Returns:
+        Text of each file by its name.
 
     Raises:
-        GainFileError: for a document that the runtime refuses.
-        InputError: for a law with a construct that has no C; it names file and line.
+        GainFileError: If the runtime refuses the document.
+        InputError: If the compensator uses a construct without C code; the message names file and line.
     """
     gain_file = check_gain_document(document, source)
-    Controller(gain_file, source)  # refuses delays that no line can hold
+    Controller(gain_file, source)  # raises an error for delays longer than any delay line
     law = gain_file.compensator
     declarations, definitions = _generated(law, COMPENSATORS[law])
     return {
@@ -203,7 +209,7 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
 
 @functools.cache
 def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
-    """Return declarations and definitions of the controller with a law."""
+    """Return declarations and definitions of the controller with a compensator."""
     signs = {
         "gains": {name: _sign(gain.lowest) for name, gain in class_.gains.items()},
         "limits": {name: _sign(limit.lowest) for name, limit in LIMITS.items()},
@@ -212,7 +218,7 @@ def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
     enumerators |= {status.name.upper(): status.number for status in STATUSES}
     methods = {name: vars(Controller)[name] for name in PUBLIC}
     functions: dict[str, Any] = {
-        name: one.fget if isinstance(one, property) else one for name, one in methods.items()
+        name: member.fget if isinstance(member, property) else member for name, member in methods.items()
     }
     program = Program(
         "jaxhil_",
@@ -223,7 +229,7 @@ def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
         enumerators=enumerators,
     )
     try:
-        made = program.add(class_.__init__, class_)
+        constructor = program.add(class_.__init__, class_)
         program.add(vars(Controller)["_guard"], Controller)
         for function in functions.values():
             program.add(function, Controller)
@@ -234,15 +240,17 @@ def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
     tables = [gains_table(law), limits_table(), faults_table(), statuses_table()]
     declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
     defined = "\n".join(table.definitions for table in tables if table.definitions)
-    init = _INIT.format(law_error=", &error" if made.fails else "")
+    init = _INIT.format(law_error=", &error" if constructor.fails else "")
     return f"{declared}{output.declarations}{_PROTOTYPES}", f"{defined}\n{output.definitions}{init}"
 
 
 def _sign(lowest: float) -> str:
+    """Return the C condition on the sign of a value with this lower bound."""
     return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 
 def _lengths(declarations: str, gain_file: GainFile) -> str:
+    """Return the definitions of the lengths of all delay lines."""
     lines = []
     delays = {**gain_file.limits, **gain_file.gains}
     for name in dict.fromkeys(_SAMPLES.findall(declarations)):

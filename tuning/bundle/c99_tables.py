@@ -1,8 +1,7 @@
-"""The parts of the controller in C99 that are tables of the runtime: gains, limits, faults, statuses.
+"""Parts of the controller in C99 that come from tables of the runtime: gains, limits, faults, statuses.
 
-Each becomes a struct or a list of constants, with what its Python original says of every entry, and a check
-that admits just what the runtime admits. The struct of gains begins with control period and clearance, which
-the laws need too.
+Each table becomes a struct or constants with the Python descriptions, and a check that accepts the same
+values as the runtime. The struct of gains begins with control period and clearance, which the laws also need.
 """
 
 import math
@@ -20,7 +19,7 @@ from jaxhil.rig.registry import COMPENSATORS
 WIDTH = 110
 
 
-# What `limits.complete` asks of limits beside each one's range.
+# Conditions of `limits.complete` besides the range of each limit.
 _FIT = (
     "limits->measured_lowest < limits->measured_highest",
     "limits->command_lowest < limits->command_highest",
@@ -29,15 +28,15 @@ _FIT = (
 
 
 class Table(NamedTuple):
-    """A fragment made of a table."""
+    """Fragment of C code made from a table."""
 
-    comment: str  # what it opens with
-    declarations: str  # what goes into the header
-    definitions: str  # what goes into the source
+    comment: str  # comment above it
+    declarations: str  # code for the header
+    definitions: str  # code for the source
 
 
 def decimal(value: float) -> str:
-    """A double as C writes it: 17 significant digits, which are read back as the same double."""
+    """Return a double as C text with 17 significant digits, which is read back as the same double."""
     if math.isinf(value):
         return "INFINITY" if value > 0.0 else "-INFINITY"
     text = f"{value:.17g}"
@@ -45,7 +44,7 @@ def decimal(value: float) -> str:
 
 
 def gains_table(law: str) -> Table:
-    """The struct `jaxhil_gains` of a law, and what is admitted in it."""
+    """Return the struct `jaxhil_gains` of a compensator, and the check of its values."""
     clearance = f"(({_within('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
     entries = [
         ("control_period", f"s, {span(*CONTROL_PERIODS)}"),
@@ -63,7 +62,7 @@ def gains_table(law: str) -> Table:
 
 
 def limits_table() -> Table:
-    """The struct `jaxhil_limits`, what is admitted in it, and the limits of a gain file without any."""
+    """Return the struct `jaxhil_limits`, the check of its values, and the default limits."""
     entries = [
         (name, f"{limit.unit}, {span(limit.lowest, limit.highest)}: {limit.meaning}")
         for name, limit in LIMITS.items()
@@ -82,7 +81,7 @@ def limits_table() -> Table:
 
 
 def faults_table() -> Table:
-    """The bits of the faults, and their names."""
+    """Return the bits of the faults, and the function for their names."""
     named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in FAULTS]
     lines = []
     for name, fault in named:
@@ -107,7 +106,7 @@ def faults_table() -> Table:
 
 
 def statuses_table() -> Table:
-    """The statuses of a law, and their names."""
+    """Return the statuses of a compensator, and the function for their names."""
     named = [(f"JAXHIL_{status.name.upper()}", status) for status in STATUSES]
     lines = [f"{_comment(status.meaning, '    ')}    {name} = {status.number}" for name, status in named]
     joined = ",\n".join(lines)
@@ -123,7 +122,7 @@ def statuses_table() -> Table:
 
 
 def constants(gain_file: GainFile) -> str:
-    """The gains and the limits of a gain file, as constants of those structs."""
+    """Return the gains and the limits of a gain file as constants of those structs."""
     units = {"control_period": "s", "clearance": "m"}
     units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
     gains = {
@@ -140,17 +139,18 @@ def constants(gain_file: GainFile) -> str:
 
 
 def _values(values: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """The fields in the order of the struct: C++ has no names for them before C++20."""
+    """Return initialisers in the order of the struct; C++ has no names for fields before C++20."""
     return "".join(f"    {decimal(value)}, /* {name}, {units[name]} */\n" for name, value in values.items())
 
 
 def _struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
+    """Return the definition of a struct of doubles."""
     lines = "".join(f"{_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
     return f"typedef struct {{\n{lines}}} {name};\n"
 
 
 def _within(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
-    """A condition in C, false of what is not a number; of a law of one's own without bounds: finite."""
+    """Return a C condition that a value is in its range; without bounds, that it is finite."""
     open_below, open_above = math.isinf(lowest), math.isinf(highest)
     conditions = [f"isfinite({struct}->{name})"] * (open_below or open_above)
     conditions += [] if open_below else [f"{struct}->{name} >= {decimal(lowest)}"]
@@ -159,10 +159,12 @@ def _within(name: str, lowest: float, highest: float, struct: str = "gains") -> 
 
 
 def _check(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:
+    """Return a C function that checks all conditions."""
     joined = " &&\n           ".join(checks)
     return f"static bool {function}(const {struct} *{argument}) {{\n    return {joined};\n}}\n"
 
 
 def _comment(text: str, indent: str) -> str:
+    """Return text as an indented C comment."""
     lines = textwrap.wrap(text, WIDTH - len(indent) - 6, break_long_words=False)
     return f"{indent}/* {f'{chr(10)}{indent} * '.join(lines)} */\n"

@@ -1,8 +1,7 @@
-"""A bundle checked from the workstation: its manifest, its signature, whether it is what this version
-exports, and then its own self-test.
+"""Check of a bundle on the workstation: manifest, signature, content, and self-test.
 
-Nothing that a bundle holds is run unless it is, byte for byte, what this version exports for these gains; and
-what is run are the bytes that were checked, in a folder of their own.
+No code of a bundle is run unless it equals, byte for byte, what this version exports for these gains. The
+code that is run is a copy of the checked bytes in a temporary folder.
 """
 
 import base64
@@ -20,7 +19,7 @@ from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files, code_files, formats_among
 from tuning.bundle.manifest import version
 
-LONGEST = 600.0  # s
+LONGEST = 600.0  # s; time limit of the self-test
 MOST_REASONS = 50
 NOT_SIGNED = "not signed"
 NOT_CHECKED = "there is one; only verification with the public key (--key) proves whose"
@@ -28,22 +27,24 @@ PROVED = "by the key given"
 OTHER = "not by the key given, or not of this manifest"
 PICTURE = re.compile(rb'src="data:image/png;base64,([A-Za-z0-9+/=]*)"')
 
-# Whether a signature is that of the bytes, as `tuning.bundle.signing.verifier` makes it.
+# Function that checks the signature of bytes, as `tuning.bundle.signing.verifier` returns it.
 Verifier = Callable[[bytes, bytes], bool]
 
 
 class Checked(NamedTuple):
-    """What is known of a bundle of which nothing was run."""
+    """Result of the checks of a bundle without running its code."""
 
-    files: dict[str, bytes]  # the content of each by its path
-    document: dict[str, Any]  # of its gain file; empty if it is bad
-    signature: str  # what is known of it, in words
-    reasons: list[str]  # why it is bad; none if it is good
+    files: dict[str, bytes]  # content of each file by its path
+    document: dict[str, Any]  # gain document; empty if the bundle is bad
+    signature: str  # state of the signature, in words
+    reasons: list[str]  # reasons for a bad bundle; empty for a good one
 
 
 def check_bundle(folder: Path, signed_by: Verifier | None = None) -> Checked:
-    """The bundle is intact, signed by that key if one is given, and all of it is what this version exports
-    for its gains, given the vectors."""
+    """Check that a bundle is intact, signed, and what this version exports for its gains and vectors.
+
+    The signature is checked only if `signed_by` is given.
+    """
     checked = _intact(folder, signed_by)
     if checked.reasons:
         return checked
@@ -55,29 +56,29 @@ def check_bundle(folder: Path, signed_by: Verifier | None = None) -> Checked:
     except (KeyError, ValueError, RecursionError) as error:
         reason = str(error) if isinstance(error, InputError) else "gains.json: not a gain file"
         return checked._replace(reasons=[one_line(reason, 300)])
-    reasons = _foreign(checked.files, checked.files, lambda: _exported(checked.files, document))
+    reasons = _differences(checked.files, checked.files, lambda: _exported(checked.files, document))
     return checked._replace(document={} if reasons else document, reasons=reasons)
 
 
 def check_code(folder: Path, compensator: str) -> list[str]:
-    """Why the Python code of a bundle is not what this version exports for a compensator; empty if it is.
+    """Return why a bundle's Python code differs from this version's for a compensator; empty if it does not.
 
-    Imports no jax.
+    This does not import jax.
     """
     checked = _intact(folder, None)
-    # What Python keeps beside the sources is not run from here.
+    # Python's cache beside the sources is not used here.
     reasons = [reason for reason in checked.reasons if selftest.CACHE not in reason]
     code = {name: content for name, content in checked.files.items() if name.endswith(".py")}
-    return reasons or _foreign(checked.files, code, lambda: code_files(compensator))
+    return reasons or _differences(checked.files, code, lambda: code_files(compensator))
 
 
 def run_selftest(checked: Checked, name: str) -> tuple[list[str], list[str]]:
-    """What the self-test of a good bundle, called `name`, prints, and why it fails; nothing if it passes."""
-    # Isolated: nothing that is installed may stand in for what is not there, but NumPy where it is needed.
+    """Run the self-test of a good bundle called `name`; return its output and the reasons for a failure."""
+    # The interpreter is isolated, so that no installed package but NumPy replaces a missing file.
     needs_numpy = re.search(rb"^(?:import|from) numpy\b", checked.files["jaxhil_runtime.py"], re.MULTILINE)
     isolated = ["-I", "-B"] if needs_numpy else ["-I", "-S", "-B"]
-    with tempfile.TemporaryDirectory(prefix="jaxhil-verify-") as place:
-        folder = Path(place) / (name or "bundle")
+    with tempfile.TemporaryDirectory(prefix="jaxhil-verify-") as temporary:
+        folder = Path(temporary) / (name or "bundle")
         for path, content in checked.files.items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(content)
@@ -96,47 +97,49 @@ def run_selftest(checked: Checked, name: str) -> tuple[list[str], list[str]]:
 
 
 def _intact(folder: Path, signed_by: Verifier | None) -> Checked:
-    """The bundle against its manifest and, with a key, the manifest against its signature."""
-    found, problems = selftest.differences(str(folder))
+    """Check a bundle against its manifest and, with a key, the manifest against its signature."""
+    files, problems = selftest.differences(str(folder))
     reasons = [one_line(f"{name}: {text}", 300) for name, text in problems]
-    signature, manifest = found.get(selftest.SIGNATURE), found.get(selftest.MANIFEST, b"")
-    known = NOT_SIGNED if signature is None else NOT_CHECKED
+    signature, manifest = files.get(selftest.SIGNATURE), files.get(selftest.MANIFEST, b"")
+    state = NOT_SIGNED if signature is None else NOT_CHECKED
     if signed_by is not None:
-        known = PROVED
+        state = PROVED
         if signature is None or not signed_by(signature, manifest):
-            known = NOT_SIGNED if signature is None else OTHER
-            given = "none" if signature is None else "another"
-            reasons.insert(0, f"{selftest.SIGNATURE}: found {given}, allowed the manifest's by the key given")
+            state = NOT_SIGNED if signature is None else OTHER
+            signer = "none" if signature is None else "another"
+            reasons.insert(
+                0, f"{selftest.SIGNATURE}: found {signer}, allowed the manifest's by the key given"
+            )
     if len(reasons) > MOST_REASONS:
         reasons[MOST_REASONS:] = [f"and {len(reasons) - MOST_REASONS} more"]
-    return Checked(found, {}, known, reasons)
+    return Checked(files, {}, state, reasons)
 
 
 def _exported(files: Mapping[str, bytes], document: Mapping[str, Any]) -> dict[str, bytes]:
-    """The bundle of the document with the vectors and the picture of these files."""
+    """Return the files that this version exports for the document, with the given vectors and picture."""
     picture = PICTURE.search(files["summary.html"])
     drawn = base64.b64decode(picture[1], validate=True) if picture else b""
     return bundle_files(document, formats_among(files, document), files["vectors.csv"], drawn)
 
 
-def _foreign(
+def _differences(
     files: Mapping[str, bytes], compared: Mapping[str, bytes], make: Callable[[], Mapping[str, bytes]]
 ) -> list[str]:
-    """Of the bundle's `files` those `compared` that are not what `make` makes, in words."""
+    """Return in words which of the `compared` files differ from the result of `make`."""
     compared = {name: content for name, content in compared.items() if name != selftest.SIGNATURE}
     try:
-        made = dict(make())
-    except Exception as error:  # a gain file from elsewhere leads anywhere
+        exported = dict(make())
+    except Exception as error:  # a third-party gain file may cause any error
         reason = one_line(str(error), 200)
         return [f"gains.json: this version cannot export it: {reason}", _origin(files)]
-    expected = made.pop(selftest.MANIFEST, None)
+    expected = exported.pop(selftest.MANIFEST, None)
     reasons = []
-    for name in sorted({*compared, *made} - {selftest.MANIFEST}):
-        if name not in made:
+    for name in sorted({*compared, *exported} - {selftest.MANIFEST}):
+        if name not in exported:
             reasons.append(f"{name}: is no file that this version exports")
         elif name not in compared:
             reasons.append(f"{name}: is not here")
-        elif made[name] != compared[name]:
+        elif exported[name] != compared[name]:
             reasons.append(f"{name}: is not what this version exports")
     if not reasons and expected is not None and compared[selftest.MANIFEST] != expected:
         reasons.append(f"{selftest.MANIFEST}: is not what this version writes of these files")
@@ -144,13 +147,13 @@ def _foreign(
 
 
 def _origin(files: Mapping[str, bytes]) -> str:
-    """Which version a bundle says it is from, and what to do."""
-    stated, own = json.loads(files[selftest.MANIFEST]).get("version"), version()
+    """Return a text on the version that wrote a bundle, and on what to do."""
+    stated, present = json.loads(files[selftest.MANIFEST]).get("version"), version()
     if stated is None:
-        return f"nothing of it was run: it does not say which version wrote it, and this is {own}"
-    if stated == own:
-        return f"nothing of it was run: it says that this version, {own}, wrote it, which did not"
+        return f"nothing of it was run: it does not say which version wrote it, and this is {present}"
+    if stated == present:
+        return f"nothing of it was run: it says that this version, {present}, wrote it, which did not"
     return (
-        f"nothing of it was run: it says that {shown(stated)} wrote it, and this is {own}: "
+        f"nothing of it was run: it says that {shown(stated)} wrote it, and this is {present}: "
         f"verify it with that version"
     )

@@ -1,7 +1,7 @@
-"""The files of a bundle, as this version makes them.
+"""Content of the files of a bundle, as this version writes them.
 
-Given its vectors and the picture of its summary, a bundle follows from its gain document to the byte: so
-`export` writes it, and so `verify` knows whether a bundle is what this version exports.
+Given the vectors and the picture of the summary, the gain document determines every byte of a bundle.
+`export` writes this content, and `verify` compares a bundle with it.
 """
 
 import json
@@ -15,15 +15,24 @@ from tuning.bundle import selftest
 from tuning.bundle.manifest import manifest_text
 
 TUNING = Path(__file__).parents[1]
-# Files that a bundle holds as they are here.
+# Files that are copied unchanged into a bundle.
 COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 def code_files(compensator: str) -> dict[str, bytes]:
-    """What runs as it is in every bundle of a compensator, by path: the runtime, self-test, UDP controller.
+    """Return the Python code of every bundle of a compensator, by path.
 
-    Raises KeyError for a compensator that the runtime does not know, ValueError for one that cannot be put
-    into one file.
+    These are the runtime, the self-test and the UDP controller.
+
+    Args:
+        compensator: name of the compensator.
+
+    Returns:
+        Content of each file by its path in the bundle.
+
+    Raises:
+        KeyError: If the runtime does not know the compensator.
+        ValueError: If the runtime's modules cannot be joined to one file.
     """
     from tuning.bundle.single_file import runtime_source
 
@@ -34,17 +43,27 @@ def code_files(compensator: str) -> dict[str, bytes]:
 def bundle_files(
     document: Mapping[str, Any], formats: Sequence[str], vectors: bytes, picture: bytes | None = None
 ) -> dict[str, bytes]:
-    """All files of the bundle of a checked gain document, by path; without a `picture` (PNG) of the summary,
-    it is drawn.
+    """Return all files of the bundle of a checked gain document, by path.
 
-    Raises as `code_files`, and InputError for a format that the compensator lacks.
+    Args:
+        document: the gain document.
+        formats: names of the additional formats of the gains.
+        vectors: content of vectors.csv.
+        picture: picture of the summary (PNG); None draws it.
+
+    Returns:
+        Content of each file by its path in the bundle.
+
+    Raises:
+        InputError: If the compensator does not support a format.
+        KeyError, ValueError: As `code_files`.
     """
     from tuning.bundle.readme import readme_text
     from tuning.bundle.summary import summary_html
     from tuning.bundle.writers import WRITERS
 
     gains = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    # In what order a caller put keys is not known from the file.
+    # The file sorts its keys, so the content must not depend on the caller's order.
     document = json.loads(gains)
     if limits := document.get("limits"):
         document = {**document, "limits": {name: limits[name] for name in LIMITS if name in limits}}
@@ -62,15 +81,15 @@ def bundle_files(
 
 
 def formats_among(names: Collection[str], document: Mapping[str, Any]) -> list[str]:
-    """The formats of which a bundle that holds files of these names has any."""
+    """Return the formats of which a bundle with these file names contains files."""
     from tuning.bundle.writers import WRITERS
 
-    found = []
+    formats = []
     for name, write in WRITERS.items():
         try:
-            made = write(document)
+            content = write(document)
         except InputError:
-            continue  # the compensator lacks it
-        if {*made} & {*names}:
-            found.append(name)
-    return found
+            continue  # the compensator does not support the format
+        if {*content} & {*names}:
+            formats.append(name)
+    return formats

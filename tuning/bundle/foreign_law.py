@@ -1,7 +1,7 @@
-"""A law from outside the package on the rig: the source of its runtime class, for the runtime in one file.
+"""Source of the runtime class of a user-registered compensator, for the runtime in one file.
 
-It is the class with what it uses of its own module: imports of the standard library, of NumPy and of
-`jaxhil.rig`, and the statements at the module's top that bind the other names.
+It contains the class and what the class uses of its own module: imports of the standard library, of NumPy and
+of `jaxhil.rig`, and the top-level statements that bind the other names.
 """
 
 import ast
@@ -14,32 +14,35 @@ FORMER, PACKAGE = "jaxhil.runtime.", "jaxhil.rig."
 
 
 def module_text(law: type, name: str) -> str:
-    """The text of a module with nothing but the class, registered as `name`, and what it names.
+    """Return the text of a module with the class, registered as `name`, and all that it uses.
 
-    Raises `InputError` for a class without a source.
+    Raise `InputError` for a class without source.
     """
     try:
         text = inspect.getsource(sys.modules[law.__module__])
     except (OSError, TypeError, KeyError):
-        # A class of a notebook's cell has a source, its module has none.
+        # A class in a notebook's cell has a source, but its module has none.
         text = _class_text(law)
     tree = ast.parse(text)
-    wanted, kept = {law.__name__}, set()
+    names, statements = {law.__name__}, set()
     while True:
-        found = [one for one in tree.body if one not in kept and wanted & set(_bound(one))]
-        if not found:
+        new = [entry for entry in tree.body if entry not in statements and names & set(_bound(entry))]
+        if not new:
             break
-        kept.update(found)
-        wanted |= {node.id for one in found for node in ast.walk(one) if isinstance(node, ast.Name)}
-    parts = [_only(one, wanted) if _is_import(one) else one for one in tree.body if one in kept]
-    texts = [
-        ast.unparse(one) if _is_import(one) else ast.get_source_segment(text, one) or "" for one in parts
+        statements.update(new)
+        names |= {node.id for entry in new for node in ast.walk(entry) if isinstance(node, ast.Name)}
+    parts = [
+        _only(entry, names) if _is_import(entry) else entry for entry in tree.body if entry in statements
     ]
-    entered = f'register("{name}")({law.__name__})'
-    return "\n\n\n".join(["from jaxhil.rig.registry import register", *texts, entered])
+    texts = [
+        ast.unparse(part) if _is_import(part) else ast.get_source_segment(text, part) or "" for part in parts
+    ]
+    registration = f'register("{name}")({law.__name__})'
+    return "\n\n\n".join(["from jaxhil.rig.registry import register", *texts, registration])
 
 
 def _class_text(law: type) -> str:
+    """Return the source of a class. Raise `InputError` if it has none."""
     try:
         return inspect.getsource(law)
     except (OSError, TypeError) as error:
@@ -48,11 +51,12 @@ def _class_text(law: type) -> str:
 
 
 def _is_import(statement: ast.stmt) -> bool:
+    """Return whether a statement is an import."""
     return isinstance(statement, (ast.Import, ast.ImportFrom))
 
 
 def _bound(statement: ast.stmt) -> list[str]:
-    """Names that a statement at a module's top binds."""
+    """Return the names that a top-level statement binds."""
     if isinstance(statement, (ast.Import, ast.ImportFrom)):
         return [alias.asname or alias.name.partition(".")[0] for alias in statement.names]
     if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
@@ -62,9 +66,9 @@ def _bound(statement: ast.stmt) -> list[str]:
 
 
 def _only(statement: ast.stmt, wanted: set[str]) -> ast.stmt:
-    """Return an import of the names wanted alone; the rig's package has its present name."""
+    """Return an import of only the wanted names, with the present name of the rig's package."""
     assert isinstance(statement, (ast.Import, ast.ImportFrom))
-    names = [one for one in statement.names if (one.asname or one.name.partition(".")[0]) in wanted]
+    names = [alias for alias in statement.names if (alias.asname or alias.name.partition(".")[0]) in wanted]
     if isinstance(statement, ast.Import):
         return ast.Import(names)
     module = statement.module or ""

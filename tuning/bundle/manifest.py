@@ -1,8 +1,7 @@
-"""A bundle's manifest: what every file must be, in enough detail to say where one differs.
+"""Manifest of a bundle: the expected content of every file, detailed enough to locate a difference.
 
-SHA-256 of each file, a check of every line of those that are text, the values of the gain file, the version
-that wrote it, and at its end checks of the manifest itself. The bundle's own self-test reads it; `verify`
-does so from here, too.
+It has the SHA-256 of each file, a check of every line of text files, the values of the gain file, the version
+that wrote it, and checks of the manifest itself. The bundle's self-test and `verify` read it.
 """
 
 import hashlib
@@ -15,12 +14,12 @@ from typing import Any
 
 from tuning.bundle import selftest
 
-# Of a folder that is meant as a bundle.
+# Files by which a folder is recognised as a bundle.
 MARKS = (selftest.MANIFEST, selftest.SIGNATURE, "selftest.py", "jaxhil_runtime.py")
 
 
 def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:
-    """The manifest of these files, by their paths in the bundle, and of the gain document among them."""
+    """Return the manifest of the files of a bundle, by path, with the values of the gain document."""
     entries = {}
     for name, content in sorted(files.items()):
         entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
@@ -43,7 +42,7 @@ def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> by
 
 
 def version() -> str:
-    """The version of this package, as it writes it into manifests."""
+    """Return the version of this package, as written into manifests."""
     try:
         return f"jaxhil {metadata.version('jaxhil')}"
     except metadata.PackageNotFoundError:
@@ -51,7 +50,7 @@ def version() -> str:
 
 
 def is_text(content: bytes) -> bool:
-    """Whether a file is lines of text."""
+    """Return whether a file's content is text in UTF-8."""
     try:
         content.decode("utf-8")
     except UnicodeDecodeError:
@@ -60,5 +59,5 @@ def is_text(content: bytes) -> bool:
 
 
 def is_bundle(folder: Path) -> bool:
-    """Whether a folder is one, or the remains of one, whatever stands there under the names of its files."""
+    """Return whether a folder contains a bundle, or remains of one."""
     return folder.is_dir() and any(os.path.lexists(folder / name) for name in MARKS)

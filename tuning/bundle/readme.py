@@ -1,4 +1,4 @@
-"""A bundle's README: the text in `bundle_readme.md`, filled with what this bundle is and holds."""
+"""README of a bundle: the template `bundle_readme.md`, filled with the data of the bundle."""
 
 import html
 import re
@@ -14,7 +14,7 @@ from jaxhil.rig.law_status import STATUSES
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 
-# What may be in a bundle, and for what.
+# Files and folders of a bundle with their purpose.
 CONTENT = {
     "gains.json": "the gains, their limits for the rig, and all that they were tuned for and over",
     "jaxhil_runtime.py": "the controller, in Python without further packages",
@@ -32,15 +32,15 @@ CONTENT = {
 
 
 def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
-    """The README of the bundle of a gain document that holds these files."""
+    """Return the README of the bundle of a gain document that contains these files."""
     present = {*(name.partition("/")[0] for name in files), "manifest.json"}
-    listed = [f"| `{name}` | {text} |" for name, text in CONTENT.items() if name in present]
+    table_rows = [f"| `{name}` | {text} |" for name, text in CONTENT.items() if name in present]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         mechanism=_text(one_line(document["mechanism"]["name"], 80)),
         compensator=document["compensator"],
         period=repr(document["control_period"]),
         digest=document["sha256"],
-        content="\n".join(("| file | is |", "|---|---|", *listed)),
+        content="\n".join(("| file | is |", "|---|---|", *table_rows)),
         statuses=status_table(),
         faults=fault_table(),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
@@ -49,13 +49,13 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
 
 
 def status_table() -> str:
-    """The runtime's table of a law's statuses in Markdown."""
+    """Return the runtime's table of a compensator's statuses in Markdown."""
     rows = [f"| `{status.name}` | {_cell(status.meaning)} |" for status in STATUSES]
     return "\n".join(("| status | says |", "|---|---|", *rows))
 
 
 def fault_table() -> str:
-    """The runtime's table of faults in Markdown: bit, name, when it is raised, what follows."""
+    """Return the runtime's table of faults in Markdown: bit, name, condition, reaction."""
     rows = [
         f"| `{fault.bit:#x}` | `{fault.name}` | {_cell(fault.condition)} | {_cell(fault.reaction)} |"
         for fault in FAULTS
@@ -64,9 +64,10 @@ def fault_table() -> str:
 
 
 def _text(text: str) -> str:
-    """Return a user's text as Markdown shows it: no markup, no HTML."""
+    """Return a user's text with escaped Markdown and HTML."""
     return re.sub(r"([\\`*_\[\]|~$#])", r"\\\1", html.escape(text, quote=False))
 
 
 def _cell(text: str) -> str:
+    """Return a text for a cell of a Markdown table."""
     return text.replace("|", "\\|")

@@ -1,10 +1,10 @@
-"""Is this bundle as it was exported, and does its controller command here what it commanded there?
+"""Self-test of a bundle: checks its files, and replays recorded ticks through its controller.
 
     python selftest.py          the files, the gains, and every test vector through jaxhil_runtime.py
-    python selftest.py --c      also the C controller, with the C compiler that is here (cc, or $CC)
+    python selftest.py --c      also the C controller, with the local C compiler (cc, or $CC)
 
-Python 3.11 or later alone. One line a check; exit code 0 if all are good, else 1. Who exported the bundle it
-cannot say: where it is signed, `jaxhil verify --key` proves that on a workstation.
+It needs only Python 3.11 or later, prints one line per check, and ends with exit code 0 if all are good, else
+1. It cannot show who exported the bundle: for a signed one, use `jaxhil verify --key` on a workstation.
 """
 
 import hashlib
@@ -21,11 +21,12 @@ import tempfile
 import zlib
 
 MANIFEST, SIGNATURE, CACHE = "manifest.json", "manifest.sig", "__pycache__/"
-PATH = re.compile(r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII)  # of a file in the manifest
-MOST_FILES, MOST_BYTES, MOST_TEXT = 1000, 1 << 26, 1 << 23  # of a bundle, of a text in it: more than any has
+PATH = re.compile(r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII)  # path of a file in the manifest
+# Limits of a bundle, and of a text file in it; no real bundle reaches them.
+MOST_FILES, MOST_BYTES, MOST_TEXT = 1000, 1 << 26, 1 << 23
 SCHEMA = "jaxhil/bundle/1"
-SIMULATED_LIMIT = 1e-11  # of the range of a run's commands: the simulation rounds in another order
-MOST_SHOWN = 8  # differences of one kind that are reported one by one
+SIMULATED_LIMIT = 1e-11  # share of the range of a run's commands; the simulation rounds in another order
+MOST_SHOWN = 8  # largest number of reported differences of one kind
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COLUMNS = (
@@ -35,7 +36,7 @@ COLUMNS = (
 
 
 def main(arguments, folder):
-    """Run the checks on the bundle in `folder`; True if all are good."""
+    """Run the checks on the bundle in `folder`; return True if all are good."""
     print(f"self-test of {plain(os.path.basename(os.path.abspath(folder)))}, Python {sys.version.split()[0]}")
     found, damaged = check_files(folder)
     runtime = check_runtime(folder, found, damaged)
@@ -48,12 +49,12 @@ def main(arguments, folder):
 
 
 def check_files(folder):
-    """Every file against the manifest: their contents, and the names of those that differ, all reported."""
+    """Check every file against the manifest; return the contents, and the names of files that differ."""
     found, problems = differences(folder)
     reported = {}
     for name, text in problems:
         if name.endswith(CACHE):
-            print(f"note  {plain(name)}: {text}")  # of Python's own making, where the controller has run
+            print(f"note  {plain(name)}: {text}")  # Python creates this when the controller runs
             continue
         reported[name] = reported.get(name, 0) + 1
         if reported[name] <= MOST_SHOWN:
@@ -69,10 +70,10 @@ def check_files(folder):
 
 
 def differences(folder):
-    """The content of each file that is here, by its path, and (path, what differs) of each difference."""
+    """Return the content of each file by its path, and (path, difference in words) for each difference."""
     found, problems, wrong, left = {}, [], [], MOST_BYTES
     if os.path.lexists(os.path.join(folder, SIGNATURE)):
-        problems += take(found, folder, SIGNATURE, 64)  # bytes, of Ed25519
+        problems += take(found, folder, SIGNATURE, 64)  # bytes of an Ed25519 signature
     try:
         found[MANIFEST] = read(folder, MANIFEST, MOST_TEXT)
         wrong = [(MANIFEST, text) for text in manifest_differences(found[MANIFEST])]
@@ -80,7 +81,7 @@ def differences(folder):
     except Exception as error:
         return found, [*problems, *wrong, (MANIFEST, f"cannot be read: {describe(error)}")]
     if wrong:
-        return found, problems + wrong  # nothing is to be learnt from it about others
+        return found, problems + wrong  # a damaged manifest says nothing about other files
     for name, entry in files.items():
         problems += take(found, folder, name, left)
         content = found.get(name, b"")
@@ -97,7 +98,7 @@ def differences(folder):
 
 
 def entries(manifest):
-    """The entry of each file, and the values of the gain file; an exception where the manifest has none."""
+    """Return the entry of each file, and the values of the gain file; raise an error for a wrong manifest."""
     document = json.loads(manifest)
     if document["schema"] != SCHEMA:
         raise ValueError(f"schema: found {shown(document['schema'])}, expected '{SCHEMA}'")
@@ -113,12 +114,12 @@ def entries(manifest):
 
 
 def manifest_differences(content):
-    """The manifest's last lines hold checks of all lines before."""
+    """Check a manifest against the checks of its lines at its end; return the differences in words."""
     body, found, seal = content.rpartition(b',\n "own_lines": ')
     try:
         own = json.loads(b'{"own_lines": ' + seal) if found else {}
         if hashlib.sha256(body).hexdigest() == own["own_sha256"]:
-            # A seal written in another way seals as well, but is not the one that was exported.
+            # A seal with the same values in another notation is not the exported one.
             good = seal == own_seal(body).partition(b',\n "own_lines": ')[2]
             line = body.count(b"\n") + 2
             return [] if good else [f"line {line} or after: its own checks differ"]
@@ -128,19 +129,19 @@ def manifest_differences(content):
 
 
 def own_seal(body):
-    """What follows a manifest's body: a check of each of its lines, and of the whole."""
+    """Return the end of a manifest: a check of each line of its body, and the body's SHA-256."""
     checks = json.dumps(line_checks(body))
     return f',\n "own_lines": {checks},\n "own_sha256": "{hashlib.sha256(body).hexdigest()}"\n}}\n'.encode()
 
 
 def line_checks(content):
-    """CRC-32 of every line, eight hexadecimal digits each, blanks between; line endings do not count."""
+    """Return the CRC-32 of every line as eight hexadecimal digits; line endings do not count."""
     lines = content.replace(b"\r\n", b"\n").split(b"\n")
     return " ".join(f"{zlib.crc32(line):08x}" for line in lines)
 
 
 def lines_that_differ(found, checks):
-    """In words, where a file's content differs from the lines whose checks these are."""
+    """Return in words which lines of a file differ from their checks."""
     if checks is None or len(found) > MOST_TEXT:
         return [f"differs from what was exported ({len(found)} bytes are here)"]
     here, expected = line_checks(found).split(), checks.split()
@@ -155,7 +156,7 @@ def lines_that_differ(found, checks):
 
 
 def value_differences(content, expected):
-    """Each value of a gain file that is not the exported one: its key, what was found and expected."""
+    """Yield the key, the value found and the value expected of each changed value in a gain file."""
     try:
         found = dict(leaves(json.loads(content), ""))
     except Exception:
@@ -167,7 +168,7 @@ def value_differences(content, expected):
 
 
 def leaves(value, key):
-    """(dotted key, value as JSON) of all that is in a JSON value."""
+    """Yield (dotted key, value as JSON) for all values in a JSON document."""
     if isinstance(value, (dict, list)) and value:
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for name, inner in items:
@@ -177,7 +178,7 @@ def leaves(value, key):
 
 
 def others(folder, files, within=""):
-    """Whatever is there that the manifest does not name; a folder of others ends with a stroke."""
+    """Yield the paths of files and folders that the manifest does not name; folders end with a slash."""
     for entry in sorted(os.scandir(os.path.join(folder, within)), key=lambda one: one.name):
         path, is_folder = within + entry.name, entry.is_dir(follow_symlinks=False)
         if is_folder and any(name.startswith(f"{path}/") for name in files):
@@ -187,12 +188,12 @@ def others(folder, files, within=""):
 
 
 def check_runtime(folder, found, damaged):
-    """The runtime's names, from the source that was checked and nothing else; None if it does not run."""
+    """Run the checked source of the runtime, and return its names; None if it does not run."""
     if {"jaxhil_runtime.py", MANIFEST} & damaged:
         return fail("jaxhil_runtime.py", "is not run: it, or the manifest, differs from what was exported")
     runtime = {"__name__": "jaxhil_runtime", "__file__": os.path.join(folder, "jaxhil_runtime.py")}
     try:
-        # Not by import: a cache of an older source may lie about, and the folder is on no path with -I.
+        # An import could load the cache of an older source, and with -I it would not find the folder.
         exec(compile(found["jaxhil_runtime.py"], "jaxhil_runtime.py", "exec"), runtime)
         if not {"Controller", "GainFileError"} <= {*runtime}:
             raise NameError("it has no Controller or no GainFileError")
@@ -202,7 +203,7 @@ def check_runtime(folder, found, damaged):
 
 
 def check_gains(folder, runtime):
-    """The gain file is one that the controller takes."""
+    """Check that the controller accepts the gain file."""
     try:
         controller = runtime["Controller"].from_file(os.path.join(folder, "gains.json"))
     except runtime["GainFileError"] as error:
@@ -214,7 +215,7 @@ def check_gains(folder, runtime):
 
 
 def check_vectors(folder, found, runtime):
-    """Every tick commands what was recorded, to the bit; the simulation's forces are met closely."""
+    """Check that every command equals the recorded one to the last bit, and is close to the simulated one."""
     try:
         rows = list(read_vectors(found["vectors.csv"].decode("ascii")))
     except Exception as error:
@@ -234,7 +235,7 @@ def check_vectors(folder, found, runtime):
 
 
 def check_simulated(runs):
-    """The forces commanded against those that the simulation commanded, run by run."""
+    """Check the commanded forces against those of the simulation, run by run."""
     largest, compared = 0.0, 0
     for run, ticks in runs.items():
         stated = [tick for tick in ticks if not math.isnan(tick[2])]
@@ -251,7 +252,7 @@ def check_simulated(runs):
 
 
 def read_vectors(text):
-    """(line number, the row's numbers) of each tick; an empty field is None."""
+    """Yield (line number, the row's numbers) for each tick; an empty field is None."""
     lines = text.split("\n")
     if lines[0].rstrip("\r") != COLUMNS:
         raise ValueError("line 1: unknown columns")
@@ -270,7 +271,7 @@ def read_vectors(text):
 
 
 def replay(rows, gains, runtime):
-    """Of each run (line, force commanded, simulated) of its ticks; the differences, in words."""
+    """Return (line, commanded force, simulated force) of each tick by run, and the differences in words."""
     controller, runs, different = None, {}, []
     for number, row in rows:
         run, event, force, position, velocity, measured, time, *motion = row[:10]
@@ -281,7 +282,7 @@ def replay(rows, gains, runtime):
         elif event == 2:
             controller.next_contact()
         command = controller.step(force, position, velocity, measured, time)
-        # An integer in the file stands for the bits of the faults; all else are floats.
+        # The faults are the only integers in the file; they are compared as floats.
         found = command, controller.position_command(*motion), float(controller.faults)
         texts = [
             f"{name}: found {one!r}, expected {expected!r}"
@@ -295,13 +296,13 @@ def replay(rows, gains, runtime):
 
 
 def same_bits(found, expected):
-    """Whether two floats are the same, signs of zero included; any NaN is as another."""
+    """Return whether two floats are equal, including the sign of zero; any NaN equals any other."""
     both_nan = found != found and expected != expected
     return both_nan or struct.pack("<d", found) == struct.pack("<d", expected)
 
 
 def check_c(folder, found, damaged):
-    """The C controller, compiled here, meets the vectors too."""
+    """Compile the C controller, and check that it reproduces the vectors."""
     sources = [os.path.join(folder, name) for name in C_SOURCES]
     differs = any(name == MANIFEST or name.startswith("c99/") for name in damaged)
     if differs or not {*C_SOURCES} <= {*found}:
@@ -325,7 +326,7 @@ def check_c(folder, found, damaged):
 
 
 def read(folder, name, most=MOST_BYTES):
-    """The content of a plain file in the folder: no link is followed, no pipe or device waited for."""
+    """Return the content of a plain file in the folder; links, pipes and devices are refused."""
     path, parts = folder, name.split("/")
     for place, part in enumerate(parts, start=1 - len(parts)):
         path = os.path.join(path, part)
@@ -340,7 +341,7 @@ def read(folder, name, most=MOST_BYTES):
 
 
 def take(found, folder, name, most):
-    """Read a file into `found`; (path, why not) where that cannot be done."""
+    """Read a file into `found`; return a list with (path, reason) if that is not possible."""
     try:
         found[name] = read(folder, name, most)
     except (OSError, ValueError) as error:
@@ -349,31 +350,33 @@ def take(found, folder, name, most):
 
 
 def passed(name, text):
+    """Print that a check is good; return True."""
     print(f"ok    {plain(name)}: {text}")
     return True
 
 
 def fail(name, text):
-    """Tell what is wrong, in one line; None, which is no success."""
+    """Print in one line what is wrong; return None, which counts as a failure."""
     print(f"FAIL  {plain(name)}: {text}")
 
 
 def describe(error):
-    """An error in one line."""
+    """Return an error as text in one line."""
     return plain(f"{type(error).__name__}: {error}")[:200]
 
 
 def shown(value):
+    """Return a value as a short printable text."""
     return plain(value if isinstance(value, str) else repr(value))[:80]
 
 
 def plain(text):
-    """Text that any terminal can print, on one line."""
+    """Return text with escapes for characters that a terminal may not print."""
     return "".join(c if c.isprintable() and c.isascii() else ascii(c)[1:-1] for c in text)
 
 
 def look_again():
-    """This file against the manifest once more, apart from all the above: it may be what is damaged."""
+    """Check this file against the manifest without the functions above, which may be damaged."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
         own = json.loads(read(here, "manifest.json", MOST_TEXT))["files"]["selftest.py"]["sha256"]
@@ -384,7 +387,7 @@ def look_again():
 
 
 def tell(kind, error, trace):
-    """What is reported of an error that nothing expected: one line."""
+    """Report an unexpected error in one line."""
     sys.stdout.flush()
     print(f"FAIL  selftest.py: cannot be run: {describe(error)}", file=sys.stderr)
 

@@ -1,8 +1,7 @@
-"""Signatures of bundles: Ed25519 (RFC 8032) over the manifest's bytes, which name every other file's SHA-256.
+"""Signatures of bundles: Ed25519 (RFC 8032) over the manifest, which has the SHA-256 of every other file.
 
-The signature is 64 bytes, `manifest.sig`; keys are PEM files, as `openssl genpkey -algorithm ed25519` makes
-them. The package `cryptography` does the work, and is imported when it is needed: it is the extra
-`jaxhil[sign]`.
+The signature is the file `manifest.sig` of 64 bytes; keys are PEM files, such as `openssl genpkey -algorithm
+ed25519` writes. It uses the package `cryptography`, the extra `jaxhil[sign]`, which is imported on use.
 """
 
 from collections.abc import Callable
@@ -12,11 +11,11 @@ from typing import Any
 from jaxhil.errors import InputError, one_line
 from jaxhil.files import open_input
 
-LARGEST = 65536  # bytes of a key's file
+LARGEST = 65536  # bytes; largest size of a key's file
 
 
 def signer(path: Path) -> Callable[[bytes], bytes]:
-    """What makes the signature of bytes with the private key in a file. Raises `InputError`."""
+    """Return a function that signs bytes with the private key in a file. Raise `InputError`."""
     ed25519, serialization = _library()
     allowed = "an Ed25519 private key without a passphrase, as PEM"
     key = _key(path, allowed, lambda text: serialization.load_pem_private_key(text, password=None))
@@ -26,7 +25,7 @@ def signer(path: Path) -> Callable[[bytes], bytes]:
 
 
 def verifier(path: Path) -> Callable[[bytes, bytes], bool]:
-    """What tells whether a signature is of these bytes, by the public key in a file. Raises `InputError`."""
+    """Return a function that checks signatures by the public key in a file. Raise `InputError`."""
     ed25519, serialization = _library()
     from cryptography.exceptions import InvalidSignature
 
@@ -46,6 +45,7 @@ def verifier(path: Path) -> Callable[[bytes, bytes], bool]:
 
 
 def _library() -> tuple[Any, Any]:
+    """Import and return the modules of `cryptography`. Raise `InputError` if it is not installed."""
     try:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
@@ -57,6 +57,7 @@ def _library() -> tuple[Any, Any]:
 
 
 def _key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
+    """Read a key from a PEM file by the function `load`. Raise `InputError`."""
     from cryptography.exceptions import UnsupportedAlgorithm
 
     try:
@@ -76,4 +77,5 @@ def _key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
 
 
 def _refusal(path: Path, found: str, allowed: str) -> InputError:
+    """Return the error for an unusable key file."""
     return InputError(f"{one_line(str(path))}: found {found}, allowed {allowed}")

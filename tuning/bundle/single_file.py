@@ -1,8 +1,8 @@
-"""The rig's controller as one source file, with the exported compensator and no other.
+"""Controller of the rig as one source file, with only the exported compensator.
 
-It has what `jaxhil.rig` offers in `__all__`, the compensator, and the modules of `jaxhil` that these import.
-Each module's text follows those that it imports, comments and all, without its own docstring and imports.
-Imports from outside come first, once each. Two modules that bind the same name are refused.
+It contains what `jaxhil.rig` offers in `__all__`, the compensator, and the modules of `jaxhil` that they
+import. The text of a module, with comments but without its docstring and imports, follows the modules that it
+imports. External imports come first, each once. Two modules that bind the same name raise an error.
 """
 
 import ast
@@ -21,31 +21,40 @@ OUTSIDE = {*sys.stdlib_module_names, "numpy"}
 
 
 class Source(NamedTuple):
-    """A module of the package."""
+    """Source of a module of the package."""
 
-    name: str  # its full name
-    text: str  # all of it
-    tree: ast.Module  # its syntax tree
-    inside: dict[str, str]  # module of the package from which each imported name is
-    outside: tuple[str, ...]  # the import lines that it needs from elsewhere
-    # the statements that are of no use in one file: docstring, imports, `__all__`
+    name: str  # full name of the module
+    text: str  # whole text
+    tree: ast.Module  # syntax tree
+    inside: dict[str, str]  # module of the package by the name imported from it
+    outside: tuple[str, ...]  # import lines for external modules
+    # statements that are left out in one file: docstring, imports, `__all__`
     dropped: tuple[ast.stmt, ...]
 
 
 def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
     """Return the text of `jaxhil_runtime.py`: all that `package` offers, with one compensator.
 
-    Raise KeyError for a compensator that the rig does not know, and ValueError for modules that cannot be put
-    into one file: an import within a function, circular, relative, renamed, or of another package than this,
-    the standard library and NumPy; a name that two modules bind.
+    Args:
+        compensator: name of the compensator.
+        package: package of the runtime.
+
+    Returns:
+        Python source.
+
+    Raises:
+        KeyError: If the rig does not know the compensator.
+        ValueError: If the modules cannot be joined to one file: imports that are within a function, circular,
+            relative, renamed, or of packages other than this one, the standard library and NumPy; or a name
+            that two modules bind.
     """
     root = package.__name__.partition(".")[0]
     class_ = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS[compensator]
-    law, own = class_.__module__, {}
+    law, generated = class_.__module__, {}
     if law.partition(".")[0] != root:
-        own[law] = source_of(module_text(class_, compensator), law, f"{compensator}.py", root)
+        generated[law] = source_of(module_text(class_, compensator), law, f"{compensator}.py", root)
     offered = read_source(f"{package.__name__}.__init__")
-    sources = _in_order([law, *_offering(offered)], own)
+    sources = _in_order([law, *_offering(offered)], generated)
     _check_unique(sources)
     public = [name for name in _public(offered) if name in offered.inside]
     imports = {line for source in sources for line in source.outside}
@@ -73,7 +82,7 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
 
 
 def read_source(name: str) -> Source:
-    """Return a module by its full name, its docstring, imports and `__all__` apart from what it does."""
+    """Return a module by its full name, with its docstring, imports and `__all__` separated."""
     root, _, below = name.partition(".")
     path = Path(str(sys.modules[root].__file__)).parent / f"{below.replace('.', '/')}.py"
     if not path.is_file():
@@ -82,11 +91,11 @@ def read_source(name: str) -> Source:
 
 
 def source_of(text: str, name: str, file: str, root: str) -> Source:
-    """Return the same of a module's text, of which imports from the package `root` are inside."""
+    """Return a module from its text; imports from the package `root` are internal."""
     tree = ast.parse(text, file)
     inside: dict[str, str] = {}
     outside: list[str] = []
-    dropped = [one for one in tree.body if _assigns(one, "__all__")]
+    dropped = [statement for statement in tree.body if _assigns(statement, "__all__")]
     dropped += tree.body[:1] if ast.get_docstring(tree) is not None else []
     for node in ast.walk(tree):
         if not isinstance(node, (ast.Import, ast.ImportFrom)):
@@ -104,7 +113,7 @@ def source_of(text: str, name: str, file: str, root: str) -> Source:
 
 
 def _from_inside(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
-    """Yield each name that an import of the package binds, and the module that it is from."""
+    """Yield each name that an import of the package binds, and its module."""
     for alias in node.names:
         if alias.asname is not None:
             raise ValueError(f"{where}: imports {alias.name} under another name, allowed its own")
@@ -112,21 +121,21 @@ def _from_inside(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
 
 
 def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
-    """One import line for each name."""
+    """Yield one import line for each imported name."""
     for alias in node.names:
         module = node.module or "" if isinstance(node, ast.ImportFrom) else alias.name
         if isinstance(node, ast.ImportFrom) and node.level:
             raise ValueError(f"{where}: a relative import, allowed imports by a module's full name")
         if module.partition(".")[0] not in OUTSIDE:
             raise ValueError(f"{where}: imports {module}, allowed the standard library and NumPy")
-        named = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
-        yield f"from {module} {named}" if isinstance(node, ast.ImportFrom) else named
+        line = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
+        yield f"from {module} {line}" if isinstance(node, ast.ImportFrom) else line
 
 
-def _in_order(wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
-    """Return the modules wanted and all that they import, each after its own imports.
+def _in_order(wanted: Iterable[str], generated: dict[str, Source]) -> list[Source]:
+    """Return the wanted modules and all modules that they import, each after its own imports.
 
-    The `own` sources are not read from files.
+    Modules in `generated` are not read from files.
     """
     ordered: dict[str, Source] = {}
 
@@ -135,7 +144,7 @@ def _in_order(wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
             raise ValueError(f"modules that import each other: {' -> '.join([*above, name])}")
         if name in ordered:
             return
-        source = own.get(name) or read_source(name)
+        source = generated.get(name) or read_source(name)
         for needed in dict.fromkeys(source.inside.values()):
             visit(needed, (*above, name))
         ordered[name] = source
@@ -146,10 +155,10 @@ def _in_order(wanted: Iterable[str], own: dict[str, Source]) -> list[Source]:
 
 
 def _check_unique(sources: Iterable[Source]) -> None:
-    """Raises ValueError where two modules bind one name, or one name means two things from outside."""
+    """Raise ValueError if two modules bind the same name, or a name has two external meanings."""
     owners: dict[str, str] = {}
     for source in sources:
-        bound = {name: source.name for one in source.tree.body for name in _bound_by(one)}
+        bound = {name: source.name for statement in source.tree.body for name in _bound_by(statement)}
         for line in source.outside:
             bound[re.split(r"[ .]", line.rpartition(" as ")[2].rpartition("import ")[2])[0]] = line
         for name, owner in bound.items():
@@ -158,6 +167,7 @@ def _check_unique(sources: Iterable[Source]) -> None:
 
 
 def _bound_by(statement: ast.stmt) -> Iterator[str]:
+    """Yield the names that a top-level statement binds, except for imports and `__all__`."""
     if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
         yield statement.name
     elif not isinstance(statement, (ast.Import, ast.ImportFrom)) and not _assigns(statement, "__all__"):
@@ -167,7 +177,7 @@ def _bound_by(statement: ast.stmt) -> Iterator[str]:
 
 
 def _section(source: Source) -> Iterator[str]:
-    """The module's docstring as a comment, then its text without what is dropped."""
+    """Yield the module's docstring as a comment, then its text without the dropped statements."""
     yield from ("", "", f"# ---- {source.name} " + "-" * (100 - len(source.name)))
     for line in (ast.get_docstring(source.tree) or "").splitlines():
         yield f"# {line}".rstrip()
@@ -180,6 +190,7 @@ def _section(source: Source) -> Iterator[str]:
 
 
 def _public(offered: Source) -> list[str]:
+    """Return the names in `__all__` of a module. Raise ValueError if there are none."""
     for statement in offered.tree.body:
         if isinstance(statement, ast.Assign) and _assigns(statement, "__all__"):
             return list(ast.literal_eval(statement.value))
@@ -187,10 +198,12 @@ def _public(offered: Source) -> list[str]:
 
 
 def _offering(offered: Source) -> list[str]:
+    """Return the modules of the public names."""
     return [offered.inside[name] for name in _public(offered) if name in offered.inside]
 
 
 def _assigns(statement: ast.stmt, name: str) -> bool:
+    """Return whether a statement assigns to a name."""
     return isinstance(statement, ast.Assign) and any(
         isinstance(target, ast.Name) and target.id == name for target in statement.targets
     )

@@ -1,6 +1,6 @@
-"""A bundle on one page for people: what for, gains, limits and watchdog, what is reached, where it holds.
+"""Summary of a bundle on one page: purpose, gains, limits, watchdog, errors, and range of validity.
 
-One HTML file with its picture in it, made to print on one sheet of A4.
+It is one HTML file with an embedded picture, made for one printed sheet of A4.
 """
 
 import base64
@@ -20,7 +20,7 @@ from tuning.bundle.writers import Entry, gain_entries, limit_entries
 
 COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
 HATCHES = {"before": "///", "literature": "...", "tuned": ""}
-KEYS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # of |e - e*|
+KEYS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # statistics of |e - e*|
 QUANTITIES = {
     "contact_frequency": ("contact frequency", "Hz", 1.0),
     "delay": ("delay", "ms", 1e3),
@@ -28,7 +28,7 @@ QUANTITIES = {
     "force": ("contact force", "N", 1.0),
 }
 
-# What the watchdog's expectation is made of.
+# Prefixes of the limits that are fitted numbers of the watchdog's expected restitution.
 FITTED = ("expected_", "softness_", "speed_", "loss_", "reference_")
 
 STYLE = """
@@ -47,7 +47,7 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 
 
 def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
-    """The page of a checked gain document, with its picture, a PNG, as it is already `drawn`, if it is."""
+    """Return the page of a checked gain document; `drawn` is its picture (PNG), None to draw it."""
     mechanism = document["mechanism"]
     name = escape(one_line(mechanism["name"], 80))
     picture = base64.b64encode(picture_png(document) if drawn is None else drawn).decode("ascii")
@@ -76,7 +76,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
 
 
 def about(mechanism: Mapping[str, Any]) -> str:
-    """The mechanism and the rig in a sentence."""
+    """Return a sentence on the mechanism and the rig."""
     bodies, contact, rig = mechanism["bodies"], mechanism["contact"], mechanism["rig"]
     mass = bodies.get("equivalent_mass")
     text = f"{_number(mass)} kg" if mass else f"bodies of {_listed(bodies.values())} kg"
@@ -94,12 +94,12 @@ def about(mechanism: Mapping[str, Any]) -> str:
 
 @matplotlib.style.context("default")
 def picture_png(document: Mapping[str, Any]) -> bytes:
-    """Restitution error before and after, beside what the gains were tuned over."""
+    """Draw the restitution error before and after tuning, and the ranges that the gains were tuned over."""
     figure = Figure(figsize=(9.3, 3.1))
     FigureCanvasAgg(figure)
     left = figure.add_axes((0.075, 0.2, 0.48, 0.6))
     _errors(left, document)
-    spans = [(key, one) for key, one in document["envelope"].items() if _is_span(one)][:4]
+    spans = [(key, span) for key, span in document["envelope"].items() if _is_span(span)][:4]
     figure.text(0.61, 0.93, "Tuned over (the gains hold there)", fontsize=10, va="center")
     if not spans:
         figure.text(0.61, 0.5, "the gain file does not say", fontsize=9)
@@ -111,19 +111,19 @@ def picture_png(document: Mapping[str, Any]) -> bytes:
 
 
 def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Groups of bars: of the nominal run and of fresh scenarios, each under the gains before and after."""
+    """Draw groups of bars: errors of the nominal run and of fresh scenarios, by gains."""
     groups = _error_groups(document["figures"])
     series = [name for name in COLOURS if any(name in values for _, values in groups)]
     width = 0.8 / max(1, len(series))
     axes.set_title("Restitution error |e - e*|", fontsize=10, loc="left", y=1.13)
-    for place, name in enumerate(series):
-        shown = [(i, values[name]) for i, (_, values) in enumerate(groups) if name in values]
-        centres = [i + (place - (len(series) - 1) / 2) * width for i, _ in shown]
+    for index, name in enumerate(series):
+        heights = [(i, values[name]) for i, (_, values) in enumerate(groups) if name in values]
+        centres = [i + (index - (len(series) - 1) / 2) * width for i, _ in heights]
         bars = axes.bar(
-            centres, [value for _, value in shown], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
+            centres, [value for _, value in heights], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
             edgecolor="white", linewidth=0.4, label=LABELS[name].partition(":")[0],
         )  # fmt: skip
-        axes.bar_label(bars, [f"{value:.2g}" for _, value in shown], fontsize=6, padding=1)
+        axes.bar_label(bars, [f"{value:.2g}" for _, value in heights], fontsize=6, padding=1)
     axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
     axes.tick_params(axis="y", labelsize=8)
     axes.set_ylabel("|e - e*| [1]", fontsize=9)
@@ -139,16 +139,19 @@ def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
 
 
 def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
+    """Return the label of each group of bars, and the error by gains."""
     groups = []
     for kind, key, label in (
         ("nominal", "rms", "nominal run,\nrms"),
         *(("robust", key, f"scenarios,\n{text}") for key, text in KEYS.items()),
     ):
-        known = figures.get(kind, {})
+        errors = figures.get(kind, {})
         values = {
-            name: one[key]
-            for name, one in (known.items() if isinstance(known, Mapping) else ())
-            if name in COLOURS and isinstance(one, Mapping) and isinstance(one.get(key), (int, float))
+            name: statistics[key]
+            for name, statistics in (errors.items() if isinstance(errors, Mapping) else ())
+            if name in COLOURS
+            and isinstance(statistics, Mapping)
+            and isinstance(statistics.get(key), (int, float))
         }
         if values:
             groups.append((label, values))
@@ -156,7 +159,7 @@ def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float
 
 
 def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
-    """One quantity's range on an axis of its own."""
+    """Draw the range of one quantity on its own axis."""
     name, unit, factor = QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
     low, high = sorted((factor * span["low"], factor * span["high"]))
     room = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
@@ -172,11 +175,12 @@ def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
 
 
 def _figures(document: Mapping[str, Any]) -> Iterator[str]:
-    known = document["figures"].get("robust")
+    """Yield the table of errors on fresh scenarios."""
+    robust = document["figures"].get("robust")
     rows = []
-    for name, one in known.items() if isinstance(known, Mapping) else ():
-        if name in LABELS and isinstance(one, Mapping):
-            cells = [*(one.get(key) for key in (*KEYS, "mean", "peak_ratio")), one.get("failed")]
+    for name, errors in robust.items() if isinstance(robust, Mapping) else ():
+        if name in LABELS and isinstance(errors, Mapping):
+            cells = [*(errors.get(key) for key in (*KEYS, "mean", "peak_ratio")), errors.get("failed")]
             rows.append((LABELS[name], *(_number(value) for value in cells)))
     if rows:
         heads = ("fresh scenarios", *KEYS.values(), "mean e - e*", "peak force / reference", "not ended")
@@ -186,9 +190,10 @@ def _figures(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _gains(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the table of gains."""
     rows = [
-        (name, _number(one.value, 6), one.unit, f"{_number(one.lower, 3)} to {_number(one.upper, 3)}")
-        for name, one in gain_entries(document).items()
+        (name, _number(gain.value, 6), gain.unit, f"{_number(gain.lower, 3)} to {_number(gain.upper, 3)}")
+        for name, gain in gain_entries(document).items()
     ]
     if rows:
         yield from _table("Gains", ("gain", "value", "unit", "bounds"), rows)
@@ -197,18 +202,19 @@ def _gains(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _limits(document: Mapping[str, Any]) -> Iterator[str]:
-    given = _given(document)
-    if not given:
+    """Yield the table of limits."""
+    limits = _active_limits(document)
+    if not limits:
         yield "<h2>Limits</h2><p>None in the gain file: those of the code hold.</p>"
         return
-    rows = [(name, _number(one.value, 5), one.unit) for name, one in given.items() if is_shown(name)]
+    rows = [(name, _number(limit.value, 5), limit.unit) for name, limit in limits.items() if is_shown(name)]
     yield from _table("Limits", ("limit", "value", "unit"), rows, (1,))
 
 
 def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
-    """What there is to say of the limits beside their values."""
-    given = _given(document)
-    if not given:
+    """Yield the verdict on the watchdog, its alarm rates, and the limits that are not set."""
+    limits = _active_limits(document)
+    if not limits:
         return
     yield "<h2>Watchdog</h2>"
     rates = document["figures"].get("watchdog")
@@ -218,45 +224,43 @@ def _watchdog(document: Mapping[str, Any]) -> Iterator[str]:
     rates_text = one_line("; ".join(alarm_rates(rates)), 1500)
     rates_text = rates_text or "Rates of false and missed alarms are not known"
     yield f"<p>{escape(rates_text[0].upper() + rates_text[1:])}.</p>"
-    fitted = sum(not is_shown(name) for name in given)
+    fitted = sum(not is_shown(name) for name in limits)
     if fitted:
         yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
-    unset = [name for name in document["limits"] if name not in given]
+    unset = [name for name in document["limits"] if name not in limits]
     if unset:
         yield f'<p class="note">Limited by the code alone: {escape(", ".join(unset))}.</p>'
 
 
 def _verdict(rates: Mapping[str, Any]) -> str:
-    """The verdict on the rates, and what speaks against them."""
-    why = [text for key in ("reasons", "unknown") for text in rates.get(key, ()) if isinstance(text, str)]
-    return one_line(
-        f"{str(rates['verdict']).capitalize()}: {'; '.join(why) or 'wrong alarms are as rare as allowed'}.",
-        500,
-    )
+    """Return the verdict on the alarm rates, and the reasons against them."""
+    texts = [text for key in ("reasons", "unknown") for text in rates.get(key, ()) if isinstance(text, str)]
+    reasons = "; ".join(texts) or "wrong alarms are as rare as allowed"
+    return one_line(f"{str(rates['verdict']).capitalize()}: {reasons}.", 500)
 
 
-def _given(document: Mapping[str, Any]) -> dict[str, Entry]:
-    """The limits that limit something."""
+def _active_limits(document: Mapping[str, Any]) -> dict[str, Entry]:
+    """Return the limits that have a value."""
     entries = limit_entries(document)
-    return {name: one for name, one in entries.items() if document["limits"][name]["value"] is not None}
+    return {name: entry for name, entry in entries.items() if document["limits"][name]["value"] is not None}
 
 
 def is_shown(limit: str) -> bool:
-    """Whether a limit says something to people: what the watchdog's expectation is made of does not."""
+    """Return whether a limit is meaningful to people; fitted numbers of the watchdog are not."""
     return not limit.startswith(FITTED)
 
 
 def alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
-    """In words, how often the watchdog stops a good run and misses a bad one, and what it notices."""
+    """Yield texts on the rates of false and missed alarms, and on the errors that are noticed."""
     for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
-        one = rates.get(name)
-        if isinstance(one, Mapping) and {"runs", "alarms", "low", "high"} <= one.keys():
-            allowed = f", allowed {_number(one['allowed'], 2)}" if "allowed" in one else ""
-            interval = f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}{allowed}"
-            yield f"{name.replace('_', ' ')} {one['alarms']} of {one['runs']} {runs} ({interval})"
-    for one in rates.get("fault_runs", ()):
-        if isinstance(one, Mapping) and {"counted", "runs", "alarms", "low", "high", "error"} <= one.keys():
-            yield _faulty(one)
+        rate = rates.get(name)
+        if isinstance(rate, Mapping) and {"runs", "alarms", "low", "high"} <= rate.keys():
+            allowed = f", allowed {_number(rate['allowed'], 2)}" if "allowed" in rate else ""
+            interval = f"95 %: {_number(rate['low'], 2)} to {_number(rate['high'], 2)}{allowed}"
+            yield f"{name.replace('_', ' ')} {rate['alarms']} of {rate['runs']} {runs} ({interval})"
+    for rate in rates.get("fault_runs", ()):
+        if isinstance(rate, Mapping) and {"counted", "runs", "alarms", "low", "high", "error"} <= rate.keys():
+            yield _faulty(rate)
     noticed = rates.get("noticed_from")
     if isinstance(noticed, Mapping):
         yield from _noticed(noticed, rates)
@@ -265,21 +269,23 @@ def alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
         yield "no run was good: the limits come from runs with errors beyond the limit"
 
 
-def _faulty(one: Mapping[str, Any]) -> str:
-    """Return in words how often a fault of known size is missed."""
-    unit = "" if one["unit"] == "1" else f" {one['unit']}"
-    if not one["counted"]:
-        most = f"up to {_number(one['largest_size'], 2)}{unit}"
-        usable = f"{one['runs']} of {one['scenarios']} runs are good without it and just bad with it"
-        return f"{one['meaning']}, {most}: not counted, {usable}"
-    interval = (
-        f"95 %: {_number(one['low'], 2)} to {_number(one['high'], 2)}, allowed {_number(one['allowed'], 2)}"
+def _faulty(runs: Mapping[str, Any]) -> str:
+    """Return a text on how often a fault of known size is missed."""
+    unit = "" if runs["unit"] == "1" else f" {runs['unit']}"
+    if not runs["counted"]:
+        most = f"up to {_number(runs['largest_size'], 2)}{unit}"
+        usable = f"{runs['runs']} of {runs['scenarios']} runs are good without it and just bad with it"
+        return f"{runs['meaning']}, {most}: not counted, {usable}"
+    interval = f"95 %: {_number(runs['low'], 2)} to {_number(runs['high'], 2)}"
+    interval += f", allowed {_number(runs['allowed'], 2)}"
+    size = f"by {_number(runs['size'], 2)}{unit}, error {_number(runs['error'], 2)}"
+    return (
+        f"missed alarms {runs['alarms']} of {runs['runs']} runs with {runs['meaning']}, {size} ({interval})"
     )
-    size = f"by {_number(one['size'], 2)}{unit}, error {_number(one['error'], 2)}"
-    return f"missed alarms {one['alarms']} of {one['runs']} runs with {one['meaning']}, {size} ({interval})"
 
 
 def _noticed(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[str]:
+    """Yield texts on the smallest error that is noticed in 95 % of contacts."""
     if rates.get("widened_from") is not None:
         widened = f"{_number(rates['widened_from'], 2)} to {_number(rates['restitution_margin'], 2)}"
         yield f"restitution_margin widened from {widened}, or too many good runs would be stopped"
@@ -292,6 +298,7 @@ def _noticed(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[s
 def _table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] | None = None
 ) -> Iterator[str]:
+    """Yield the lines of an HTML table; columns `numbers` are right-aligned, by default all but the first."""
     right = set(range(1, len(heads)) if numbers is None else numbers)
     if numbers is None and "unit" in heads:
         right.discard(list(heads).index("unit"))
@@ -308,20 +315,24 @@ def _table(
 
 
 def _number(value: Any, digits: int = 4) -> str:
+    """Return a number as text, or a dash if it is none."""
     return f"{value:.{digits}g}" if isinstance(value, (int, float)) else "-"
 
 
 def _listed(values: Any, most: int = 4) -> str:
+    """Return numbers as text, at most `most` of them."""
     texts = [_number(value) for value in values]
     return ", ".join(texts[:most]) + (", ..." if len(texts) > most else "")
 
 
 def _flat(value: Any) -> Iterator[float]:
-    for one in value:
-        yield from _flat(one) if isinstance(one, (list, tuple)) else (one,)
+    """Yield the numbers of nested lists."""
+    for entry in value:
+        yield from _flat(entry) if isinstance(entry, (list, tuple)) else (entry,)
 
 
 def _is_span(value: Any) -> bool:
+    """Return whether a value is a range with numbers `low` and `high`."""
     return isinstance(value, Mapping) and all(
         isinstance(value.get(key), (int, float)) for key in ("low", "high")
     )

@@ -1,8 +1,8 @@
-"""A gain document as other programs read it: ROS 2 parameters, MATLAB, CSV, C99.
+"""Gain documents in the formats of other programs: ROS 2 parameters, MATLAB, CSV, C99.
 
-`WRITERS` holds them by the name that `--format` takes; each makes files, by their paths in the bundle, of a
-checked gain document. Numbers come back as the same doubles; a limit of null as what it means. To add
-a format is one function here and its entry in `WRITERS`.
+`WRITERS` maps the names of `--format` to functions, which return the content of files by path for a checked
+gain document. Numbers are written so that the same doubles are read back; a limit of null is written as its
+default. A new format needs one function and its entry in `WRITERS`.
 """
 
 import csv
@@ -21,35 +21,34 @@ _MAT_HEADER = b"MATLAB 5.0 MAT-file, made by jaxhil export"
 
 
 class Entry(NamedTuple):
-    """A gain or a limit."""
+    """Gain or limit."""
 
     value: float  # [SI]
-    unit: str  # of the value
-    lower: float | None = None  # bound; None for a limit, which has none
-    upper: float | None = None  # likewise
+    unit: str  # unit of the value and its bounds
+    lower: float | None = None  # lower bound; None for a limit, which has no bounds
+    upper: float | None = None  # upper bound; None for a limit
 
 
 def gain_entries(document: Mapping[str, Any]) -> dict[str, Entry]:
-    """The document's gains by name."""
+    """Return the document's gains by name."""
     return {
-        name: Entry(float(one["value"]), one["unit"], float(one["lower"]), float(one["upper"]))
-        for name, one in document["gains"].items()
+        name: Entry(float(gain["value"]), gain["unit"], float(gain["lower"]), float(gain["upper"]))
+        for name, gain in document["gains"].items()
     }
 
 
 def limit_entries(document: Mapping[str, Any]) -> dict[str, Entry]:
-    """The document's limits by name; none in a document without."""
+    """Return the document's limits by name; an empty dictionary if it has none."""
     return {
-        name: Entry(_limit(name, one["value"]), one["unit"])
-        for name, one in document.get("limits", {}).items()
+        name: Entry(_limit(name, limit["value"]), limit["unit"])
+        for name, limit in document.get("limits", {}).items()
     }
 
 
 def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """A ROS 2 parameter file: `/jaxhil_controller: ros__parameters:`, gains and limits by nested names.
+    """Return a ROS 2 parameter file: `/jaxhil_controller: ros__parameters:` with nested names.
 
-    Every number is a double to ROS 2 (it has a decimal point), every text is quoted: neither can be taken for
-    another type.
+    Every number has a decimal point and every text is quoted, so that ROS 2 reads them as double and string.
     """
     import yaml
 
@@ -57,7 +56,7 @@ def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
         pass
 
     class Text(str):
-        """A value, as against a name."""
+        """Quoted value, unlike an unquoted name."""
 
     Dumper.add_representer(
         Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", str(text), style='"')
@@ -68,15 +67,15 @@ def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
         "control_period": float(document["control_period"]),
         "mechanism": Text(document["mechanism"]["name"]),
         "sha256": Text(document["sha256"]),
-        "gains": {name: one.value for name, one in gains.items()},
-        "limits": {name: one.value for name, one in limits.items()},
+        "gains": {name: entry.value for name, entry in gains.items()},
+        "limits": {name: entry.value for name, entry in limits.items()},
         "units": {
             "control_period": Text("s"),
-            "gains": {name: Text(one.unit) for name, one in gains.items()},
-            "limits": {name: Text(one.unit) for name, one in limits.items()},
+            "gains": {name: Text(entry.unit) for name, entry in gains.items()},
+            "limits": {name: Text(entry.unit) for name, entry in limits.items()},
         },
     }
-    # ROS 2 takes no empty table.
+    # ROS 2 refuses empty tables.
     tables = {NODE: {"ros__parameters": _without_empty(parameters)}}
     text = yaml.dump(tables, Dumper=Dumper, sort_keys=False, default_flow_style=False, width=1000)
     heading = f"# Parameters of the compensator {document['compensator']}, in SI units.\n"
@@ -84,8 +83,11 @@ def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def matlab(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """`gains.mat`: a struct `jaxhil` with fields compensator, control_period, mechanism, sha256, gains,
-    limits; each gain and limit is a struct of value, unit and, for gains, lower and upper."""
+    """Return `gains.mat` with a struct `jaxhil`.
+
+    Its fields are compensator, control_period, mechanism, sha256, gains and limits; each gain and limit is a
+    struct with value, unit and, for gains, lower and upper.
+    """
     from scipy.io import savemat
 
     gains, limits = gain_entries(document), limit_entries(document)
@@ -94,8 +96,8 @@ def matlab(document: Mapping[str, Any]) -> dict[str, bytes]:
         "control_period": float(document["control_period"]),
         "mechanism": document["mechanism"]["name"],
         "sha256": document["sha256"],
-        "gains": {name: one._asdict() for name, one in gains.items()} or np.empty((0, 0)),
-        "limits": {name: {"value": one.value, "unit": one.unit} for name, one in limits.items()}
+        "gains": {name: entry._asdict() for name, entry in gains.items()} or np.empty((0, 0)),
+        "limits": {name: {"value": entry.value, "unit": entry.unit} for name, entry in limits.items()}
         or np.empty((0, 0)),
     }
     for name in (*gains, *limits):
@@ -104,27 +106,27 @@ def matlab(document: Mapping[str, Any]) -> dict[str, bytes]:
             raise InputError(f"matlab: {shown(name)}: found {len(name)} characters, {allowed}")
     file = io.BytesIO()
     savemat(file, {"jaxhil": content}, format="5", long_field_names=True, oned_as="row")
-    # The file begins with a text of 116 characters, in which SciPy writes the date: equal gains, equal files.
+    # SciPy writes the date into the first 116 characters; without it, equal gains give equal files.
     return {"gains.mat": _MAT_HEADER.ljust(116) + file.getvalue()[116:]}
 
 
 def csv_table(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """`gains.csv`: name, value, unit, lower, upper; limits under `limits.NAME`, without bounds."""
+    """Return `gains.csv`: name, value, unit, lower, upper; limits are named `limits.NAME`, without bounds."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("name", *Entry._fields))
     entries = {
         "control_period": Entry(float(document["control_period"]), "s"),
         **gain_entries(document),
-        **{f"limits.{name}": one for name, one in limit_entries(document).items()},
+        **{f"limits.{name}": entry for name, entry in limit_entries(document).items()},
     }
-    for name, one in entries.items():
-        writer.writerow((name, *(_cell(value) for value in one)))
+    for name, entry in entries.items():
+        writer.writerow((name, *(_cell(value) for value in entry)))
     return {"gains.csv": text.getvalue().encode("ascii")}
 
 
 def c99(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """The controller in C99, in the folder `c99`. Raises `InputError` for a law that has no C."""
+    """Return the controller in C99, in the folder `c99`. Raise `InputError` if it has no C code."""
     from tuning.bundle.c99 import c99_texts
 
     return {f"c99/{name}": text.encode("ascii") for name, text in c99_texts(document).items()}
@@ -139,18 +141,20 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
 
 
 def _limit(name: str, value: float | None) -> float:
-    # Null is what holds without the limit.
+    """Return the value of a limit; for null its default, which has no effect."""
     return LIMITS[name].default if value is None else float(value)
 
 
 def _cell(value: float | str | None) -> str:
+    """Return a table cell as text; empty for None."""
     if value is None or isinstance(value, str):
         return value or ""
     return repr(value)
 
 
 def _without_empty(value: Any) -> Any:
+    """Return nested dictionaries without the empty ones."""
     if not isinstance(value, dict):
         return value
-    inner = {key: _without_empty(one) for key, one in value.items()}
-    return {key: one for key, one in inner.items() if one != {}}
+    inner = {key: _without_empty(item) for key, item in value.items()}
+    return {key: item for key, item in inner.items() if item != {}}

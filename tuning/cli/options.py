@@ -1,4 +1,4 @@
-"""The options of each command of `jaxhil`, as tyro reads them."""
+"""Options of the commands of `jaxhil`, read by tyro."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -32,35 +32,36 @@ DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
 @dataclass(frozen=True)
 class Init:
-    """Write a mechanism file to start from: every key with its meaning, unit, range and default.
+    """Write a mechanism file to start from, with the meaning, unit, range and default of every key.
 
     Example: jaxhil init rig-300kg --output my-rig.toml
 
-    It is never written over a file that is there.
+    An existing file is never overwritten.
     """
 
     name: Annotated[
         Positional[str | None],
         text(
-            "[NAME]", "Built-in mechanism whose values it has, by default 'varying'; or the file, NAME.toml."
+            "[NAME]",
+            "Built-in mechanism to copy the values from, by default 'varying'; or the file, NAME.toml.",
         ),
     ] = None
-    output: Annotated[str | None, text("FILE", "The file; by default mechanism.toml.", aliases=("-o",))] = (
-        None
-    )
-    list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names, writing nothing.")] = False
+    output: Annotated[
+        str | None, text("FILE", "File to write; by default mechanism.toml.", aliases=("-o",))
+    ] = None
+    list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names; write nothing.")] = False
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
 class Simulate:
-    """Run the contacts once; per contact restitution, reference, error, peak force, duration.
+    """Run the contacts once; report restitution, reference, error, peak force and duration of each.
 
     Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
 
-    Exit code 0 if every |e - e*| is within the limit, and every real contact's peak force at most 2 times and
-    its duration 0.5 to 2 times that of the ideal contact, else 1.
+    Exit code 0 if every |e - e*| is within the limit, every real contact's peak force is at most 2 times, and
+    its duration 0.5 to 2 times that of the ideal contact; otherwise 1.
     """
 
     file: OptionalFile = None
@@ -75,15 +76,15 @@ class Simulate:
     animate: Annotated[
         str | None,
         text(
-            "FILM", "Of a mechanism of six axes: the contact in space beside that on the rig, .gif or .mp4."
+            "FILM", "Six axes: animate the ideal contact beside the one on the rig, to a .gif or .mp4 file."
         ),
     ] = None
     log: Annotated[
         str | None,
-        text("FILE", "Write every tick to a CSV file; of one axis it is a rig's log, which identify reads."),
+        text("FILE", "Write every tick to a CSV file; for one axis it is a log that identify reads."),
     ] = None
     reference: Annotated[
-        bool, arg(help="Of a mechanism of six axes: the two bodies in space alone, without the rig.")
+        bool, arg(help="Six axes: simulate only the ideal contact of the two bodies, without the rig.")
     ] = False
     limit: Limit = 0.01
     seed: Annotated[int, number("Seed of the sensor noise.")] = 0
@@ -93,18 +94,18 @@ class Simulate:
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(TuneOptions):
-    """Tune a compensator's gains for every mechanism; judge them on scenarios that tuning never saw.
+    """Tune a compensator's gains for every mechanism; evaluate them on fresh scenarios.
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with the noise
-    of the sensors or without, or more than 1 % of the real contacts have more than 2 times the ideal
-    contact's peak force, or less than 0.5 or more than 2 times its duration. Warns of commands that peak
-    beyond 1.5 ideal peaks, and of noise amplified more than twice.
+    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with or without
+    sensor noise, or if more than 1 % of the real contacts have a peak force above 2 times, or a duration
+    below 0.5 or above 2 times that of the ideal contact. Warns if the force command peaks above 1.5 ideal
+    peaks, or amplifies the sensor noise more than twice.
     """
 
     files: Files = ()
-    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out"
+    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out"
     overrides: Overrides = ()
     unset: Unset = ()
     resume: Resume = False
@@ -114,11 +115,12 @@ class Tune(TuneOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(SweepOptions):
-    """Monte Carlo robustness: how probable is a failure, how close do the worst scenarios come to one?
+    """Monte Carlo robustness: the probability of failure, and the worst scenarios.
 
     Example: jaxhil sweep jaxhil-out/varying/gains.json --scenarios 1000000 --output study/sweep
 
-    Exit code 0 if no scenario failed or, with --acceptable, if the interval ends below it; else 1.
+    Exit code 0 if no scenario failed or, with --acceptable, if the confidence interval ends below it;
+    otherwise 1.
     """
 
     gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
@@ -126,7 +128,7 @@ class Sweep(SweepOptions):
         str | None,
         text(
             "DIR",
-            "Folder of the store; by default beside the gain file and named by it: NAME-sweep for NAME.json.",
+            "Folder of the store; by default NAME-sweep beside the gain file NAME.json.",
             aliases=("-o",),
         ),
     ] = None
@@ -136,7 +138,7 @@ class Sweep(SweepOptions):
 
 @dataclass(frozen=True)
 class Replay:
-    """Run one scenario of a sweep again, and see whether it does the same, to the bit.
+    """Run one scenario of a sweep again, and check that all its numbers are the same to the last bit.
 
     Example: jaxhil replay jaxhil-out/varying/gains-sweep 1234 --plot worst.png
 
@@ -155,20 +157,20 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(CompareOptions):
-    """Compensators, each tuned to its best, on the same fresh scenarios, with intervals.
+    """Compare compensators, each tuned, on the same fresh scenarios, with confidence intervals.
 
-    Those with settings for any mechanism are judged with these, untuned.
+    Compensators with settings for any mechanism use these settings, untuned.
 
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
-    Writes DIR/compare.json, with every figure and all gains, and pictures.
+    Writes DIR/compare.json with all metrics and gains, and plots.
     """
 
     files: Files = ()
     suites: Annotated[
-        FlagCreatePairsOff[bool], text(None, "The standard suites, besides what files are given.")
+        FlagCreatePairsOff[bool], text(None, "Also the standard suites, in addition to the files.")
     ] = False
-    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/compare"
+    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out/compare"
     overrides: Overrides = ()
     unset: Unset = ()
     resume: Resume = False
@@ -178,13 +180,13 @@ class Compare(CompareOptions):
 
 @dataclass(frozen=True)
 class Mechanisms:
-    """The built-in mechanism files, with their sources and paths.
+    """List the built-in mechanism files, with their sources and paths.
 
     Example: jaxhil mechanisms --json
     """
 
     schema: Annotated[
-        FlagCreatePairsOff[bool], text(None, "Instead the JSON Schema of mechanism files, for editors.")
+        FlagCreatePairsOff[bool], text(None, "Print the JSON Schema of mechanism files instead, for editors.")
     ] = False
     json: Json = False
     timings: Timings = False

@@ -1,4 +1,4 @@
-"""The options of `jaxhil map` and `jaxhil report`, as tyro reads them."""
+"""Options of `jaxhil map` and `jaxhil report`, read by tyro."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -24,52 +24,53 @@ AXIS = "PATH[=LOW:HIGH]"
 
 @dataclass(frozen=True, kw_only=True)
 class Map(MapOptions):
-    """Stability map: the restitution error over two keys, its contours, and what theory says there.
+    """Stability map: the restitution error over two keys, its contours, and closed-form theory.
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
 
-    Writes DIR/map.json and DIR/map.png. The gains are the nominal ones at every point.
+    Writes DIR/map.json and DIR/map.png. Every point uses the gains of the nominal mechanism.
     """
 
     x: Annotated[
         str,
         text(
             AXIS,
-            "Key along x, in SI units, or gains.NAME. Without ends: what is drawn of it, else 0.3 to 3 times "
-            "its value; of a gain its bounds.",
+            "Key along x, in SI units, or gains.NAME. Default range: the key's uncertainty, else 0.3 to 3 "
+            "times its value; for a gain its bounds.",
         ),
     ]
-    y: Annotated[str, text(AXIS, "Key along y, likewise.")]
+    y: Annotated[str, text(AXIS, "Key along y, like x.")]
     file: OptionalFile = None
     compensator: CompensatorName = None
     setting: Setting = None
     gains: GainSource = None
     overrides: Overrides = ()
     unset: Unset = ()
-    output: Annotated[str, folder("Folder for what is written.")] = "jaxhil-out/map"
+    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out/map"
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
 class Report:
-    """One HTML page for a review board, of what identify, tune, sweep, compare, map and export wrote.
+    """Write one HTML page for a review board from the results of the other commands.
 
     Example: jaxhil report jaxhil-out/varying jaxhil-out/varying/gains-sweep jaxhil-out/bundle
 
-    It needs nothing else, and is readable without JavaScript and on paper. Exit code 1 if its verdict is bad.
+    The page needs no other file, and is readable without JavaScript and on paper. Exit code 1 if its verdict
+    is bad.
     """
 
     results: Annotated[
         Positional[tuple[str, ...]],
         text(
             "RESULT [RESULT ...]",
-            "Results of one mechanism, at most one of each command: folders or files; of monitor what --json "
-            "printed.",
+            "Results for one mechanism, at most one of each command: folders or files; for monitor the "
+            "output of --json.",
         ),
     ] = ()
-    output: Annotated[str, text("FILE", "The page; by default jaxhil-out/report.html.", aliases=("-o",))] = (
-        "jaxhil-out/report.html"
-    )
+    output: Annotated[
+        str, text("FILE", "File of the page; by default jaxhil-out/report.html.", aliases=("-o",))
+    ] = "jaxhil-out/report.html"
     json: Json = False
     timings: Timings = False

@@ -1,6 +1,6 @@
-"""The command line `jaxhil`: which command was meant, and which module acts on it.
+"""Parser of the command line `jaxhil`, which selects the module that runs the command.
 
-Neither `--help` nor a wrong argument imports jax: the commands' modules are imported when they run.
+Neither `--help` nor a wrong argument imports jax: a command's module is imported when it runs.
 """
 
 import importlib
@@ -32,9 +32,9 @@ from tuning.front_door.sweep_options import DEFAULT_DRIVERS
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 
-To begin: jaxhil init mine.toml, then jaxhil tune mine.toml. More of a command: jaxhil COMMAND --help.
+To begin: jaxhil init mine.toml, then jaxhil tune mine.toml. Help for a command: jaxhil COMMAND --help.
 
-jaxhil --version says which version this is. Completion by the Tab key, for bash (or zsh, tcsh):
+jaxhil --version prints the version. Completion by the Tab key, for bash (or zsh, tcsh):
 jaxhil --tyro-write-completion bash ~/.local/share/bash-completion/completions/jaxhil"""
 
 Command = (
@@ -56,15 +56,15 @@ Command = (
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """The command that the arguments ask for, ready to run; it returns the exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:
+    """Parse the arguments and return the command as a function, which returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
         return _print_version
     options = tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
         prog="jaxhil",
         description=DESCRIPTION,
-        args=complete_bare(given),
+        args=complete_bare(words),
     )
 
     def run() -> int:
@@ -76,18 +76,19 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
 
 def _print_version() -> int:
+    """Print the version of the package and return exit code 0."""
     print(f"jaxhil {metadata.version('jaxhil')}")
     return 0
 
 
 def complete_bare(arguments: list[str]) -> list[str]:
-    """A `--plot`, `--drivers` or `--rare` that no value follows gets the default one."""
+    """Add the default value to each `--plot`, `--drivers` or `--rare` without a value."""
     completed = []
-    own = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
-    plot = own.get(arguments[0], DEFAULT_PLOT) if arguments else DEFAULT_PLOT
-    for place, word in enumerate(arguments):
+    default_plots = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
+    plot = default_plots.get(arguments[0], DEFAULT_PLOT) if arguments else DEFAULT_PLOT
+    for index, word in enumerate(arguments):
         completed.append(word)
-        following = arguments[place + 1] if place + 1 < len(arguments) else ""
+        following = arguments[index + 1] if index + 1 < len(arguments) else ""
         if word == "--plot" and not following.lower().endswith(PICTURES):
             completed.append(plot)
         elif word in ("--drivers", "--rare") and not _is_number(following):
@@ -96,6 +97,7 @@ def complete_bare(arguments: list[str]) -> list[str]:
 
 
 def _is_number(word: str) -> bool:
+    """Return whether a word is a number."""
     try:
         float(word)
     except ValueError:

@@ -1,6 +1,6 @@
-"""Where the time of a command went: importing, making programs, reading kept ones, and all the rest.
+"""Time of a command by kind of work: imports, compilation, reading of cached programs, and the rest.
 
-Of what overlaps, as a program that is traced within another, the time counts once.
+Overlapping times, such as a program traced within another, are counted once.
 """
 
 import builtins
@@ -11,21 +11,21 @@ from contextlib import contextmanager
 
 from tuning import terminal
 
-# What jax tells of its programs, by the names of its events.
+# Kind of work of jax's monitoring events.
 EVENTS = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "tracing",
     "/jax/core/compile/backend_compile_duration": "compiling",
     "/jax/compilation_cache/cache_retrieval_time_sec": "reading kept programs",
 }
-# In this order: what lies within one before is not of one after.
+# Kinds by priority: time that counts for one kind does not count for a later one.
 KINDS = ("importing", "reading kept programs", "compiling", "tracing")
 Span = tuple[float, float]
 
 
 @contextmanager
 def measured(wanted: bool) -> Iterator[None]:
-    """Say on standard error where the time within went, if that is wanted."""
+    """Report on standard error how the time within the context was spent, if wanted."""
     if not wanted:
         yield
         return
@@ -38,20 +38,20 @@ def measured(wanted: bool) -> Iterator[None]:
 
 
 def said(begun: float, ended: float, spans: dict[str, list[Span]]) -> str:
-    """The shares in words, the largest first [s]."""
+    """Return a text with the time of each kind of work [s], the largest first."""
     shares, counted, before = {}, [], 0.0
     for kind in KINDS:
         counted += spans[kind]
         together = covered(counted)
         shares[kind], before = together - before, together
     shares["all else"] = max(ended - begun - before, 0.0)
-    parts = sorted(shares.items(), key=lambda one: -one[1])
+    parts = sorted(shares.items(), key=lambda part: -part[1])
     listed = ", ".join(f"{kind} {seconds:.2f} s" for kind, seconds in parts if seconds >= 0.005)
     return f"{ended - begun:.2f} s in all: {listed}"
 
 
 def covered(spans: list[Span]) -> float:
-    """How much time intervals cover together [s]."""
+    """Return the length of the union of time intervals [s]."""
     total, until = 0.0, float("-inf")
     for begin, end in sorted(spans):
         total += max(0.0, end - max(begin, until))
@@ -61,7 +61,7 @@ def covered(spans: list[Span]) -> float:
 
 @contextmanager
 def _imports(spans: dict[str, list[Span]]) -> Iterator[None]:
-    """Note the times of imports and, from when jax is there, of what it tells."""
+    """Record the times of imports and, once jax is imported, of its events in `spans`."""
     plain, listening = builtins.__import__, []
 
     def listen() -> None:
@@ -74,13 +74,13 @@ def _imports(spans: dict[str, list[Span]]) -> Iterator[None]:
             now = time.monotonic()
             spans[EVENTS[event]].append((now - seconds, now))
 
-    def timed(name: str, *others, **more):
+    def timed(name: str, *arguments, **keywords):
         begun = time.monotonic()
         try:
-            return plain(name, *others, **more)
+            return plain(name, *arguments, **keywords)
         finally:
             ended = time.monotonic()
-            if ended - begun > 1e-4:  # the module was not there yet
+            if ended - begun > 1e-4:  # the module was imported for the first time
                 spans["importing"].append((begun, ended))
             listen()
 

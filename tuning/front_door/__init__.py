@@ -1,6 +1,5 @@
-"""The functions that `import tuning` offers, one a file: `tune`, `sweep`, `compare`, `map`,
-`export`, `verify` and `report`.
+"""Functions behind `import tuning`, one per module.
 
-They compute what the commands of those names compute and return it; the commands print it. Arguments are
-checked before jax is imported, and whatever is wrong with one is an `InputError` of one line.
+They compute and return what the commands of the same names print. Arguments are checked before jax is
+imported; an unusable argument raises `InputError` with a message of one line.
 """

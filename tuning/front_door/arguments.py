@@ -1,6 +1,7 @@
-"""Arguments of the front door's functions: each checked, and refused in one line if it will not do.
+"""Checks of the arguments of public functions; each raises an error with a message of one line.
 
-The same line serves function and command: an `ArgumentError` knows how its argument is called as an option.
+The same message serves the function and the command: an `ArgumentError` also has a text with the option's
+name.
 """
 
 import functools
@@ -30,17 +31,20 @@ SIX_AXES = names(6)
 
 
 class ArgumentError(InputError):
-    """An unusable argument: "name: found X, allowed Y"; `option` says it of the command's option. Where an
-    argument holds several things, `which` of them is meant comes after the name."""
+    """Error for an unusable argument: "name: found X, allowed Y".
+
+    `option` is the text for the command's option. `which` names the entry of an argument with several values.
+    """
 
     def __init__(self, name: str, found: str, allowed: str, which: str = ""):
+        """Create the error from the argument's name, the value found and the allowed values, in words."""
         text = f"{f': {which}' if which else ''}: found {found}, allowed {allowed}"
         super().__init__(name + text)
         self.option = f"--{name.replace('_', '-')}{text}"
 
 
 def entry(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function of the front door: what the system refuses is an `InputError` too."""
+    """Decorate a public function, so that an `OSError` in it becomes an `InputError`."""
 
     @functools.wraps(function)
     def called(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
@@ -53,9 +57,9 @@ def entry(function: Callable[Parameters, Result]) -> Callable[Parameters, Result
     return called
 
 
-def integers(least: int, most: int | None = None, **given: Any) -> None:
-    """Every argument given is an integer, `least` <= it <= `most`."""
-    for name, value in given.items():
+def integers(least: int, most: int | None = None, **values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is an integer from `least` to `most`."""
+    for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise ArgumentError(name, shown(value), f"an integer >= {least}")
         if value < least:
@@ -64,40 +68,40 @@ def integers(least: int, most: int | None = None, **given: Any) -> None:
             raise ArgumentError(name, str(value), f"at most {most}")
 
 
-def one_of(allowed: Sequence[str], **given: Any) -> None:
-    """Every argument given is one of the `allowed` names."""
-    for name, value in given.items():
+def one_of(allowed: Sequence[str], **values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is one of the `allowed` names."""
+    for name, value in values.items():
         if value not in allowed:
             raise ArgumentError(name, shown(value), ", ".join(allowed))
 
 
 def limit(value: Any) -> None:
-    """A limit of the restitution error is a number >= 0; infinite where there is none."""
+    """Raise `ArgumentError` unless a limit of the restitution error is a number >= 0; it may be infinite."""
     if not is_number(value) or math.isnan(value) or value < 0:
         raise ArgumentError("limit", str(value) if is_number(value) else shown(value), "a number >= 0")
 
 
-def flags(**given: Any) -> None:
-    """Every argument given is true or false."""
-    for name, value in given.items():
+def flags(**values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is true or false."""
+    for name, value in values.items():
         if not isinstance(value, bool):
             raise ArgumentError(name, shown(value), "true or false")
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a real number, of Python or of NumPy."""
+    """Return whether a value is an `int` or `float` (also NumPy's `float64`), and not a `bool`."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def compensators(names: Iterable[Any], argument: str = "compensator") -> None:
-    """Every name is a compensator's, built in or registered."""
-    known = compensator_names()
+    """Raise `ArgumentError` unless every name is a compensator, built in or registered."""
+    allowed = compensator_names()
     for name in names:
-        one_of(known, **{argument: name})
+        one_of(allowed, **{argument: name})
 
 
 def fits(compensator: Any, mechanism: AnyMechanism | None, argument: str = "compensator") -> None:
-    """The name is that of a compensator of the mechanism's axes; of some axes where there is none yet."""
+    """Raise `ArgumentError` unless the compensator supports the mechanism's axes, or any if it is None."""
     if mechanism is None:
         one_of(tuple(dict.fromkeys([*compensator_names(), *SIX_AXES])), **{argument: compensator})
     elif not isinstance(mechanism, SixAxisMechanism):
@@ -107,22 +111,25 @@ def fits(compensator: Any, mechanism: AnyMechanism | None, argument: str = "comp
         raise ArgumentError(argument, shown(compensator), allowed)
 
 
-def not_in_six_axes(mechanism: AnyMechanism, **given: Any) -> None:
-    """Nothing is given, or asked for, that six axes do not have yet."""
-    for name, value in given.items():
+def not_in_six_axes(mechanism: AnyMechanism, **values: Any) -> None:
+    """Raise `ArgumentError` if the mechanism has six axes and any of the arguments is set."""
+    for name, value in values.items():
         if isinstance(mechanism, SixAxisMechanism) and value:
             found = "a function" if callable(value) else shown(value)
             raise ArgumentError(name, found, "nothing: in six axes there is none so far")
 
 
 def compensator_names() -> tuple[str, ...]:
-    """Of all compensators, the registered ones last. Starts no jax where there are none."""
+    """Return the names of all compensators, the registered ones last.
+
+    This does not import jax: registered compensators exist only if jax is already imported.
+    """
     loaded = sys.modules.get("jaxhil.laws.compensators")
     return tuple(dict.fromkeys([*names(), *(loaded.COMPENSATORS if loaded else ())]))
 
 
 def setting(compensator: str, value: Any) -> None:
-    """The compensator has a setting of that name, if one is given. Imports jax then."""
+    """Raise `ArgumentError` unless a given setting is one of the compensator's. This may import jax."""
     if value is None:
         return
     from jaxhil.laws.compensators import compensator_of
@@ -134,44 +141,54 @@ def setting(compensator: str, value: Any) -> None:
 
 
 def several(given: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
-    """What is given as a list, one of the `kinds` alone being a list of one; whether it was a list."""
+    """Return a value as a list, and whether it was a list.
+
+    A value of one of the `kinds`, a mapping, or a value that is not iterable becomes a list of one entry.
+    """
     if isinstance(given, kinds) or not isinstance(given, Iterable) or isinstance(given, Mapping):
         return [given], False
     return list(given), True
 
 
 def folder(name: str, value: Any) -> Path:
-    """A path, whatever is there."""
+    """Return a path, which need not exist. Raise `ArgumentError` if the value is not a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise ArgumentError(name, shown(value), "a path")
     return Path(value)
 
 
 def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
-    """The mechanisms of one axis given, one or several, each as `jaxhil.load` returns it or by its name or
-    file; whether there were several. Raises `InputError`."""
-    listed, many = _listed(given)
-    checked = [as_mechanism(one) for one in listed]
-    return [LoadedMechanism(one, source_sha256(one), one.name) for one in checked], many
+    """Return one-axis mechanisms as a list, and whether several were given.
+
+    Each is given as the result of `jaxhil.load`, or as a name or path that it accepts. Raise `InputError`.
+    """
+    listed, is_list = _listed(given)
+    checked = [as_mechanism(value) for value in listed]
+    return [
+        LoadedMechanism(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked
+    ], is_list
 
 
 def any_mechanisms(given: Any) -> tuple[list[LoadedAny], bool]:
-    """Likewise, of one axis or of six."""
-    listed, many = _listed(given)
-    checked = [as_any_mechanism(one) for one in listed]
-    return [LoadedAny(one, source_sha256(one), one.name) for one in checked], many
+    """Return mechanisms with one axis or six as a list, like `mechanisms`."""
+    listed, is_list = _listed(given)
+    checked = [as_any_mechanism(value) for value in listed]
+    return [LoadedAny(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked], is_list
 
 
-def _listed(given: Any) -> tuple[list[Any], bool]:
-    listed, many = several(given, (Mechanism, SixAxisMechanism, str, os.PathLike))
+def _listed(value: Any) -> tuple[list[Any], bool]:
+    """Return mechanisms as a list, and whether it was a list. Raise `ArgumentError` for an empty one."""
+    listed, is_list = several(value, (Mechanism, SixAxisMechanism, str, os.PathLike))
     if not listed:
         raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
-    return listed, many
+    return listed, is_list
 
 
 def gain_file(given: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
-    """The gains given: a gain file's path, or its folder's, or what has a gain file's `document`; of one
-    axis, unless `any_axes` will do."""
+    """Return the loaded gains of a path, a folder, or an object with a gain file's `document`.
+
+    Six axes are accepted only with `any_axes`.
+    """
     from jaxhil.simulation.gain_file import check_document, load_gain_file
 
     document = getattr(given, "document", None)
@@ -182,7 +199,7 @@ def gain_file(given: Any, argument: str = "gains", any_axes: bool = False) -> "L
 
 
 def readable_gain_file(given: Any, argument: str = "gains") -> Path:
-    """The gain file at `given`, or in the folder there. Raises `InputError` if it cannot be read at all."""
+    """Return the path of a gain file, given itself or its folder. Raise `InputError` if it is unreadable."""
     try:
         path = folder(argument, given)
         if path.is_dir():
@@ -199,7 +216,7 @@ def readable_gain_file(given: Any, argument: str = "gains") -> Path:
 
 
 def runtime(compensator: str) -> None:
-    """The law can run on the rig. Raises `InputError` for one that was registered without a runtime."""
+    """Raise `InputError` if the compensator was registered without a runtime for the rig."""
     from jaxhil.rig import COMPENSATORS
 
     if compensator not in COMPENSATORS:

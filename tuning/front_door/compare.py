@@ -1,4 +1,4 @@
-"""`tuning.compare`: several compensators, each tuned to its own best, judged on the same fresh scenarios."""
+"""Function `tuning.compare`: compares compensators, each tuned, on the same fresh scenarios."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,31 +21,34 @@ if TYPE_CHECKING:
 
 
 class Estimated(float):
-    """A number with an interval of 95 %, from `low` to `high`."""
+    """Number with a 95 % confidence interval from `low` to `high`."""
 
     low: float
     high: float
 
     def __new__(cls, value: float, low: float, high: float) -> "Estimated":
-        made = super().__new__(cls, value)
-        made.low, made.high = low, high
-        return made
+        """Create a number with its interval."""
+        number = super().__new__(cls, value)
+        number.low, number.high = low, high
+        return number
 
     @property
     def value(self) -> float:
-        """The number alone."""
+        """Return the number without its interval."""
         return float(self)
 
 
 @dataclass(frozen=True)
 class Board:
-    """What `compare` returns of one mechanism.
+    """Result of `compare` for one mechanism.
 
-    document: all that is known of it, as in `jaxhil compare --json` under `mechanisms`.
-    figures: by law, then by its gains ("literature", "tuned", or a setting's name), with rms, p99, worst,
-        early, late, slope, peak and more, each a number with `low` and `high`.
-    gains: by law, then by name as in `figures`: the gains [SI units].
-    winners: of each figure the law that is better than every other by more than the intervals, or None.
+    Attributes:
+        document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
+        figures: metrics by compensator, then by its gains ("literature", "tuned", or a setting's name), with
+            rms, p99, worst, early, late, slope, peak and more, each a number with `low` and `high`.
+        gains: gains [SI units] by compensator, by the same names as in `figures`, then by gain.
+        winners: for each metric the compensator that is better than all others by more than the confidence
+            intervals, or None.
     """
 
     document: dict[str, Any]
@@ -60,14 +63,14 @@ class CompareOptions:
 
     compensators: Annotated[
         tuple[str, ...],
-        text("NAME [NAME ...]", "Compensators to compare; by default all that are published and our own."),
+        text("NAME [NAME ...]", "Compensators to compare; by default all built-in ones."),
     ] = ()
     untuned: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "Tune nothing: judge the literature's gains, and a compensator's settings, as they are."),
+        text(None, "Tune nothing: evaluate the literature's gains and the compensators' settings."),
     ] = False
     scenarios: Annotated[int, number("Scenarios to tune on."), Allowed(1)] = 32
-    judged: Annotated[int, number("Fresh scenarios to judge on."), Allowed(2)] = 256
+    judged: Annotated[int, number("Fresh scenarios for the evaluation."), Allowed(2)] = 256
     limit: Annotated[
         float, arg(metavar="NUMBER", help="Restitution error that counts as a failure."), AnyLimit
     ] = 0.01
@@ -75,7 +78,7 @@ class CompareOptions:
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Check all options. Raises `InputError`."""
+        """Check all options. Raise `InputError`."""
         check_options(self)
         arguments.compensators(self.laws, "compensators")
 
@@ -94,35 +97,35 @@ def compare(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Compensators for a mechanism, each tuned to its best, on the same fresh scenarios, with intervals.
+    """Compare compensators for a mechanism, each tuned, on the same fresh scenarios, with intervals.
 
-    The figures are those of `jaxhil compare`. They are computed in this process, where that command starts
-    one for each core.
+    The metrics equal those of `jaxhil compare`. They are computed in this process; the command starts a
+    process for each core.
 
     Args:
-        mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those.
-        compensators: names of laws, built in or registered; by default all that are published and our own.
-            Laws with settings are judged with these, the others tuned.
-        progress: say on standard error what is going on.
-    OPTIONS
+        mechanism: result of `jaxhil.load`, or a name or path that it accepts; or a list of these.
+        compensators: names of compensators, built in or registered; by default all built-in ones.
+            Compensators with settings use these, the others are tuned.
+        progress: report the progress on standard error.
+        **options: OPTIONS
 
     Returns:
-        A `Board`; a list of them for a list of mechanisms.
+        A `Board`, or a list of them for a list of mechanisms.
 
     Raises:
-        InputError: one line, for an argument that will not do.
+        InputError: If an argument is unusable; the message has one line.
     """
-    loaded, several = arguments.mechanisms(mechanism)
-    asked = CompareOptions(compensators=tuple(_names(compensators)), **options)
-    asked.check()
+    loaded, is_list = arguments.mechanisms(mechanism)
+    settings = CompareOptions(compensators=tuple(_names(compensators)), **options)
+    settings.check()
     arguments.flags(progress=progress)
     check_names(loaded)
-    found: dict[str, dict[str, LawFigures]] = {one.mechanism.name: {} for one in loaded}
-    with computing(), terminal.progress(len(loaded) * len(asked.laws), "results", progress) as bar:
-        for one in compare_each(loaded, asked, 0, bar):
-            found[one.mechanism][one.law] = one
-        boards = [board(one, asked, found[one.mechanism.name]) for one in loaded]
-    return boards if several else boards[0]
+    results: dict[str, dict[str, LawFigures]] = {entry.mechanism.name: {} for entry in loaded}
+    with computing(), terminal.progress(len(loaded) * len(settings.laws), "results", progress) as bar:
+        for result in compare_each(loaded, settings, 0, bar):
+            results[result.mechanism][result.law] = result
+        boards = [board(entry, settings, results[entry.mechanism.name]) for entry in loaded]
+    return boards if is_list else boards[0]
 
 
 def compare_each(
@@ -132,8 +135,10 @@ def compare_each(
     bar: terminal.Progress,
     pieces: "Pieces | None" = None,
 ) -> Iterator[Any]:
-    """What `tuning.benchmark.study.compare` finds, as it is done. What is among the `pieces` is taken from
-    there, and the rest kept there."""
+    """Yield the results of `tuning.benchmark.study.compare`, as they are finished.
+
+    Work stored in the checkpoints `pieces` is not repeated, and new work is stored there.
+    """
     from tuning.benchmark.study import CompareSettings, compare
     from tuning.caches.pieces import NOTHING_KEPT
 
@@ -144,58 +149,63 @@ def compare_each(
         seed=options.seed,
         tuned=not options.untuned,
     )
-    for one in loaded:
-        meaning.check(one.mechanism, one.label)
-    mechanisms = [one.mechanism for one in loaded]
-    kept = pieces or NOTHING_KEPT
-    yield from compare(mechanisms, options.laws, settings, processes, bar.tell, kept, options.scheduler)
+    for entry in loaded:
+        meaning.check(entry.mechanism, entry.label)
+    mechanisms = [entry.mechanism for entry in loaded]
+    checkpoints = pieces or NOTHING_KEPT
+    yield from compare(
+        mechanisms, options.laws, settings, processes, bar.tell, checkpoints, options.scheduler
+    )
 
 
 def check_names(loaded: Sequence[LoadedMechanism]) -> None:
-    """Mechanisms are told apart by their names. Raises `InputError` where two have one."""
-    known: dict[str, str] = {}
-    for one in loaded:
-        name = one.mechanism.name
-        if name in known:
+    """Raise `InputError` if two mechanisms have the same name."""
+    labels: dict[str, str] = {}
+    for entry in loaded:
+        name = entry.mechanism.name
+        if name in labels:
             raise InputError(
-                f"{one.label}: name: found {name}, allowed a name other than that of {known[name]}"
+                f"{entry.label}: name: found {name}, allowed a name other than that of {labels[name]}"
             )
-        known[name] = one.label
+        labels[name] = entry.label
 
 
 def board(one: LoadedMechanism, options: CompareOptions, found: "Mapping[str, LawFigures]") -> Board:
-    """What is said of one mechanism, of the laws that are done."""
+    """Return the result for one mechanism, from the compensators that are finished."""
     from jaxhil.laws.compensators import COMPENSATORS
     from tuning.benchmark.tables import winners
 
     laws = [found[law] for law in options.laws if law in found]
-    won = winners(laws) if laws else {}
+    best = winners(laws) if laws else {}
     document = {
         "mechanism": one.mechanism.name,
         "file": one.label,
         "laws": [
             {
-                "law": own.law,
-                "knows": list(COMPENSATORS[own.law].knows),
-                "gains": own.gains,
-                "figures": own.figures,
+                "law": result.law,
+                "knows": list(COMPENSATORS[result.law].knows),
+                "gains": result.gains,
+                "figures": result.figures,
             }
-            for own in laws
+            for result in laws
         ],
-        "winners": won,
+        "winners": best,
     }
     figures = {
-        own.law: {
-            which: SimpleNamespace(**{name: Estimated(*each[:3]) for name, each in several.items()})
-            for which, several in own.figures.items()
+        result.law: {
+            gains_name: SimpleNamespace(
+                **{name: Estimated(*estimate[:3]) for name, estimate in metrics.items()}
+            )
+            for gains_name, metrics in result.figures.items()
         }
-        for own in laws
+        for result in laws
     }
-    return Board(document, figures, {own.law: own.gains for own in laws}, won)
+    return Board(document, figures, {result.law: result.gains for result in laws}, best)
 
 
-def _names(given: Any) -> list[Any]:
-    names, _ = arguments.several(given, (str,))
+def _names(value: Any) -> list[Any]:
+    """Return the names of compensators as a list. Raise `InputError` if one is not a text."""
+    names, _ = arguments.several(value, (str,))
     for name in names:
         if not isinstance(name, str):
             raise arguments.ArgumentError("compensators", shown(name), "names of compensators")

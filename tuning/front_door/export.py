@@ -1,4 +1,4 @@
-"""`tuning.export`: gains as a bundle that a rig computer can check and run by itself."""
+"""Function `tuning.export`: writes gains as a bundle that a rig computer can check and run."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export` returns.
+    """Result of `export`.
 
-    document: all that is known, as `jaxhil export --json` prints it.
-    sizes: bytes of each of the bundle's files.
+    Attributes:
+        document: all results, as `jaxhil export --json` prints them.
+        sizes: size of each of the bundle's files [bytes].
     """
 
     document: dict[str, Any]
@@ -35,23 +36,26 @@ class Exported:
 
     @property
     def verdict(self) -> str:
-        """ "good"; "bad" if the controller on the rig does not do what was simulated, or raises wrong alarms
-        more often than allowed; "unknown" if nothing is bad, but too few runs say how often it does."""
+        """Return the verdict: "good", "bad" or "unknown".
+
+        It is "bad" if the rig's controller differs from the simulated one, or gives wrong alarms more often
+        than allowed, and "unknown" if nothing is bad, but too few runs determine the alarm rates.
+        """
         return self.document["verdict"]
 
     @property
     def good(self) -> bool:
-        """Whether nothing was found to be bad: the exit code 0 of `jaxhil export`."""
+        """Return whether nothing is bad, that is, whether `jaxhil export` ends with exit code 0."""
         return self.verdict != "bad"
 
     @property
     def reasons(self) -> list[str]:
-        """Why it is bad; none if it is not."""
+        """Return the reasons for a bad verdict; an empty list for any other verdict."""
         return list(self.document["reasons"])
 
     @property
     def unknown(self) -> list[str]:
-        """What is not known, and which sweep would tell; nothing if it is good."""
+        """Return what is not known, with the sweep that would show it; empty for a good verdict."""
         return list(self.document["unknown"])
 
 
@@ -65,13 +69,14 @@ class ExportOptions:
     false_alarms: Annotated[
         float,
         arg(
-            metavar="PROBABILITY", help="Acceptable share of good runs (error up to half the limit) stopped."
+            metavar="PROBABILITY",
+            help="Acceptable share of good runs (error at most half the limit) that are stopped.",
         ),
         Probability,
     ] = 0.01
     missed: Annotated[
         float,
-        arg(metavar="PROBABILITY", help="Acceptable share of runs to be stopped that the watchdog misses."),
+        arg(metavar="PROBABILITY", help="Acceptable share of bad runs that the watchdog misses."),
         Probability,
     ] = 0.02
     seed: Annotated[int, number("Seed of the test vectors."), Seed] = 0
@@ -93,58 +98,69 @@ def export(
     progress: bool = False,
     **options: Any,
 ) -> Exported:
-    """Write a bundle for the rig: gains, controller, test vectors, self-test; nothing to install there.
+    """Write a bundle for the rig: gains, controller, test vectors and self-test, without dependencies.
 
     Args:
-        gains: what `tuning.tune` returned, or a gain file's path, or its folder's.
-        folder: where to write the bundle: new, empty, or a bundle, which is replaced.
-        sweep: what `tuning.sweep` returned for these gains, or its store's folder: limits and the watchdog's
-            rates come from it.
-        formats: also the gains for "ros2", "matlab", "csv", "c99"; None: all.
-        limits: limits of the rig's own by name [SI units], None for no limit, instead of those worked out.
-        progress: say on standard error what is going on.
-    OPTIONS
+        gains: result of `tuning.tune`, or the path of a gain file or of its folder.
+        folder: folder of the bundle: a new or empty one, or a bundle, which is replaced.
+        sweep: result of `tuning.sweep` for these gains, or the folder of its store, from which limits and
+            alarm rates are computed.
+        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99"; None for all.
+        limits: limits of this rig by name [SI units], None for no limit; they replace the computed ones.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The verdict with its reasons, all results, and the sizes of the files.
 
     Raises:
-        InputError: one line, for an argument that will not do, a law without a runtime, or a folder that
-            cannot be written.
+        InputError: If an argument is unusable, the compensator has no runtime, or the folder cannot be
+            written; the message has one line.
     """
-    asked = ExportOptions(**options)
-    check_options(asked)
+    settings = ExportOptions(**options)
+    check_options(settings)
     arguments.flags(progress=progress)
     from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, write_bundle
     from tuning.bundle.signing import signer
 
     target = arguments.folder("folder", folder)
-    replaced = _replaced({} if limits is None else limits)
+    user_limits = _replaced({} if limits is None else limits)
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
     _check_formats(formats)
     check_target(target)
-    key = None if asked.sign is None else signer(arguments.folder("sign", asked.sign))
+    key = None if settings.sign is None else signer(arguments.folder("sign", settings.sign))
     with computing():
         loaded = arguments.gain_file(path)
         arguments.runtime(loaded.compensator)
         check_mechanism(target, loaded.mechanism.name)
-        chosen = _formats(formats)
-        found = _calibrated(loaded, sweep, replaced, (asked.false_alarms, asked.missed), progress)
+        format_names = _formats(formats)
+        calibration = _calibrated(
+            loaded, sweep, user_limits, (settings.false_alarms, settings.missed), progress
+        )
         with terminal.stages(2, progress) as stages:
             bundle = build_bundle(
-                loaded.document, chosen, found.limits, found.rates, asked.seed, stages.begin, key
+                loaded.document,
+                format_names,
+                calibration.limits,
+                calibration.rates,
+                settings.seed,
+                stages.begin,
+                key,
             )
             if not bundle.reasons:
                 write_bundle(target, bundle.files)
-    document = _document(loaded, bundle, chosen, found.rates)
+    document = _document(loaded, bundle, format_names, calibration.rates)
     document["bundle"] = None if bundle.reasons else str(target)
     return Exported(document, {name: len(content) for name, content in bundle.files.items()})
 
 
-def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
-    """What `jaxhil export --json` prints, but for where the bundle is."""
+def _document(loaded, bundle, format_names, rates) -> dict[str, Any]:
+    """Return the document of the export, without the path of the bundle."""
     from tuning.verification.stops import advice
 
     stops = []
     if bundle.stop is not None:
-        # What the limits stop here they stop on the rig.
+        # A nominal run that the limits stop here is also stopped on the rig.
         stops = [f"the nominal run is {bundle.stop.text}; {advice(bundle.passing)}"]
     elif bundle.ended and bundle.ended[0]:
         stops = [f"the nominal run, {bundle.ended[0]}"]
@@ -154,7 +170,7 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
         "mechanism": loaded.mechanism.name,
         "compensator": loaded.compensator,
         "gains_sha256": bundle.document["sha256"],
-        "formats": chosen,
+        "formats": format_names,
         "files": sorted(bundle.files),
         "signed": SIGNATURE in bundle.files,
         "limits": bundle.document.get("limits"),
@@ -172,7 +188,7 @@ def _document(loaded, bundle, chosen, rates) -> dict[str, Any]:
 def _calibrated(
     loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
 ):
-    """The limits for the rig, and what is known of the watchdog's alarms."""
+    """Return the calibrated limits, and the rates of false and missed alarms."""
     from tuning.watchdog.calibration import WITHOUT_STORE, calibrate, held_scenarios
     from tuning.watchdog.fault_runs import FAULTS, scenarios_needed
     from tuning.watchdog.verdict import Allowed
@@ -194,7 +210,7 @@ def _calibrated(
 
 @contextmanager
 def _store(sweep: Any) -> "Iterator[Store | None]":
-    """The rows of a sweep, if there is one."""
+    """Open the store of a sweep; None without a sweep."""
     from tuning.front_door.sweep import SweepStudy
     from tuning.sweeps.store import read_store
 
@@ -205,26 +221,26 @@ def _store(sweep: Any) -> "Iterator[Store | None]":
         yield None if sweep is None else read_store(arguments.folder("sweep", sweep))
 
 
-def _replaced(given: Any) -> dict[str, float | None]:
-    """The limits that the user sets, None for no limit. Raises `InputError`."""
-    if not isinstance(given, Mapping):
-        raise ArgumentError("limits", shown(given), "limits by name")
-    for name, value in given.items():
+def _replaced(limits: Any) -> dict[str, float | None]:
+    """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
+    if not isinstance(limits, Mapping):
+        raise ArgumentError("limits", shown(limits), "limits by name")
+    for name, value in limits.items():
         if name not in LIMITS:
             raise ArgumentError("limits", shown(name), f"one of {', '.join(LIMITS)}")
         if value is not None and not (arguments.is_number(value) and LIMITS[name].admits(value)):
             raise ArgumentError("limits", shown(value), allowed_values(name), name)
-    return {name: None if value is None else float(value) for name, value in given.items()}
+    return {name: None if value is None else float(value) for name, value in limits.items()}
 
 
 def allowed_values(name: str) -> str:
-    """What a limit may be set to, in words."""
+    """Return the allowed values of a limit, in words."""
     limit = LIMITS[name]
     return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
 
 
 def _check_formats(formats: Any) -> None:
-    """Raises `InputError` for a format that there is not."""
+    """Raise `InputError` for a format that does not exist."""
     from tuning.bundle.writers import WRITERS
 
     for name in formats or ():
@@ -232,7 +248,7 @@ def _check_formats(formats: Any) -> None:
 
 
 def _formats(formats: Sequence[str] | None) -> list[str]:
-    """Return the formats asked for, in the order of the table; by default all."""
+    """Return the requested formats, by default all, in the order of `WRITERS`."""
     from tuning.bundle.writers import WRITERS
 
     return [name for name in WRITERS if not formats or name in formats]

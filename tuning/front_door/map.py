@@ -1,4 +1,4 @@
-"""`tuning.map`: where on two keys of the mechanism the loop diverges, and how far from there it is."""
+"""Function `tuning.map`: computes where the loop diverges over two keys, and the nominal point's margins."""
 
 import os
 from collections.abc import Mapping
@@ -38,17 +38,17 @@ MOST_POINTS = 1000
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """What `map` returns; arrays are NumPy's, rows along y and columns along x."""
+    """Result of `map`; arrays are NumPy's, with rows along y and columns along x."""
 
-    document: dict[str, Any]  # all that is known, as `jaxhil map --json` prints it
+    document: dict[str, Any]  # all results, as `jaxhil map --json` prints them
     x: np.ndarray  # values along x, (columns,), in the unit of its key
     y: np.ndarray  # values along y, (rows,)
-    error: np.ndarray  # e - e* of the contact where it is largest, (rows, columns) [1]; NaN: did not end
+    error: np.ndarray  # e - e* of largest magnitude of any contact, (rows, columns) [1]; NaN: no end
     restitution: np.ndarray  # e of that contact, (rows, columns) [1]
     found: "Map" = field(repr=False)
 
     def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw the map; the name ends in .png, .pdf or .svg. Raises `InputError` if it cannot be written."""
+        """Draw the map to a .png, .pdf or .svg file. Raise `InputError` if it cannot be written."""
         from jaxhil.simulation.contact_plot import save
         from tuning.reporting.map_picture import map_picture
 
@@ -62,9 +62,9 @@ class StabilityMap:
 class MapOptions:
     """Options of `map`."""
 
-    points: Annotated[int, number("Points along either axis."), Allowed(2, MOST_POINTS)] = 100
+    points: Annotated[int, number("Number of points along each axis."), Allowed(2, MOST_POINTS)] = 100
     limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error to which margins are told."), AnyLimit
+        float, arg(metavar="NUMBER", help="Restitution error up to which margins are computed."), AnyLimit
     ] = 0.01
     resume: Resume = False
     scheduler: Scheduler = None
@@ -84,31 +84,35 @@ def map(
     progress: bool = False,
     **options: Any,
 ) -> StabilityMap:
-    """The restitution error over two keys of a mechanism, with what theory says there.
+    """Compute the restitution error over two keys of a mechanism, and closed-form theory.
 
-    The gains are the same at every point, those of the nominal mechanism: the map shows what happens to a
-    controller that is not told. Where compensator and contact law are linear there is also the spectral
-    radius of the sampled loop in contact, at the nominal point with its derivative by every gain.
+    The gains are the same at every point, those of the nominal mechanism: the map shows the effect of changes
+    that the controller does not know. If compensator and contact law are linear, the map also has the
+    spectral radius of the sampled loop in contact and, at the nominal point, its derivative by every gain.
 
     Args:
         mechanism: a `Mechanism`, the name of a built-in one, or a file's path.
-        x: the key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME"; without ends from the
-            file's [uncertainty], else 0.3 to 3 times the nominal value, of a gain its bounds. A list scales
-            as a whole and its first entry says how far; "contact.stiffness[1]" is one entry.
-        y: the key along y, likewise.
-        compensator: a law's name.
-        gains: as those of `jaxhil.simulate`.
-        folder: where to write map.json and map.png; None writes nothing.
-        progress: say on standard error what is going on.
-    OPTIONS
+        x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is that of
+            the file's [uncertainty], else 0.3 to 3 times the nominal value; for a gain its bounds. A list is
+            scaled as a whole, and the values are those of its first entry; "contact.stiffness[1]" is a single
+            entry.
+        y: key along y, like `x`.
+        compensator: name of a compensator.
+        gains: gains, as for `jaxhil.simulate`.
+        folder: folder for map.json and map.png; None writes nothing.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The values along both axes, the errors, and all results.
 
     Raises:
-        InputError: one line, for an argument that will not do, or a folder that cannot be written.
+        InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
     """
-    asked = MapOptions(**options)
-    check_options(asked)
+    settings = MapOptions(**options)
+    check_options(settings)
     arguments.flags(progress=progress)
-    if asked.resume and folder is None:
+    if settings.resume and folder is None:
         raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
     checked, target = as_mechanism(mechanism), None if folder is None else arguments.folder("folder", folder)
     with computing():
@@ -127,43 +131,52 @@ def map(
             error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
             raise
         meaning.check(checked)
-        with terminal.progress(runs(asked.points), "runs", progress) as bar:
-            kept = Pieces(None if target is None else target / FOLDER, asked.resume)
-            found = compute_map(
+        with terminal.progress(runs(settings.points), "runs", progress) as bar:
+            checkpoints = Pieces(None if target is None else target / FOLDER, settings.resume)
+            computed = compute_map(
                 checked,
                 name,
                 values,
                 axes,
-                asked.points,
-                asked.limit,
-                asked.seed,
+                settings.points,
+                settings.limit,
+                settings.seed,
                 bar.tell,
-                asked.scheduler,
-                kept,
+                settings.scheduler,
+                checkpoints,
             )
-        document = _document(checked, name, values, found, asked.limit, asked.seed)
-        made = StabilityMap(document, found.x, found.y, found.error, found.restitution, found)
+        document = _document(checked, name, values, computed, settings.limit, settings.seed)
+        stability_map = StabilityMap(
+            document, computed.x, computed.y, computed.error, computed.restitution, computed
+        )
         if target is not None:
-            _write(made, target)
-            kept.remove()
-    return made
+            _write(stability_map, target)
+            checkpoints.remove()
+    return stability_map
 
 
-def _write(made: StabilityMap, folder: Path) -> None:
+def _write(stability_map: StabilityMap, folder: Path) -> None:
+    """Write map.json and map.png."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / DOCUMENT, terminal.as_json(made.document).encode("ascii"))
-    made.plot(folder / PICTURE)
+        write_whole(folder / DOCUMENT, terminal.as_json(stability_map.document).encode("ascii"))
+    stability_map.plot(folder / PICTURE)
 
 
 def _document(
-    mechanism: Mechanism, compensator: str, gains: Mapping[str, float], found: "Map", limit: float, seed: int
+    mechanism: Mechanism,
+    compensator: str,
+    gains: Mapping[str, float],
+    computed: "Map",
+    limit: float,
+    seed: int,
 ) -> dict[str, Any]:
+    """Return the JSON document of a map."""
     from jaxhil.simulation.contact_bounds import BOUNDS
     from jaxhil.simulation.sources import versions
     from tuning.gain_file import VERSIONED, plain
 
-    closed, radii, nominal = found.closed, found.radii, found.nominal
+    closed, radii, nominal = computed.closed, computed.radii, computed.nominal
     keys = ("low", "high")
     document = {
         "schema": SCHEMA,
@@ -172,14 +185,14 @@ def _document(
         "gains": dict(gains),
         **{
             name: {"key": axis.key, "unit": axis.unit, "nominal": axis.nominal, "values": values}
-            for name, axis, values in zip("xy", found.axes, (found.x, found.y), strict=True)
+            for name, axis, values in zip("xy", computed.axes, (computed.x, computed.y), strict=True)
         },
         "limit": limit,
         "seed": seed,
-        "error": found.error,
-        "restitution": found.restitution,
-        "peak_force_ratio": found.peak_force_ratio,
-        "duration_ratio": found.duration_ratio,
+        "error": computed.error,
+        "restitution": computed.restitution,
+        "peak_force_ratio": computed.peak_force_ratio,
+        "duration_ratio": computed.duration_ratio,
         "bounds": BOUNDS,
         "theory": {
             "series": closed.series,
@@ -189,7 +202,7 @@ def _document(
         },
         "spectral_radius": {
             **({} if radii is None else {"x": radii.x, "y": radii.y, "values": radii.values}),
-            "none_because": found.no_growth,
+            "none_because": computed.no_growth,
         },
         "nominal": {
             "restitution": nominal.restitution,
@@ -198,13 +211,13 @@ def _document(
             "duration_ratio": nominal.duration_ratio,
             "growth": nominal.growth,
             "margins": {
-                what: None
+                name: None
                 if margins is None
                 else {
                     axis: dict(zip(keys, margin, strict=True))
                     for axis, margin in zip("xy", margins, strict=True)
                 }
-                for what, margins in (
+                for name, margins in (
                     ("error", nominal.error_margins),
                     ("contact", nominal.contact_margins),
                     ("spectral_radius", nominal.radius_margins),

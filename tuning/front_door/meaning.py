@@ -1,4 +1,4 @@
-"""What a mechanism means, said before work on it begins; refused where that work would never end."""
+"""Summary of a mechanism before a computation, and a check that the computation would end."""
 
 from collections.abc import Callable
 
@@ -8,8 +8,11 @@ from tuning import terminal
 
 
 def check(mechanism: AnyMechanism, label: str | None = None) -> None:
-    """No contact, nominal or drawn, takes more ticks than can be run; in six axes the nominal run can begin.
-    Raises `InputError`; imports jax."""
+    """Check that the contacts of a mechanism can be simulated.
+
+    Raise `InputError` if a contact, nominal or drawn, takes too many ticks or, in six axes, if the nominal
+    run cannot begin. This imports jax.
+    """
     if isinstance(mechanism, SixAxisMechanism):
         from jaxhil.sixdof.building import build_scenarios
         from jaxhil.sixdof.plausibility import check_scenario
@@ -22,13 +25,15 @@ def check(mechanism: AnyMechanism, label: str | None = None) -> None:
 
 
 def say(mechanism: AnyMechanism, tell: Callable[[str], None] | None) -> None:
-    """`tell`, if anybody, in one line what a mechanism means; warn on standard error of what can hardly be
-    meant. Imports jax. In six axes `jaxhil simulate` says it, of the run it makes."""
+    """Report the summary of a one-axis mechanism by `tell`, if given, and warn of implausible values.
+
+    This imports jax. In six axes it does nothing; `jaxhil simulate` reports the summary.
+    """
     if isinstance(mechanism, SixAxisMechanism):
         return
     from jaxhil.simulation.plausibility import meaning
 
-    found = meaning(mechanism)
+    summary = meaning(mechanism)
     if tell is not None:
-        tell(found.line(mechanism.name))
-    terminal.warn(f"{mechanism.name}: {warning}" for warning in found.warnings)
+        tell(summary.line(mechanism.name))
+    terminal.warn(f"{mechanism.name}: {warning}" for warning in summary.warnings)

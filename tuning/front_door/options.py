@@ -1,13 +1,14 @@
-"""Options of commands and of functions of the same name: type, range, default and help.
+"""Options that commands and public functions share: type, range, default and help.
 
-One frozen dataclass per command states its options, once. The command line reads it with tyro, the Python
-function `takes` its fields as keyword arguments, and `check_options` refuses values out of range.
+One frozen dataclass per command defines its options. The command line reads it with tyro, the decorator
+`takes` gives its fields to the Python function as keyword arguments, and `check_options` checks the ranges.
 """
 
 import dataclasses
 import functools
 import inspect
 import math
+import re
 import textwrap
 import typing
 from collections.abc import Callable
@@ -24,26 +25,26 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Allowed:
-    """Values that an option may have; None stands for its default besides."""
+    """Allowed values of an option; None, for its default, is also allowed."""
 
     least: float = -math.inf
     most: float = math.inf
     names: tuple[str, ...] = ()
-    words: str = ""  # what is allowed, where it is more than the ends say
+    words: str = ""  # allowed values in words, if the range is not enough
 
 
 def number(meaning: str):
-    """Return how tyro shows an option that is a number."""
+    """Return tyro's description of an option that is a number."""
     return arg(metavar="NUMBER", help=meaning)
 
 
 def folder(meaning: str):
-    """Return how tyro shows an option that is a folder to write to."""
+    """Return tyro's description of an option that is an output folder."""
     return arg(aliases=("-o",), metavar="DIR", help=meaning)
 
 
 def text(metavar: str | None, meaning: str, **more: Any):
-    """Return how tyro shows an option whose help itself says what holds by default."""
+    """Return tyro's description of an option whose help itself states the default."""
     return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
 
 
@@ -59,7 +60,7 @@ Overrides = Annotated[
     UseAppendAction[tuple[str, ...]],
     text(
         "PATH=VALUE",
-        "Any key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
+        "Set a key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
         name="set",
     ),
 ]
@@ -67,8 +68,7 @@ Unset = Annotated[
     UseAppendAction[tuple[str, ...]],
     text(
         "PATH",
-        "A key to take out of the mechanism file, and what [uncertainty] says of it, after all --set; "
-        "repeatable.",
+        "Remove a key, and its entry in [uncertainty], from the mechanism file, after all --set; repeatable.",
         name="unset",
     ),
 ]
@@ -77,20 +77,20 @@ Limit = Annotated[
     float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad."), AnyLimit
 ]
 Seed = Allowed(0)
-Json = Annotated[
-    FlagCreatePairsOff[bool], text(None, "One JSON document on standard output, nothing else there.")
-]
-Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Say on standard error where the time went.")]
+Json = Annotated[FlagCreatePairsOff[bool], text(None, "Print only one JSON document on standard output.")]
+Timings = Annotated[FlagCreatePairsOff[bool], text(None, "Report on standard error how the time was spent.")]
 Scheduler = Annotated[
     str | None,
-    arg(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers do the computing."),
+    arg(
+        metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers run the computations."
+    ),
 ]
 Resume = Annotated[
     bool,
-    arg(name="resume", metavar="", help="Go on after an interruption: what is finished is not done again."),
+    arg(name="resume", metavar="", help="Continue after an interruption; finished work is not repeated."),
 ]
 CompensatorName = Annotated[
-    str | None, arg(metavar="NAME", help="Compensator, at the literature's gains; 'none' by default.")
+    str | None, arg(metavar="NAME", help="Compensator, with the literature's gains; 'none' by default.")
 ]
 GainSource = Annotated[
     str | None,
@@ -99,7 +99,7 @@ GainSource = Annotated[
 
 
 Setting = Annotated[
-    str | None, text("NAME", "Take a set of gains that the compensator has for any mechanism, by its name.")
+    str | None, text("NAME", "Name of a set of gains that the compensator has for any mechanism.")
 ]
 
 
@@ -107,7 +107,7 @@ def check_options(options: Any) -> None:
     """Check the type and range of every option that states them.
 
     Raises:
-        InputError: One line, "name: found X, allowed Y".
+        InputError: If a value is not allowed; one line, "name: found X, allowed Y".
     """
     for name, (kind, allowed) in _stated(type(options)).items():
         value = getattr(options, name)
@@ -117,7 +117,7 @@ def check_options(options: Any) -> None:
 
 @functools.cache
 def _stated(options: type) -> dict[str, tuple[Any, Allowed]]:
-    """Return kind and allowed values of the options that are flags or state what they allow."""
+    """Return the type and the allowed values of the options that are flags or state allowed values."""
     stated = {}
     for name, hint in typing.get_type_hints(options, include_extras=True).items():
         kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
@@ -128,6 +128,7 @@ def _stated(options: type) -> dict[str, tuple[Any, Allowed]]:
 
 
 def _check_one(name: str, value: Any, kind: Any, allowed: Allowed) -> None:
+    """Raise `ArgumentError` if the value of one option is not allowed."""
     if kind is bool:
         if not isinstance(value, bool):
             raise ArgumentError(name, shown(value), "true or false")
@@ -148,9 +149,10 @@ def _check_one(name: str, value: Any, kind: Any, allowed: Allowed) -> None:
 
 
 def takes(options: type) -> Callable[[Function], Function]:
-    """Let a function state the fields of `options` as its keyword arguments, with their help.
+    """Return a decorator that adds the fields of `options` to a function's signature and docstring.
 
-    The function takes them as `**options`; signature and docstring name them one by one.
+    The function accepts them as `**options`; the line `**options: OPTIONS` of its docstring is
+    replaced by their help.
     """
 
     def stated(function: Function) -> Function:
@@ -165,14 +167,16 @@ def takes(options: type) -> Callable[[Function], Function]:
         ]
         function.__signature__ = signature.replace(parameters=[*first, *more])  # pyright: ignore
         lines = [_meaning(options, field.name) for field in fields]
-        function.__doc__ = (function.__doc__ or "").replace("    OPTIONS\n", "".join(lines))
+        function.__doc__ = re.sub(
+            r" +(\*\*options: )?OPTIONS\n", lambda _: "".join(lines), function.__doc__ or ""
+        )
         return function
 
     return stated
 
 
 def _meaning(options: type, name: str) -> str:
-    """Return the line of a docstring that says what an option means."""
+    """Return the line of a docstring that describes an option."""
     hint = typing.get_type_hints(options, include_extras=True)[name]
     (meaning,) = (mark.help for mark in typing.get_args(hint)[1:] if getattr(mark, "help", None))
     return textwrap.fill(f"{name}: {meaning}", 110, initial_indent=" " * 8, subsequent_indent=" " * 12) + "\n"

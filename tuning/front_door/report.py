@@ -1,9 +1,8 @@
-"""`tuning.report`: one page for a review board, of what the other functions and commands wrote."""
+"""Function `tuning.report`: makes one page for a review board from the results of the other commands."""
 
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from jaxhil.files import follow, write_whole, writing
 from jaxhil.simulation.environment import computing
@@ -14,14 +13,18 @@ from tuning.front_door.arguments import ArgumentError
 
 @dataclass(frozen=True)
 class Report:
-    """What `report` returns."""
+    """Result of `report`: the page and its verdict."""
 
     html: bytes  # the page
-    verdict: str  # "good", "bad", or "unknown" where what was given does not decide it
-    requirements: list[dict[str, str]]  # what, required, result, margin and verdict of each
+    verdict: str  # "good", "bad", or "unknown" if the given results do not decide it
+    requirements: list[dict[str, str]]  # each with what, required, result, margin and verdict
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page, whole or not at all. Raises `InputError` if that is not possible."""
+        """Write the page atomically.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
         target = arguments.folder("path", path)
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -32,37 +35,36 @@ class Report:
 def report(
     results: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, progress: bool = False
 ) -> Report:
-    """One page of results: verdict, requirements, assumptions, gains, runs, errors, how to reproduce them.
+    """Make one page of results: verdict, requirements, assumptions, gains, runs, errors and commands.
 
     Args:
-        results: paths of what `identify`, `tune`, `sweep`, `compare`, `map` and `export` wrote, at most one
-            of each: a folder or the JSON file in it; of `monitor` the file of what `--json` printed.
-        progress: say on standard error what is going on.
+        results: paths of the results of `identify`, `tune`, `sweep`, `compare`, `map` and `export`, at most
+            one of each: a folder or the JSON file in it; for `monitor` a file with the output of `--json`.
+        progress: report the progress on standard error.
+
+    Returns:
+        The page with its verdict and requirements.
 
     Raises:
-        InputError: one line, for what is no result, was changed since it was written, or belongs to another
-            mechanism or other gains than the rest.
+        InputError: If a path is no result, a result was changed after it was written, or results belong to
+            different mechanisms or gains; the message has one line.
     """
     arguments.flags(progress=progress)
     listed, _ = arguments.several(results, (str, os.PathLike))
     if not listed:
         raise ArgumentError("results", "none", "paths of results")
-    paths = [arguments.folder("results", one) for one in listed]
+    paths = [arguments.folder("results", path) for path in listed]
     with computing():
         from tuning.reporting.content import requirements, verdict_of
         from tuning.reporting.page import page
         from tuning.reporting.reading import read_results
         from tuning.reporting.study_sections import pictures
 
-        found = read_results(paths)
-        with terminal.progress(pictures(found), "pictures", progress) as bar:
-            html = page(found, bar.turn_to)
-        asked = requirements(found)
-        return Report(html, verdict_of(asked), [_plain(one) for one in asked])
-
-
-def _plain(one: Any) -> dict[str, str]:
-    return {**vars(one)}
+        loaded = read_results(paths)
+        with terminal.progress(pictures(loaded), "pictures", progress) as bar:
+            html = page(loaded, bar.turn_to)
+        evaluated = requirements(loaded)
+        return Report(html, verdict_of(evaluated), [dict(vars(requirement)) for requirement in evaluated])
 
 
 __all__ = ["Report", "report"]

@@ -1,7 +1,7 @@
-"""`tuning.sweep`: how probable is a failure, how close do the worst scenarios come to one?
+"""Function `tuning.sweep`: computes the probability of failure and the worst scenarios.
 
-The rows are the store's (`tuning.sweeps.store`), in a folder that stays, or in one that is gone when the
-sweep is done. Beside them stands one document, which `jaxhil sweep --json` prints.
+The rows are in a store (`tuning.sweeps.store`), in a permanent or a temporary folder. The results are one
+document, which `jaxhil sweep --json` prints.
 """
 
 import os
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Interval(NamedTuple):
-    """Ends of an interval of 95 %."""
+    """Confidence interval of 95 %."""
 
     low: float
     high: float
@@ -39,13 +39,14 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class SweepStudy:
-    """What `sweep` returns.
+    """Result of `sweep`.
 
-    document: all that is known, as `jaxhil sweep --json` prints it.
-    manifest: everything that the rows follow from.
-    folder: where the rows are kept; None if they are not.
-    rows: those that are kept in no folder.
-    unwritten: what could not be written beside the rows, and why.
+    Attributes:
+        document: all results, as `jaxhil sweep --json` prints them.
+        manifest: everything that determines the rows.
+        folder: folder of the rows; None if they are only in memory.
+        rows: rows in memory; None if they are in a folder.
+        unwritten: errors for files that could not be written beside the rows.
     """
 
     document: dict[str, Any]
@@ -56,10 +57,10 @@ class SweepStudy:
 
     @cached_property
     def table(self) -> "pyarrow.Table":
-        """The rows, one a scenario, as an Arrow table; units and meanings are its fields' metadata.
+        """Return the rows, one per scenario, as an Arrow table with units and meanings as field metadata.
 
-        Those in a folder are read when they are first asked for: there may be more than memory holds. Raises
-        `InputError` where they are no longer there.
+        Rows in a folder are read on first use, because they may exceed the memory. Raise `InputError` if they
+        no longer exist.
         """
         from tuning.sweeps.store import read_store
 
@@ -74,24 +75,27 @@ class SweepStudy:
 
     @property
     def failure_probability(self) -> float:
-        """The share of scenarios that failed: an error beyond the limit, or a run that does not end well."""
+        """Return the share of failed scenarios: an error beyond the limit, or a run that did not end well."""
         return self.document["failure_probability"]["value"]
 
     @property
     def interval(self) -> Interval:
-        """In which the failure probability lies, with 95 % confidence."""
-        known = self.document["failure_probability"]
-        return Interval(known["low"], known["high"])
+        """Return the 95 % confidence interval of the failure probability."""
+        probability = self.document["failure_probability"]
+        return Interval(probability["low"], probability["high"])
 
     @property
     def verdict(self) -> str:
-        """ "good" if no scenario failed or, with an acceptable probability, if the interval ends below it,
-        else "bad"."""
+        """Return the verdict, "good" or "bad".
+
+        It is "good" if no scenario failed or, with an acceptable probability, if the interval ends at or
+        below it.
+        """
         return self.document["verdict"]
 
     @contextmanager
     def store(self) -> Iterator["Store"]:
-        """The rows in a store: the folder's, or one that is there within the context alone."""
+        """Provide the rows in a store: that of the folder, or a temporary one within the context."""
         from tuning.sweeps.parts import from_table
         from tuning.sweeps.store import open_store, read_store, write_part
 
@@ -115,35 +119,38 @@ def sweep(
     progress: bool = False,
     **options: Any,
 ) -> SweepStudy:
-    """Monte Carlo robustness of a gain file: scenarios drawn from its mechanism's uncertainty and run.
+    """Compute the Monte Carlo robustness of a gain file on scenarios drawn from its mechanism's uncertainty.
 
-    Scenario i depends on the seed and on i alone; its row is that of `jaxhil sweep`, to the bit.
+    Scenario i depends only on the seed and on i; its row equals that of `jaxhil sweep` to the last bit.
 
     Args:
-        gains: a gain file's path, or its folder's, or what `tuning.tune` returned.
-        folder: where to keep the rows, with pictures; None keeps nothing.
-        progress: say on standard error how far it is.
-    OPTIONS
+        gains: path of a gain file or of its folder, or a result of `tuning.tune`.
+        folder: folder for the rows and plots; None keeps the rows in memory.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The failure probability with its interval, the verdict, the rows, and all results.
 
     Raises:
-        InputError: one line, for an argument that will not do, or a folder that cannot be written.
+        InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
     """
-    asked = SweepOptions(**options)
-    asked.check()
+    settings = SweepOptions(**options)
+    settings.check()
     arguments.flags(progress=progress)
     if folder is not None:
         target = arguments.folder("folder", folder)
-        return run_study(gains, asked, target, progress)
-    if asked.resume:
+        return run_study(gains, settings, target, progress)
+    if settings.resume:
         raise ArgumentError("resume", "without a folder", "with the folder of a sweep")
     with tempfile.TemporaryDirectory(prefix="jaxhil-sweep-") as temporary:
-        return run_study(gains, asked, Path(temporary), progress, keep=False)
+        return run_study(gains, settings, Path(temporary), progress, keep=False)
 
 
 def run_study(
     gains: Any, options: SweepOptions, folder: Path, progress: bool, keep: bool = True
 ) -> SweepStudy:
-    """Compute what the store in the folder lacks; what is to `keep` gets pictures and the document too."""
+    """Compute what the store in the folder lacks; with `keep`, also write plots and the document."""
     path = gains if hasattr(gains, "document") else arguments.readable_gain_file(gains)
     with computing(), _cluster(options.scheduler) as workers:
         from tuning.statistics.intervals import scenarios_needed
@@ -155,8 +162,8 @@ def run_study(
 
         choices = Choices(**{name: getattr(options, name) for name in Choices._fields})
         loaded = arguments.gain_file(path, any_axes=True)
-        asked = {"works": options.works, "precision": options.precision == "float32" and "float32"}
-        arguments.not_in_six_axes(loaded.mechanism, **asked)
+        unsupported = {"works": options.works, "precision": options.precision == "float32" and "float32"}
+        arguments.not_in_six_axes(loaded.mechanism, **unsupported)
         meaning.check(loaded.mechanism)
         manifest = build_manifest(loaded, choices)
         with locked(folder):
@@ -164,31 +171,31 @@ def run_study(
             with terminal.progress(manifest.scenarios, "scenarios", progress) as bar:
 
                 def so_far(tally) -> str:
-                    known = failure_probability(tally)
-                    text = f"failed {known.value:.3g} ({known.low:.2g} to {known.high:.2g})"
+                    probability = failure_probability(tally)
+                    text = f"failed {probability.value:.3g} ({probability.low:.2g} to {probability.high:.2g})"
                     if options.until_width is None:
                         return text
-                    needed = scenarios_needed(known.value, options.until_width)
+                    needed = scenarios_needed(probability.value, options.until_width)
                     return f"{text}, about {needed} wanted"
 
                 bar.reach(0, "running scenarios")
-                done, tally = run_sweep(
+                finished_sweep, tally = run_sweep(
                     store,
                     lambda rows, _: bar.skip(rows),
                     lambda rows, tally: bar.advance(rows, so_far(tally)),
                     run_parts if workers is None else parts_on(workers),
                 )
-            document = _document(options, store, done, tally, bar.rate)
+            document = _document(options, store, finished_sweep, tally, bar.rate)
             if not keep:
                 document["store"] = None
-            unwritten = _complete(options, store, done, document, progress, keep, workers)
+            unwritten = _complete(options, store, finished_sweep, document, progress, keep, workers)
             if keep:
                 return SweepStudy(document, manifest, folder, None, unwritten)
             return SweepStudy(document, manifest, None, _table(store), unwritten)
 
 
 def _cluster(address: str | None) -> AbstractContextManager["Workers | None"]:
-    """The workers of a cluster; None where everything is computed here."""
+    """Connect to the workers of a cluster; None if no address is given."""
     from tuning.caches.cluster import connected
 
     return nullcontext() if address is None else connected(address)
@@ -203,9 +210,9 @@ def _complete(
     keep: bool,
     workers: "Workers | None",
 ) -> list[InputError]:
-    """Add what belongs beside the verdict, and keep all that is known in the store after every step.
+    """Add plots and additional studies to the document, and write it after every step.
 
-    What could not be written is returned, to be reported after the verdict, which no full disk is to cost.
+    Return the errors for files that could not be written, so that a full disk does not cost the verdict.
     """
     from tuning.sweeps.pictures import write_pictures
     from tuning.sweeps.run import compare_precisions
@@ -239,6 +246,7 @@ def _complete(
 
 
 def _document(options: SweepOptions, store: "Store", done, tally, rate: float | None) -> dict[str, Any]:
+    """Return the JSON document of a sweep, without the additional studies."""
     from tuning.sweeps.run import describe_outcomes
     from tuning.sweeps.tally import error_quantiles, failure_probability
 
@@ -261,7 +269,7 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "failed": tally.failed,
         "failure_probability": probability._asdict(),
         "left_out_of_replicates": tally.left_out,
-        "error_quantiles": [one._asdict() for one in error_quantiles(tally)],
+        "error_quantiles": [quantile._asdict() for quantile in error_quantiles(tally)],
         "outcomes": describe_outcomes(tally),
         "worst": [_scenario(store, done.mechanism, index) for _, _, index in tally.worst],
         "scenarios_per_second": rate,
@@ -271,13 +279,13 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
 
 
 def _scenario(store: "Store", mechanism: Any, index: int) -> dict[str, Any]:
-    """What is said of one scenario: how it ended, its worst contact, what was drawn."""
+    """Return the document's entry of one scenario: outcome, worst error, its contact, and inputs."""
     from tuning.sweeps.columns import slots, texts_of
     from tuning.sweeps.store import read_row
 
     row = read_row(store, index)
     columns = store.manifest.columns
-    numbers = {one.name: row[one.name][0].item() for one in columns if one.kind != "text"}
+    numbers = {column.name: row[column.name][0].item() for column in columns if column.kind != "text"}
     errors = {slot: numbers[slot.error] for slot in slots(mechanism)}
     worst = numbers["worst_error"]
     return {
@@ -286,12 +294,12 @@ def _scenario(store: "Store", mechanism: Any, index: int) -> dict[str, Any]:
         "worst_error": worst,
         # None if no contact ended.
         "worst_contact": next((slot.number for slot, value in errors.items() if value == worst), None),
-        "inputs": {one.name: numbers[one.name] for one in columns if one.kind == "input"},
+        "inputs": {column.name: numbers[column.name] for column in columns if column.kind == "input"},
     }
 
 
 def _table(store: "Store") -> "pyarrow.Table":
-    """All rows of the store, in the order of their indices."""
+    """Return all rows of the store, sorted by index."""
     import pyarrow
 
     from tuning.sweeps.parts import schema, to_table

@@ -1,4 +1,4 @@
-"""`tuning.tune`: the gains of one compensator for one mechanism or several, judged on fresh scenarios."""
+"""Function `tuning.tune`: tunes one compensator's gains for one or several mechanisms."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -25,48 +25,48 @@ def tune(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Tune a compensator's gains for a mechanism; judge them on scenarios that tuning never saw.
+    """Tune a compensator's gains for a mechanism, and evaluate them on fresh scenarios.
 
-    Equal arguments give equal gains to the bit, and those of `jaxhil tune`.
+    Equal arguments give equal gains to the last bit, also with the command `jaxhil tune`.
 
     Args:
-        mechanism: what `jaxhil.load` returns, or a name or path for it; or a list of those, which are tuned
-            together.
-        compensator: name of a law, built in or registered; in six axes "none", "phase_lead" or
+        mechanism: result of `jaxhil.load`, or a name or path that it accepts; or a list of these, which are
+            tuned together.
+        compensator: name of a compensator, built in or registered; in six axes "none", "phase_lead" or
             "phase_lead_per_axis".
-        progress: say on standard error what is going on.
-    OPTIONS
+        progress: report the progress on standard error.
+        **options: OPTIONS
 
-    `start` also takes results of `tune`, and `objective` a function of the metrics of all scenarios, which
-    returns a number >= 0 to be made small.
+    `start` also accepts results of `tune`, and `objective` a function of the metrics of all scenarios, which
+    returns a number >= 0 to be minimised.
 
     Returns:
-        A `TunedGains`; a list of them for a list.
+        A `TunedGains`, or a list of them for a list of mechanisms.
 
     Raises:
-        InputError: one line, for an argument that will not do.
+        InputError: If an argument is unusable; the message has one line.
     """
-    asked = TuneOptions(compensator=compensator, **options)
+    settings = TuneOptions(compensator=compensator, **options)
     arguments.flags(progress=progress)
-    loaded, several = arguments.any_mechanisms(mechanism)
-    asked.check()
-    for one in loaded:
-        asked.fits(one.mechanism)
+    loaded, is_list = arguments.any_mechanisms(mechanism)
+    settings.check()
+    for entry in loaded:
+        settings.fits(entry.mechanism)
     with computing():
-        for one in loaded:
-            meaning.check(one.mechanism, one.label)
-        for one in loaded if progress else ():
-            meaning.say(one.mechanism, terminal.note)
+        for entry in loaded:
+            meaning.check(entry.mechanism, entry.label)
+        for entry in loaded if progress else ():
+            meaning.say(entry.mechanism, terminal.note)
     with computing(), terminal.progress(len(loaded), "mechanisms", progress) as bar:
-        found = dict(tune_each(loaded, asked, bar))
-        results = [found[index] for index in range(len(loaded))]
-    if asked.pareto:
+        by_index = dict(tune_each(loaded, settings, bar))
+        results = [by_index[index] for index in range(len(loaded))]
+    if settings.pareto:
         with computing(), terminal.progress(len(loaded), "fronts", progress) as bar:
-            for place, front in tune_pareto.trade(
-                results, asked.pareto, asked.pareto_against, bar, None, asked.scheduler
+            for index, front in tune_pareto.trade(
+                results, settings.pareto, settings.pareto_against, bar, None, settings.scheduler
             ):
-                results[place] = dataclasses.replace(results[place], pareto=tuple(front))
-    return results if several else results[0]
+                results[index] = dataclasses.replace(results[index], pareto=tuple(front))
+    return results if is_list else results[0]
 
 
 def tune_each(
@@ -75,19 +75,28 @@ def tune_each(
     bar: terminal.Progress,
     pieces: "Pieces | None" = None,
 ) -> Iterator[tuple[int, TunedGains]]:
-    """Index and result of every mechanism, as they are done; the `bar` shows how far it is. What is among the
-    `pieces` is taken from there, and the rest kept there."""
+    """Yield the index and the result of every mechanism, as they are finished.
+
+    The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
+    stored there.
+    """
     from tuning.caches.pieces import NOTHING_KEPT
     from tuning.gains.tune_all import tune_all
     from tuning.gains.work import Work
 
     settings, known = options.settings(), options.known()
-    mechanisms = [one.mechanism for one in loaded]
+    mechanisms = [entry.mechanism for entry in loaded]
     number = len(loaded)
     work = Work(lambda text, share, before: bar.tell(text, share * number, before * number))
-    kept = pieces or NOTHING_KEPT
+    checkpoints = pieces or NOTHING_KEPT
     results = tune_all(
-        mechanisms, options.compensator, settings, work, known, pieces=kept, scheduler=options.scheduler
+        mechanisms,
+        options.compensator,
+        settings,
+        work,
+        known,
+        pieces=checkpoints,
+        scheduler=options.scheduler,
     )
-    for index, found in results:
-        yield index, TunedGains(found, loaded[index].sha256, options.limit)
+    for index, result in results:
+        yield index, TunedGains(result, loaded[index].sha256, options.limit)

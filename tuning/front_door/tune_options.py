@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import Tuned
 
-    # The command line takes names; the function also takes results and functions.
+    # The command line accepts names; the function also accepts results and functions.
     Start = Any
     ObjectiveOption = str | Callable[[Any], Any]
 else:
@@ -42,30 +42,33 @@ class TuneOptions:
         Count,
     ] = None
     starts: Annotated[
-        int, number("Starts of the solver, and of each further lot where they disagree."), Count
+        int, number("Starts of the solver, and number of each further group if they disagree."), Count
     ] = 4
     start: Annotated[
         Start,
         text(
             "GAINS [GAINS ...]",
-            "Gain files of the same compensator: each mechanism is tuned from the gains of the nearest "
-            "of their mechanisms too.",
+            "Gain files of the same compensator: each mechanism is also tuned from the gains of the most "
+            "similar of their mechanisms.",
         ),
     ] = ()
-    steps: Annotated[int, number("Most solver steps from each start."), Count] = 25
-    validation: Annotated[int, number("Fresh scenarios to judge on."), Count] = 511
+    steps: Annotated[int, number("Largest number of solver steps from each start."), Count] = 25
+    validation: Annotated[int, number("Fresh scenarios for the evaluation."), Count] = 511
     objective: Annotated[
         ObjectiveOption,
-        arg(metavar="NAME", help="Of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst."),
+        arg(
+            metavar="NAME",
+            help="Statistic of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst.",
+        ),
     ] = "rms"
     divergence_weight: Annotated[
-        float, number("How much more a squared divergence (e > e*) counts than a squared convergence.")
+        float, number("Weight of a squared divergence (e > e*) relative to a squared convergence.")
     ] = 1.0
     command_weight: Annotated[
         Weight,
         text(
             "NUMBER",
-            "How many times the limit a command is worth that peaks one ideal peak too high; by default 0.3 "
+            "Penalty, in multiples of the limit, of a command peak one ideal peak too high; by default 0.3 "
             "for impulse_ledger, 0 for others.",
         ),
     ] = None
@@ -73,27 +76,29 @@ class TuneOptions:
         Weight,
         text(
             "NUMBER",
-            "How many times the limit it is worth to amplify sensor noise once more. Where sensors are noisy "
-            "and no weight is given: the quietest gains within the limit; 0: the least error.",
+            "Penalty, in multiples of the limit, of one more amplification of the sensor noise. Default with "
+            "noisy sensors: the quietest gains within the limit; 0: the least error.",
         ),
     ] = None
     chatter_weight: Annotated[
         Weight,
         text(
             "NUMBER",
-            "How many times the limit a command is worth that swings once too often by the ideal peak force.",
+            "Penalty, in multiples of the limit, of one extra swing of the command by the ideal peak force.",
         ),
     ] = None
     transparency_weight: Annotated[
         Weight,
         text(
             "NUMBER",
-            "How much errors of the same scenarios count with a push on the hardware, and damped; by "
-            "default 1 for impulse_ledger, 0 for others.",
+            "Weight of the errors of the same scenarios with a push on the hardware, and with more damping; "
+            "by default 1 for impulse_ledger, 0 for others.",
             aliases=("--honesty-weight",),
         ),
     ] = None
-    pareto: Annotated[int, number("Points of a trade-off of restitution error, each a gain file.")] = 0
+    pareto: Annotated[
+        int, number("Number of points of a trade-off against the restitution error, each a gain file.")
+    ] = 0
     pareto_against: Annotated[
         str | None,
         text(
@@ -108,7 +113,7 @@ class TuneOptions:
             name="global-search",
             aliases=("--certify",),
             metavar="",
-            help="Also search all gains' whole ranges, with 50 times the evaluations: is there better?",
+            help="Also search the full range of all gains, with 50 times the evaluations, for better ones.",
         ),
     ] = False
     seed: Annotated[int, number("Seed of scenarios and starts."), Seed] = 0
@@ -116,7 +121,7 @@ class TuneOptions:
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Check what can be checked without JAX. Raises `InputError`."""
+        """Check all options that can be checked without jax. Raise `InputError`."""
         check_options(self)
         arguments.fits(self.compensator, None)
         if callable(self.objective) and self.pareto:
@@ -124,15 +129,15 @@ class TuneOptions:
         tune_pareto.check(self.pareto, self.pareto_against, self.compensator)
 
     def fits(self, mechanism: AnyMechanism) -> None:
-        """The mechanism has the axes for what is asked for. Raises `InputError`."""
+        """Raise `InputError` if the mechanism has six axes and an option does not support them."""
         arguments.fits(self.compensator, mechanism)
-        asked = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
-        arguments.not_in_six_axes(mechanism, **{name: getattr(self, name) for name in asked})
+        options = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
+        arguments.not_in_six_axes(mechanism, **{name: getattr(self, name) for name in options})
         if callable(self.objective):
             arguments.not_in_six_axes(mechanism, objective=self.objective)
 
     def settings(self) -> "TuneSettings":
-        """The same as tuning takes it. Raises `InputError`; imports jax."""
+        """Return the settings of the tuning. Raise `InputError`. This imports jax."""
         from tuning.gains.settings import TuneSettings
 
         arguments.setting(self.compensator, self.setting)
@@ -151,41 +156,41 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Tell whether there is a limit, and nothing but what is minimised by default is asked for."""
+        """Return whether the limit is finite and no option of the objective was changed."""
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
-        usual = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
-        return usual and 0 < self.limit < math.inf
+        is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
+        return is_default and 0 < self.limit < math.inf
 
     def _objective(self) -> "Objective":
-        """What is asked for and, where nothing is, what the compensator's kind calls for."""
+        """Return the objective, with the compensator's default weights where none are given."""
         from tuning.gains.objective import WEIGHTS, Objective
         from tuning.transparency.probes import default_weights
 
-        # Where no error is too large, or any is, the usual limit is the unit of the weights.
+        # If the limit is 0 or infinite, the default limit is the unit of the weights.
         limit = float(self.limit) if 0 < self.limit < math.inf else TuneOptions.limit
-        given = {name: getattr(self, name) for name in WEIGHTS}
-        stated = {name: weight for name, weight in given.items() if weight is not None}
+        options = {name: getattr(self, name) for name in WEIGHTS}
+        user_weights = {name: weight for name, weight in options.items() if weight is not None}
         if not callable(self.objective):
-            weights = {**default_weights(self.compensator), **stated}
+            weights = {**default_weights(self.compensator), **user_weights}
             return Objective(self.objective, **weights, limit=limit)
         from tuning.gains.metrics_function import MetricsFunction
 
-        # What the user wants small is all that he says it is.
-        return Objective(**stated, function=MetricsFunction(self.objective), limit=limit)
+        # A user's function gets no default weights: it is minimised as it is.
+        return Objective(**user_weights, function=MetricsFunction(self.objective), limit=limit)
 
     def known(self) -> "list[Tuned]":
-        """What the gain files to start from hold. Raises `InputError`; imports jax."""
+        """Return the contents of the gain files to start from. Raise `InputError`. This imports jax."""
         from tuning.gains.transfer import Tuned
 
         start: Any = self.start
         alone = isinstance(start, (str, os.PathLike)) or hasattr(start, "document")
-        given: Any = [start] if alone else start
-        found = []
-        for one in given:
-            loaded = arguments.gain_file(one, "start")
-            label = str(one) if isinstance(one, (str, os.PathLike)) else loaded.mechanism.name
+        sources: Any = [start] if alone else start
+        tuned = []
+        for source in sources:
+            loaded = arguments.gain_file(source, "start")
+            label = str(source) if isinstance(source, (str, os.PathLike)) else loaded.mechanism.name
             if loaded.compensator != self.compensator:
                 allowed = f"gains of {self.compensator}"
                 raise ArgumentError("start", f"gains of {loaded.compensator}", allowed, one_line(label))
-            found.append(Tuned(loaded.mechanism, loaded.gains, label))
-        return found
+            tuned.append(Tuned(loaded.mechanism, loaded.gains, label))
+        return tuned

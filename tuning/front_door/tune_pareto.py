@@ -1,4 +1,4 @@
-"""The part of `tuning.tune` that trades the error for something else: a front of gains for each mechanism."""
+"""Pareto fronts of `tuning.tune`: gains that trade the error for another cost."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 def check(number: Any, against: Any, compensator: str) -> None:
-    """There is a front to find, if one is asked for. Raises `InputError`; imports jax where one is."""
+    """Raise `InputError` unless the options describe a possible front.
+
+    This imports jax if `number` is at least 2.
+    """
     arguments.integers(0, pareto=number)
     if number == 0:
         return
@@ -30,7 +33,7 @@ def check(number: Any, against: Any, compensator: str) -> None:
 
 
 def axis_of(against: str | None, compensator: str) -> "Axis | None":
-    """What the error is traded against; None: nothing."""
+    """Return the cost that the error is traded for, or None if there is no trade-off."""
     from tuning.gains.pareto_search import AXES, NOISE, default_axis, has_trade_off
 
     if against is None:
@@ -47,15 +50,17 @@ def trade(
     pieces: "Pieces | None" = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, list[TradedGains]]]:
-    """Place and front of every result, as they are done; the `bar` shows how far it is. What is among the
-    `pieces` is taken from there, and the rest kept there. With a `scheduler`, a cluster's workers compute
-    them."""
+    """Yield the index and the front of every result, as they are finished.
+
+    The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
+    stored there. With a `scheduler`, the workers of a cluster compute the fronts.
+    """
     from tuning.caches.pieces import NOTHING_KEPT
     from tuning.gains.pareto import fronts
     from tuning.gains.work import Work
 
-    found = [one.found for one in tuned]
+    results = [gains.found for gains in tuned]
     axis: Any = axis_of(against, tuned[0].compensator) if tuned else None
-    work = Work(lambda text, share, before: bar.tell(text, share * len(found), before * len(found)))
-    for place, front in fronts(found, number, work, axis, pieces or NOTHING_KEPT, scheduler):
-        yield place, [TradedGains(tuned[place], front, point) for point in front.points]
+    work = Work(lambda text, share, before: bar.tell(text, share * len(results), before * len(results)))
+    for index, front in fronts(results, number, work, axis, pieces or NOTHING_KEPT, scheduler):
+        yield index, [TradedGains(tuned[index], front, point) for point in front.points]

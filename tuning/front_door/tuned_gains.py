@@ -1,4 +1,4 @@
-"""What `tuning.tune` returns: tuned gains, and points of a front that trade the error for something else."""
+"""Results of `tuning.tune`: tuned gains, and points of a Pareto front."""
 
 import functools
 import os
@@ -15,18 +15,19 @@ if TYPE_CHECKING:
     from tuning.gains.pareto import Front, Point
     from tuning.gains.tune import ErrorFigures, TuneResult
 
-# Names in files that stand for those that the objective uses.
+# Names in files of the objective's weights, where they differ.
 IN_FILES = {"transparency_weight": "honesty_weight"}
 
 
 @dataclass(frozen=True)
 class TunedGains:
-    """What `tune` returns of one mechanism.
+    """Result of `tune` for one mechanism.
 
-    found: all that tuning found (`tuning.gains.tune.TuneResult`).
-    mechanism_sha256: SHA-256 of the mechanism's file.
-    limit: the rms error [1] that is still good.
-    pareto: the front of gains that trade the error for something else, if one was asked for.
+    Attributes:
+        found: all results of the tuning (`tuning.gains.tune.TuneResult`).
+        mechanism_sha256: SHA-256 of the mechanism's file.
+        limit: largest rms error with a good verdict [1].
+        pareto: points of the Pareto front, if one was requested.
     """
 
     found: "TuneResult"
@@ -36,65 +37,75 @@ class TunedGains:
 
     @property
     def mechanism(self) -> AnyMechanism:
-        """What was tuned for."""
+        """Return the mechanism that the gains were tuned for."""
         return self.found.mechanism
 
     @property
     def compensator(self) -> str:
-        """The name of the law that was tuned."""
+        """Return the name of the tuned compensator."""
         return self.found.compensator
 
     @property
     def gains(self) -> dict[str, float]:
-        """The tuned gains by name [SI units], those that are not tuned among them."""
+        """Return all gains by name [SI units], including those that are not tuned."""
         return self.found.gains
 
     @property
     def literature(self) -> dict[str, float]:
-        """The gains that the literature's rules give, or those of the setting, by name [SI units]."""
+        """Return the gains of the literature's rules, or of the setting, by name [SI units]."""
         return self.found.literature
 
     @property
     def figures(self) -> "dict[str, ErrorFigures]":
-        """Errors on fresh scenarios "before" (no compensation), with the "literature"'s gains and with the
-        "tuned" ones: each has rms, p99, max [1] and more."""
+        """Return the errors on fresh scenarios by gains.
+
+        The keys are "before" (no compensation), "literature" and "tuned"; each value has rms, p99, max [1]
+        and more.
+        """
         return self.found.figures
 
     @property
     def parts(self) -> "dict[str, dict[str, ErrorFigures]]":
-        """In six axes, the same of "energy_error" and "twist_error", each by itself; else nothing."""
+        """Return "energy_error" and "twist_error" of six axes, each like `figures`; empty for one axis."""
         from tuning.gains.tune import figures_of_parts
 
         return figures_of_parts(self.found)
 
     @property
     def verdict(self) -> str:
-        """ "good" if every contact ended with the tuned gains, their rms error is within the limit, and at
-        most 1 % of the real contacts are harder, shorter or longer than the ideal contact allows, with the
-        sensors' noise and without, else "bad"."""
+        """Return the verdict, "good" or "bad".
+
+        It is "good" if, with and without sensor noise, every contact ended, the rms error is within the
+        limit, and at most 1 % of the real contacts are harder, shorter or longer than the ideal contact
+        allows.
+        """
         return "good" if tune_verdict.is_good(self.found, self.limit) else "bad"
 
     @property
     def without_noise(self) -> "ErrorFigures | None":
-        """Errors of the tuned gains on the same scenarios without the sensors' noise; None where the
-        mechanism has none."""
+        """Return the errors on the same scenarios without sensor noise; None without noise in the file."""
         return self.found.without_noise
 
     @functools.cached_property
     def command(self) -> CommandFigures:
-        """What the tuned gains do to the force command: `peak_p99`, the 99th percentile of its peak over the
-        ideal contact's peak force, and `noise_amplification` [1]."""
+        """Return the metrics of the force command with the tuned gains.
+
+        `peak_p99` is the 99th percentile of its peak over the ideal contact's peak force [1], and
+        `noise_amplification` the amplification of the sensor noise [1].
+        """
         return tune_verdict.command_figures(self.found)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for each figure of `command` beyond its bound."""
+        """Return a sentence for each metric of `command` beyond its bound."""
         return tune_verdict.command_warnings(self.found, self.command)
 
     @functools.cached_property
     def meaning(self) -> "Meaning | None":
-        """What the mechanism means: mass, contacts in space, rates; `warnings` of what cannot be meant. In
-        six axes None: a run of `jaxhil.simulate` has it."""
+        """Return a summary of the mechanism: mass, ideal contacts, rates, warnings of implausible values.
+
+        In six axes this is None; a result of `jaxhil.simulate` has the summary.
+        """
         from jaxhil.simulation import plausibility
 
         if isinstance(self.mechanism, SixAxisMechanism):
@@ -103,37 +114,37 @@ class TunedGains:
 
     @functools.cached_property
     def document(self) -> dict[str, Any]:
-        """The content of the gain file."""
+        """Return the content of the gain file."""
         from tuning.gain_file import build_document, envelope_in_space, validity_envelope
         from tuning.transparency.pushes import PUSHES
 
-        found = self.found
-        if isinstance(found.mechanism, SixAxisMechanism):
-            envelope = envelope_in_space(found.scenarios, found.outcomes["tuned"])
+        result = self.found
+        if isinstance(result.mechanism, SixAxisMechanism):
+            envelope = envelope_in_space(result.scenarios, result.outcomes["tuned"])
         else:
-            envelope = validity_envelope(found.mechanism, found.scenarios)
+            envelope = validity_envelope(result.mechanism, result.scenarios)
         return build_document(
-            found.compensator,
-            found.gains,
-            found.mechanism,
+            result.compensator,
+            result.gains,
+            result.mechanism,
             self.mechanism_sha256,
             envelope,
             {
-                "nominal": found.nominal,
-                "robust": found.figures,
-                "tuned_intervals": found.intervals.plain() if found.intervals else None,
+                "nominal": result.nominal,
+                "robust": result.figures,
+                "tuned_intervals": result.intervals.plain() if result.intervals else None,
                 **self.parts,
-                "without_noise": found.without_noise,
+                "without_noise": result.without_noise,
                 "command": self.command,
                 "warnings": self.warnings,
-                **({"honesty": found.transparency, "transparency": PUSHES} if found.transparency else {}),
+                **({"honesty": result.transparency, "transparency": PUSHES} if result.transparency else {}),
             },
-            found.settings.seed,
-            found.timings,
+            result.settings.seed,
+            result.timings,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the gain file. Raises `InputError` when it cannot be written."""
+        """Write the gain file. Raise `InputError` if it cannot be written."""
         from tuning.gain_file import write_gain_file
 
         write_gain_file(arguments.folder("path", path), self.document)
@@ -141,11 +152,12 @@ class TunedGains:
 
 @dataclass(frozen=True)
 class TradedGains:
-    """One point of a front.
+    """Point of a Pareto front.
 
-    tuned: what was tuned without a trade-off.
-    front: the whole front (`tuning.gains.pareto.Front`).
-    point: this point of it (`tuning.gains.pareto.Point`).
+    Attributes:
+        tuned: gains tuned without a trade-off.
+        front: the whole front (`tuning.gains.pareto.Front`).
+        point: this point of the front (`tuning.gains.pareto.Point`).
     """
 
     tuned: TunedGains
@@ -154,17 +166,17 @@ class TradedGains:
 
     @property
     def gains(self) -> dict[str, float]:
-        """By name [SI units]."""
+        """Return the gains of the point by name [SI units]."""
         return self.point.gains
 
     @property
     def figures(self) -> "ErrorFigures":
-        """Errors on fresh scenarios."""
+        """Return the errors on fresh scenarios."""
         return self.point.figures
 
     @property
     def traded(self) -> dict[str, Any]:
-        """The weight of what is traded, its cost, the error [1], and whether no other point beats it."""
+        """Return the weight, the cost, the error [1], and whether the point is on the front."""
         axis = self.front.axis
         return {
             IN_FILES.get(axis.weight, axis.weight): self.point.weight,
@@ -175,31 +187,31 @@ class TradedGains:
 
     @functools.cached_property
     def document(self) -> dict[str, Any]:
-        """The content of the gain file."""
+        """Return the content of the gain file."""
         from tuning.gain_file import build_document, validity_envelope
 
-        found, point = self.tuned.found, self.point
-        mechanism: Any = found.mechanism
+        result, point = self.tuned.found, self.point
+        mechanism: Any = result.mechanism
         figures: dict[str, Any] = {
-            "nominal": {**found.nominal, "tuned": point.nominal},
-            "robust": {**found.figures, "tuned": point.figures},
+            "nominal": {**result.nominal, "tuned": point.nominal},
+            "robust": {**result.figures, "tuned": point.figures},
             "tuned_intervals": point.intervals.plain(),
         }
         if point.transparency is not None:
-            figures["honesty"] = {**found.transparency, "tuned": point.transparency}
+            figures["honesty"] = {**result.transparency, "tuned": point.transparency}
         return build_document(
-            found.compensator,
+            result.compensator,
             point.gains,
-            found.mechanism,
+            result.mechanism,
             self.tuned.mechanism_sha256,
-            validity_envelope(mechanism, found.scenarios),
+            validity_envelope(mechanism, result.scenarios),
             {**figures, "pareto": self.traded},
-            found.settings.seed,
+            result.settings.seed,
             {},
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the gain file. Raises `InputError` when it cannot be written."""
+        """Write the gain file. Raise `InputError` if it cannot be written."""
         from tuning.gain_file import write_gain_file
 
         write_gain_file(arguments.folder("path", path), self.document)

@@ -1,7 +1,7 @@
-"""`tuning.verify`: does the runtime on the rig do what was simulated and tuned?
+"""Function `tuning.verify`: checks that the rig's runtime reproduces the simulated controller.
 
-A bundle is checked from here, file by file, then by its own self-test in a bare interpreter, and then as its
-gain file is.
+A bundle is checked file by file, then by its own self-test in an isolated interpreter, and then its gain file
+is verified.
 """
 
 import os
@@ -19,18 +19,22 @@ from tuning.front_door.options import Allowed, Seed, check_options, number, take
 
 @dataclass(frozen=True)
 class Verification:
-    """What `verify` returns; `document` is all that is known, as `jaxhil verify --json` prints it."""
+    """Result of `verify`.
+
+    Attributes:
+        document: all results, as `jaxhil verify --json` prints them.
+    """
 
     document: dict[str, Any]
 
     @property
     def good(self) -> bool:
-        """Whether the runtime agrees."""
+        """Return whether the runtime agrees with the simulation."""
         return self.document["verdict"]
 
     @property
     def reasons(self) -> list[str]:
-        """Why it is bad; none if it is good."""
+        """Return the reasons for a bad verdict; an empty list for a good one."""
         return list(self.document["reasons"])
 
 
@@ -51,36 +55,39 @@ class VerifyOptions:
 def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification:
     """Replay recorded signals through the rig's runtime.
 
-    Of a bundle, its self-test comes first; nothing is run of one that is not, byte for byte, what this
-    version exports for its gains.
+    For a bundle, the self-test runs first. No code of a bundle is run unless the bundle is byte for byte what
+    this version exports for its gains.
 
     Args:
-        path: of a bundle, a gain file, or the folder of one; or what `tuning.tune` returned.
-        progress: say on standard error what is going on.
-    OPTIONS
+        path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The verdict with its reasons, and all results.
 
     Raises:
-        InputError: one line, if there is nothing to read, or the law has no runtime.
+        InputError: If there is nothing to read, or the compensator has no runtime; the message has one line.
     """
-    asked = VerifyOptions(**options)
-    check_options(asked)
+    settings = VerifyOptions(**options)
+    check_options(settings)
     arguments.flags(progress=progress)
-    key, scenarios, seed = asked.key, asked.scenarios, asked.seed
+    key, scenarios, seed = settings.key, settings.scenarios, settings.seed
     from tuning.bundle.manifest import is_bundle
 
-    given = hasattr(path, "document")
-    folder = None if given else arguments.folder("path", path)
+    is_result = hasattr(path, "document")
+    folder = None if is_result else arguments.folder("path", path)
     if folder is not None and _is_folder(folder) and is_bundle(folder):
         return Verification(_verified_bundle(folder, key, scenarios, seed, progress))
-    file = path if given else arguments.readable_gain_file(path, "path")
+    file = path if is_result else arguments.readable_gain_file(path, "path")
     if key is not None:
         raise ArgumentError("key", shown(str(key)), "only with a bundle: gain files are not signed")
-    named = {} if given else {"file": str(file)}
-    return Verification(_verified(file, named, scenarios, seed, progress))
+    label = {} if is_result else {"file": str(file)}
+    return Verification(_verified(file, label, scenarios, seed, progress))
 
 
 def _verified_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: bool) -> dict[str, Any]:
-    """What verification finds of a bundle."""
+    """Return the document of the verification of a bundle."""
     from tuning.bundle.checking import check_bundle, run_selftest
     from tuning.bundle.signing import verifier
 
@@ -98,24 +105,25 @@ def _verified_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress
     return _verified(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)
 
 
-def _verified(given: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
-    """What verification finds of a gain file."""
+def _verified(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
+    """Return the document of the verification of a gain file, or of gains in memory."""
     with computing():
         import msgspec
 
         from tuning.verification.replay import verify
 
         try:
-            loaded = arguments.gain_file(given)
+            loaded = arguments.gain_file(gains)
         except InputError as error:
             return {**document, "verdict": False, "reasons": [str(error)]}
         arguments.runtime(loaded.compensator)
         with terminal.stages(3, progress) as stages:
-            found = verify(loaded, scenarios, seed, stages.begin)
-        return {**document, "mechanism": loaded.mechanism.name, **msgspec.to_builtins(found)}
+            result = verify(loaded, scenarios, seed, stages.begin)
+        return {**document, "mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
 
 
 def _is_folder(path: Path) -> bool:
+    """Return whether a path is a folder; False if it cannot be read."""
     try:
         return path.is_dir()
     except (OSError, ValueError):

@@ -1,1 +1,1 @@
-"""What people look at when the work is done: stability maps, and the page of a review board."""
+"""Stability maps and the report page for a review board."""

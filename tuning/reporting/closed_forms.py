@@ -1,7 +1,7 @@
-"""What theory says of an uncompensated contact behind a pure delay (notebooks/guide/model.md, section 6).
+"""Closed forms for an uncompensated contact with a pure delay (notebooks/guide/model.md, section 6).
 
-Items 1 and 2 hold for linear contact without damping, item 5 for Kelvin-Voigt contact, both of them in the
-limit of a small control period, of which what is left is its mean delay (item 7).
+Items 1 and 2 hold for linear contact without damping, item 5 for Kelvin-Voigt contact; all hold in the limit
+of a small control period, of which only the mean delay remains (item 7).
 """
 
 import math
@@ -14,24 +14,24 @@ from jaxhil.contact.laws import contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import Scenario
 
-TERMS = 40  # of the series; 4.5^81/81! is far below rounding
-LONGEST_DELAY = 1.0  # omega tau up to which the series has its first zero before 4.5/omega
-ENTRIES = 2049  # of a table of the series, between which straight lines miss less than 1e-6
-INTEGRATORS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # own delay, periods
+TERMS = 40  # terms of the series; 4.5^81/81! is far below the rounding error
+LONGEST_DELAY = 1.0  # omega tau; up to this value the first zero of the series is before 4.5/omega
+ENTRIES = 2049  # entries of a table of the series; linear interpolation has errors below 1e-6
+INTEGRATORS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # delay [control periods]
 
 
 class ClosedForms(NamedTuple):
-    """Of every lane of a batch; None where a form does not apply."""
+    """Closed forms for every lane of a batch; None if a form does not apply."""
 
     series: np.ndarray | None  # restitution e, item 1 [1]
     characteristic_root: np.ndarray | None  # restitution e, item 2 [1]
-    # the delay over the one from which a lasting contact grows, item 5 [1]
+    # delay over the critical one, beyond which a lasting contact grows, item 5 [1]
     delay_over_critical: np.ndarray | None
-    reason: str | None  # why none applies
+    reason: str | None  # reason if no form applies
 
 
 def closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ClosedForms:
-    """What applies to a batch of scenarios of a mechanism, of its stiffest contact each."""
+    """Return the closed forms that apply to a batch of scenarios, for the stiffest contact of each."""
     reason = _reason(mechanism, compensator, scenarios)
     if reason:
         return ClosedForms(None, None, None, reason)
@@ -46,8 +46,11 @@ def closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) ->
 
 
 def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """All that delays the force behind the motion of an ideal motion simulator [s]: its own delay and the
-    sensor's, and of the control period the share of integrator, latency and hold (item 7)."""
+    """Return the total mean delay between force and motion with an ideal motion simulator [s], (lanes,).
+
+    It is the sum of the delays of motion simulator and sensor, and of integrator, latency and hold, which are
+    shares of the control period (item 7).
+    """
     rig = mechanism.rig
     periods = INTEGRATORS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
     sensed = np.asarray(scenarios.force_sensor.delay) + np.asarray(scenarios.simulator.delay)
@@ -55,9 +58,11 @@ def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
 
 
 def series(phase: np.ndarray) -> np.ndarray:
-    """Restitution of x'' = -omega^2 x(t - tau) at phase = omega tau, where 0 <= phase <= 1, else NaN: the
-    motion S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!, from its first zero t_s on for tau, |S'(t_s + tau)|
-    (item 1), time in units of 1/omega."""
+    """Return the restitution of x'' = -omega^2 x(t - tau) at phase = omega tau; NaN unless 0 <= phase <= 1.
+
+    The motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!, with time in units of 1/omega. It continues
+    for tau after its first zero t_s, and the restitution is |S'(t_s + tau)| (item 1).
+    """
     table = np.linspace(0.0, LONGEST_DELAY, ENTRIES)
     low, high = np.full_like(table, 2.0), np.full_like(table, 4.5)
     for _ in range(50):
@@ -70,8 +75,11 @@ def series(phase: np.ndarray) -> np.ndarray:
 
 
 def characteristic_root(phase: np.ndarray) -> np.ndarray:
-    """Restitution exp(pi Re s/|Im s|) at phase = omega tau >= 0, by the root s = (2/tau) W_0(j omega tau/2)
-    of s^2 = -omega^2 e^(-s tau) (item 2)."""
+    """Return the restitution exp(pi Re s/|Im s|) at phase = omega tau >= 0.
+
+    s = (2/tau) W_0(j omega tau/2), with the principal branch W_0 of the Lambert function, is a root of
+    s^2 = -omega^2 e^(-s tau) (item 2).
+    """
     phase = np.asarray(phase, float)
     root = lambertw(0.5j * np.where(phase > 0, phase, 1.0))
     with np.errstate(divide="ignore"):
@@ -80,14 +88,14 @@ def characteristic_root(phase: np.ndarray) -> np.ndarray:
 
 
 def critical_delay(mass: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """tau_c [s] beyond which M x'' + b x'(t - tau) + k x(t - tau) = 0 grows (item 5)."""
+    """Return the delay tau_c [s] beyond which M x'' + b x'(t - tau) + k x(t - tau) = 0 grows (item 5)."""
     square = (damping**2 + np.sqrt(damping**4 + 4 * mass**2 * stiffness**2)) / (2 * mass**2)
     frequency = np.sqrt(square)
     return np.arctan(damping * frequency / stiffness) / frequency
 
 
 def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str | None:
-    """Why no closed form applies, if none does."""
+    """Return the reason why no closed form applies, or None."""
     damping = np.asarray(scenarios.contact.damping)[: mechanism.approach.contacts]
     if compensator != "none":
         return "there is a compensation"
@@ -105,7 +113,7 @@ def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str 
 
 
 def _motion(time: np.ndarray, delay: np.ndarray, derivative: int) -> np.ndarray:
-    """S, or its derivative, where it is made of no more than `TERMS` terms, elementwise."""
+    """Return S(t), or its derivative, elementwise; `TERMS` terms must be enough."""
     total = np.zeros_like(time)
     for n in range(TERMS):
         power = 2 * n + 1 - derivative

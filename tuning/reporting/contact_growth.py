@@ -1,14 +1,14 @@
-"""Whether a contact that lasts grows: the eigenvalues of one control period of the sampled loop in contact.
+"""Growth of a lasting contact: eigenvalues of one control period of the sampled loop in contact.
 
-For a linear contact law and a linear compensator the loop in contact is a linear map from tick to tick of the
-numerical model, the commands on their way, the motion simulator, the force sensor's lag, the readings on
-their way (its delay) and the compensator's filters. The plant between ticks is its exact solution; the map's
-matrix is the derivative of one period written out. The largest of its eigenvalues' magnitudes, the spectral
-radius, tells how much the motion grows per control period: above 1 the contact gains energy however it is
-entered. With the eigenvalue z, growth is ln|z|/T per second, and over half an oscillation, which is what a
-free contact lasts, a factor exp(pi ln|z|/|arg z|).
+For a linear contact law and a linear compensator, the loop in contact is a linear map from tick to tick. Its
+state consists of the numerical model, the delayed commands, the motion simulator, the force sensor's lag, the
+delayed readings, and the compensator's filters. The plant between ticks is solved exactly; the matrix is the
+derivative of one period. The largest magnitude of its eigenvalues, the spectral radius, is the growth per
+control period: above 1, the contact gains energy for any initial state. For the eigenvalue z, the growth is
+ln|z|/T per second, and the factor over half an oscillation, the duration of a free contact, is exp(pi
+ln|z|/|arg z|).
 
-This stands beside `jaxhil.simulation` without using its loop, which the tests hold it against.
+This code does not use the loop of `jaxhil.simulation`; tests compare the two.
 """
 
 from collections.abc import Mapping
@@ -32,48 +32,48 @@ LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
     "smith_hybrid",
 )  # fmt: skip
-SHORTEST_LAG = 1e-3  # control periods; where a batch has lags, one without has this much
-SQUARINGS, TERMS = 12, 12  # of the exponential: to 1e-12 for norms up to 1000
-DEEP = 1e-3  # m, where the loop is linearised: well in contact
-PER_CHUNK = 4_000_000  # numbers of matrices at a time
+SHORTEST_LAG = 1e-3  # control periods; in a batch with lags, lanes without a lag get this one
+SQUARINGS, TERMS = 12, 12  # of the matrix exponential: errors below 1e-12 for norms up to 1000
+DEEP = 1e-3  # m; penetration at which the loop is linearised
+PER_CHUNK = 4_000_000  # matrix entries computed at a time
 
 
 class Shape(NamedTuple):
-    """What shapes the program."""
+    """Static parameters of the compiled program."""
 
     compensator: str
     integrator: str
-    hold: str  # of the command
-    latency: int  # of the command, periods
+    hold: str  # kind of hold of the command
+    latency: int  # latency of the command [control periods]
     has_lag: bool  # whether the force sensor has a lag
-    delays: int  # readings on their way, at most
+    delays: int  # largest number of delayed readings
 
 
 class Lane(NamedTuple):
-    """Numbers of one loop in contact; arrays over lanes where there are several."""
+    """Parameters of one loop in contact, or arrays over lanes."""
 
     mass: Any  # M [kg]
     period: Any  # T [s]
     stiffness: Any  # k [N/m]
     damping: Any  # b [N s/m]
-    numerator: Any  # of the motion simulator, descending powers of s, (order,)
-    denominator: Any  # likewise, (order + 1,)
-    delay: Any  # of motion simulator and force sensor together [s]
-    lag: Any  # of the force sensor [s]
+    numerator: Any  # numerator of the motion simulator, descending powers of s, (order,)
+    denominator: Any  # its denominator, descending powers of s, (order + 1,)
+    delay: Any  # delay of motion simulator plus force sensor [s]
+    lag: Any  # time constant of the force sensor [s]
 
 
 class Growth(NamedTuple):
-    """Of a contact that lasts."""
+    """Growth of a lasting contact."""
 
-    spectral_radius: float  # of one control period [1]
+    spectral_radius: float  # spectral radius of one control period [1]
     per_second: float  # ln(spectral radius)/T [1/s]
-    per_half_oscillation: float | None  # factor on the amplitude [1]; None where nothing oscillates
-    frequency: float  # of the eigenvalue [Hz]
+    per_half_oscillation: float | None  # factor on the amplitude [1]; None without oscillation
+    frequency: float  # frequency of the eigenvalue [Hz]
     by_gain: dict[str, float]  # derivative of the spectral radius [1 over the gain's unit]
 
 
 def no_growth(mechanism: Mechanism, compensator: str) -> str | None:
-    """Why the loop in contact is not linear, if it is not."""
+    """Return the reason why the loop in contact is not linear, or None if it is linear."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
     if not contact_law(mechanism.contact.law).is_linear:
@@ -84,41 +84,43 @@ def no_growth(mechanism: Mechanism, compensator: str) -> str | None:
 def spectral_radii(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, Any], scenarios: Scenario
 ) -> np.ndarray:
-    """The spectral radius of every lane, (lanes,), of that contact of the schedule in which it is largest.
+    """Return the spectral radius of every lane, (lanes,), the largest of all contacts of the schedule.
 
-    `gains` are scalars or have one value a lane.
+    `gains` are scalars or have one value per lane.
     """
     number = len(np.asarray(scenarios.velocity))
-    shape, own = _shape(mechanism, compensator, scenarios), _own(gains, number)
-    found = np.zeros(number)
+    shape, lane_gains = _shape(mechanism, compensator, scenarios), _per_lane(gains, number)
+    largest = np.zeros(number)
     for slot in _contacts(mechanism):
         lanes = _lanes(scenarios, slot)
         size = _size(shape, lanes)
         for start in range(0, number, step := max(1, PER_CHUNK // size**2)):
             part = slice(start, start + step)
-            matrices = _matrices(shape, *jax.tree.map(lambda leaf, part=part: leaf[part], (lanes, own)))
+            matrices = _matrices(
+                shape, *jax.tree.map(lambda leaf, part=part: leaf[part], (lanes, lane_gains))
+            )
             radii = np.max(np.abs(np.linalg.eigvals(np.asarray(matrices))), axis=-1)
-            found[part] = np.maximum(found[part], radii)
-    return found
+            largest[part] = np.maximum(largest[part], radii)
+    return largest
 
 
 def cost(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> float:
-    """Order of the work of one lane's eigenvalues: matrices, size cubed."""
+    """Return the order of magnitude of the operations for one lane's eigenvalues."""
     shape = _shape(mechanism, compensator, scenarios)
     return len(_contacts(mechanism)) * float(_size(shape, _lanes(scenarios, 0))) ** 3
 
 
 def growth(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario) -> Growth:
-    """Of the first lane, with its derivative by every gain, of the contact that grows most."""
+    """Return the growth of the first lane in its fastest growing contact, with the slope by every gain."""
     shape, values = _shape(mechanism, compensator, scenarios), {k: jnp.asarray(v) for k, v in gains.items()}
     most: Growth | None = None
     for slot in _contacts(mechanism):
         lane: Lane = jax.tree.map(lambda leaf: leaf[0], _lanes(scenarios, slot))
         matrix, slopes = _with_slopes(shape, lane, values)
-        found: Any = scipy.linalg.eig(np.asarray(matrix), left=True)
-        eigenvalues, left, right = found
-        place = int(np.argmax(np.abs(eigenvalues)))
-        eigenvalue, left, right = eigenvalues[place], left[:, place].conj(), right[:, place]
+        solution: Any = scipy.linalg.eig(np.asarray(matrix), left=True)
+        eigenvalues, left, right = solution
+        index = int(np.argmax(np.abs(eigenvalues)))
+        eigenvalue, left, right = eigenvalues[index], left[:, index].conj(), right[:, index]
         by_gain = {
             name: float((np.conj(eigenvalue) / abs(eigenvalue) * (left @ np.asarray(slope) @ right)
                          / (left @ right)).real)
@@ -127,25 +129,26 @@ def growth(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], s
         angle, period = abs(np.angle(eigenvalue)), float(lane.period)
         rate = float(np.log(abs(eigenvalue)))
         half = float(np.exp(np.pi * rate / angle)) if angle > 0 else None
-        found = Growth(
+        candidate = Growth(
             float(abs(eigenvalue)), rate / period, half, float(angle / period / 2 / np.pi), by_gain
         )
-        most = found if most is None or found.spectral_radius > most.spectral_radius else most
+        most = candidate if most is None or candidate.spectral_radius > most.spectral_radius else most
     assert most is not None
     return most
 
 
 def _contacts(mechanism: Mechanism) -> list[int]:
-    """The contacts of the schedule that differ from those before."""
+    """Return the contacts of the schedule with distinct stiffness and damping."""
     contact, pairs = mechanism.contact, {}
     for slot in range(mechanism.approach.contacts):
-        own = (contact.stiffness[min(slot, len(contact.stiffness) - 1)],
+        pair = (contact.stiffness[min(slot, len(contact.stiffness) - 1)],
                contact.damping[min(slot, len(contact.damping) - 1)])  # fmt: skip
-        pairs.setdefault(own, slot)
+        pairs.setdefault(pair, slot)
     return sorted(pairs.values())
 
 
 def _shape(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> Shape:
+    """Return the static parameters of the program for a batch."""
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
@@ -154,6 +157,7 @@ def _shape(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> Shape
 
 
 def _lanes(scenarios: Scenario, slot: int) -> Lane:
+    """Return the parameters of every lane in one contact of the schedule."""
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
     numbers = Lane(
         mass=scenarios.equivalent_mass,
@@ -168,29 +172,31 @@ def _lanes(scenarios: Scenario, slot: int) -> Lane:
     return jax.tree.map(np.asarray, numbers)
 
 
-def _own(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
+def _per_lane(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
+    """Return the gains with one value per lane, (number,)."""
     return {name: np.broadcast_to(np.asarray(value, float), (number,)) for name, value in gains.items()}
 
 
 def _size(shape: Shape, lanes: Lane) -> int:
-    """Roughly the rows of a matrix."""
+    """Return the approximate number of rows of a matrix."""
     return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.has_lag + shape.delays + 4
 
 
 @partial(jax.jit, static_argnums=0)
 def _matrices(shape: Shape, lanes: Lane, gains: Gains) -> jax.Array:
+    """Return the matrices of all lanes, (lanes, size, size)."""
     return jax.vmap(partial(_matrix, shape))(lanes, gains)
 
 
 @partial(jax.jit, static_argnums=0)
 def _with_slopes(shape: Shape, lane: Lane, gains: Gains) -> tuple[jax.Array, Gains]:
-    """The matrix, and its derivative by every gain."""
+    """Return the matrix, and its derivative by every gain."""
     matrix = partial(_matrix, shape, lane)
     return matrix(gains), jax.jacfwd(matrix)(gains) if gains else {}
 
 
 def _matrix(shape: Shape, lane: Lane, gains: Gains) -> jax.Array:
-    """The matrix of one control period, (size, size)."""
+    """Return the matrix of one control period, (size, size)."""
     law = COMPENSATORS[shape.compensator]
     constants = Constants(lane.period, jnp.full_like(lane.period, jnp.inf))
     plant = jnp.zeros(lane.numerator.shape[0] + shape.has_lag)
@@ -212,9 +218,9 @@ def _period(
     shape: Shape, law: Compensator, lane: Lane, gains: Gains, constants: Constants, transition: jax.Array,
     reading: jax.Array, before: Any,
 ) -> Any:  # fmt: skip
-    """One control period of the loop in contact, from tick to tick."""
+    """Return the state of the loop in contact after one control period, from tick to tick."""
     position, velocity, commands, plant, readings, state = before
-    # What is read at a tick was sampled so many whole periods before the newest sample.
+    # The reading at a tick was sampled a whole number of periods before the newest sample.
     force = readings[jnp.floor(lane.delay / lane.period + 1e-9).astype(int)]
     signals = Signals(force, position, velocity, position, jnp.asarray(1))
     command, state = law.step(law.prepare(gains, constants), state, signals, jnp.asarray(1))
@@ -231,11 +237,11 @@ def _period(
 
 
 def _plant(shape: Shape, lane: Lane) -> tuple[jax.Array, jax.Array]:
-    """Motion simulator, contact and sensor lag over a control period: rows of the next state, and the row of
-    the reading on its way, of (state, command at the period's start, command at its end).
+    """Return the transition of motion simulator, contact and sensor lag over a control period.
 
-    The exponential of the system augmented by its input and the input's slope (Van Loan 1978), time in
-    control periods; the command is a straight line over the period.
+    The rows of the next state, and the row of the new reading, multiply (state, command at the period's
+    start, command at its end). They come from the exponential of the system augmented by its input and the
+    input's slope (Van Loan 1978), with time in control periods and a linear command within the period.
     """
     order, period = lane.numerator.shape[0], lane.period
     size = order + shape.has_lag
@@ -244,13 +250,13 @@ def _plant(shape: Shape, lane: Lane) -> tuple[jax.Array, jax.Array]:
     position = jnp.zeros(size + 2)
     if order == 0:
         position = position.at[command].set(1.0)
-    for place in range(order):
-        # Powers of s in ascending order, in units that make the command's weight 1.
-        scale = period ** (order - place) / lane.denominator[0]
-        position = position.at[place].set(lane.numerator[order - 1 - place] * scale)
-        generator = generator.at[order - 1, place].set(-lane.denominator[order - place] * scale)
-        if place < order - 1:
-            generator = generator.at[place, place + 1].set(1.0)
+    for power in range(order):
+        # Powers of s ascend, in units in which the weight of the command is 1.
+        scale = period ** (order - power) / lane.denominator[0]
+        position = position.at[power].set(lane.numerator[order - 1 - power] * scale)
+        generator = generator.at[order - 1, power].set(-lane.denominator[order - power] * scale)
+        if power < order - 1:
+            generator = generator.at[power, power + 1].set(1.0)
     if order:
         generator = generator.at[order - 1, command].set(1.0)
     force = lane.stiffness * position + lane.damping / period * (position @ generator)
@@ -258,16 +264,16 @@ def _plant(shape: Shape, lane: Lane) -> tuple[jax.Array, jax.Array]:
         ratio = 1.0 / jnp.maximum(lane.lag / period, SHORTEST_LAG)
         generator = generator.at[order].set(ratio * force).at[order, order].add(-ratio)
         force = jnp.zeros(size + 2).at[order].set(1.0)
-    # A reading at a tick takes the value just before the tick acts: a place in (0, 1].
-    place = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
-    whole, part = (_exponential(generator * share) for share in (jnp.ones_like(place), place))
+    # A reading at a tick has the value just before the tick, so its time lies in (0, 1].
+    time = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
+    whole, part = (_exponential(generator * share) for share in (jnp.ones_like(time), time))
     rows = jnp.concatenate([whole[:size], (force @ part)[None]])
     rows = rows.at[:, command].add(-rows[:, slope])
     return rows[:size], rows[size]
 
 
 def _exponential(matrix: jax.Array) -> jax.Array:
-    """By scaling, Taylor and squaring: `jax.scipy.linalg.expm` takes many times as long to compile."""
+    """Return a matrix exponential by scaling and squaring; `expm` compiles much more slowly."""
     identity, scaled = jnp.eye(len(matrix)), matrix / 2**SQUARINGS
 
     def horner(step: Any, total: jax.Array) -> jax.Array:

@@ -1,10 +1,10 @@
-"""The documents that commands write, as far as a report shows them: types that no foreign file fits."""
+"""Structs for the documents of commands, with the fields that a report shows; wrong files do not fit them."""
 
 from msgspec import Struct
 
 
 class Probability(Struct):
-    """A probability with an interval of 95 %."""
+    """Probability with a 95 % confidence interval."""
 
     value: float
     low: float
@@ -13,7 +13,7 @@ class Probability(Struct):
 
 
 class Quantile(Struct):
-    """Of the worst |e - e*| of a scenario; None where it is infinite."""
+    """Quantile of the worst |e - e*| of a scenario; None if it is infinite."""
 
     order: float
     value: float | None = None
@@ -22,7 +22,7 @@ class Quantile(Struct):
 
 
 class WorstScenario(Struct):
-    """One of a sweep's worst."""
+    """One of the worst scenarios of a sweep."""
 
     index: int
     outcome: str
@@ -32,7 +32,7 @@ class WorstScenario(Struct):
 
 
 class InputShares(Struct):
-    """Sobol indices of an input, with ends of their intervals."""
+    """Sobol indices of an input, with their confidence intervals."""
 
     input: str
     first_order: float | None = None
@@ -44,7 +44,7 @@ class InputShares(Struct):
 
 
 class Drivers(Struct):
-    """What drives the error."""
+    """Sobol indices of the error."""
 
     inputs: list[InputShares]
     cap: float
@@ -53,7 +53,7 @@ class Drivers(Struct):
 
 
 class Rare(Struct):
-    """Subset simulation."""
+    """Result of a subset simulation."""
 
     limit: float
     probability: float
@@ -65,7 +65,7 @@ class Rare(Struct):
 
 
 class SweepVerdict(Struct):
-    """verdict.json of a sweep's store."""
+    """Document verdict.json of a sweep's store."""
 
     sweep_sha256: str
     gains_sha256: str
@@ -89,7 +89,7 @@ class SweepVerdict(Struct):
 
 
 class Estimate(Struct):
-    """A number that was identified, or known beforehand."""
+    """Parameter that was identified, or known beforehand."""
 
     key: str
     value: float
@@ -102,7 +102,7 @@ class Estimate(Struct):
 
 
 class Check(Struct):
-    """What an identification looked for."""
+    """Effect that an identification looked for."""
 
     name: str
     finding: str
@@ -113,7 +113,7 @@ class Check(Struct):
 
 
 class Identification(Struct):
-    """identification.json."""
+    """Document identification.json."""
 
     estimates: list[Estimate]
     checks: list[Check]
@@ -129,15 +129,15 @@ class Identification(Struct):
 
 
 class MonitoredFigure(Struct):
-    """Of a contact, 0 where the mechanism file is right; None where the log does not tell."""
+    """Metric of a contact, 0 if the mechanism file is right; None if the log does not show it."""
 
     value: float | None
     predicted_std: float | None
-    z: float | None  # value less the predicted one, over that
+    z: float | None  # (value - predicted value) / predicted_std
 
 
 class MonitoredContact(Struct):
-    """A contact of later logs."""
+    """Contact of later logs."""
 
     contact: int
     log: str
@@ -146,9 +146,9 @@ class MonitoredContact(Struct):
 
 
 class Monitoring(Struct):
-    """What `jaxhil monitor --json` prints."""
+    """Document of `jaxhil monitor --json`."""
 
-    mechanism: str  # path of its file, or the name of a built-in one
+    mechanism: str  # path of a file, or name of a built-in one
     mechanism_sha256: str | None
     state: str
     reason: str
@@ -156,11 +156,11 @@ class Monitoring(Struct):
     notes: list[str]
     sources: dict[str, str]
     versions: dict[str, str]
-    since: int | None = None  # contact with which a change likely began, from 1
+    since: int | None = None  # number of the contact at which a change likely began, from 1
 
 
 class Figure(Struct):
-    """A figure of a law, with its interval where it has one."""
+    """Metric of a compensator, with its interval if it has one."""
 
     value: float | None = None
     low: float | None = None
@@ -168,21 +168,21 @@ class Figure(Struct):
 
 
 class LawOfComparison(Struct):
-    """A law's figures, by the name of its gains and the figure's."""
+    """Metrics of a compensator by the name of its gains, then by the metric's name."""
 
     law: str
     figures: dict[str, dict[str, Figure]]
 
 
 class MechanismOfComparison(Struct):
-    """All laws on one mechanism."""
+    """Metrics of all compensators for one mechanism."""
 
     mechanism: str
     laws: list[LawOfComparison]
 
 
 class Comparison(Struct):
-    """compare.json."""
+    """Document compare.json."""
 
     limit: float | None
     seed: int
@@ -193,7 +193,7 @@ class Comparison(Struct):
 
 
 class AxisOfMap(Struct):
-    """An axis of map.json."""
+    """Axis of map.json."""
 
     key: str
     unit: str
@@ -202,7 +202,7 @@ class AxisOfMap(Struct):
 
 
 class Theory(Struct):
-    """What theory says at every point of a map."""
+    """Closed forms at every point of a map."""
 
     series: list[list[float | None]] | None = None
     characteristic_root: list[list[float | None]] | None = None
@@ -211,7 +211,7 @@ class Theory(Struct):
 
 
 class RadiusOfMap(Struct):
-    """The spectral radius over its own grid."""
+    """Spectral radius over its own grid."""
 
     x: list[float] | None = None
     y: list[float] | None = None
@@ -220,7 +220,7 @@ class RadiusOfMap(Struct):
 
 
 class GrowthOfMap(Struct):
-    """Of a contact that lasts, at the nominal point."""
+    """Growth of a lasting contact at the nominal point."""
 
     spectral_radius: float
     per_second: float
@@ -230,14 +230,14 @@ class GrowthOfMap(Struct):
 
 
 class MarginOfMap(Struct):
-    """Ends of a range; None where the map ends first."""
+    """Ends of a range; None if the map ends first."""
 
     low: float | None = None
     high: float | None = None
 
 
 class MarginsOfMap(Struct):
-    """Along x and y by their names; None where the nominal point itself is beyond."""
+    """Margins by axis, "x" and "y"; None if the nominal point itself exceeds the limit."""
 
     error: dict[str, MarginOfMap] | None = None
     contact: dict[str, MarginOfMap] | None = None
@@ -245,7 +245,7 @@ class MarginsOfMap(Struct):
 
 
 class NominalOfMap(Struct):
-    """The nominal point."""
+    """Results at the nominal point."""
 
     margins: MarginsOfMap
     restitution: float | None = None
@@ -256,7 +256,7 @@ class NominalOfMap(Struct):
 
 
 class MapDocument(Struct):
-    """map.json."""
+    """Document map.json."""
 
     mechanism: str
     compensator: str

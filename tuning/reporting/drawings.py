@@ -1,7 +1,7 @@
-"""Pictures of a report: those of the other commands, as SVG that stands in the page itself.
+"""Plots of a report as SVG elements in the page.
 
-Nothing is drawn by a script: the pictures are there without JavaScript and on paper. A scenario's point is a
-link to its trace. (A plotting library in the page would add more than 3 MB, and show nothing on paper.)
+No script draws them, so they are visible without JavaScript and on paper; a plotting library would add more
+than 3 MB. The point of a scenario is a link to its plot.
 """
 
 import html
@@ -36,22 +36,22 @@ from tuning.sweeps.regions import Points, add_rows, empty_regions, make_plan
 from tuning.sweeps.replay import motion_of
 from tuning.sweeps.store import Store, kept_part
 
-TYPICAL = 6  # scenarios with traces besides the worst, at equal distances in the order of their errors
-ESTIMATE = ("key", "value", "unit", "std", "low", "high", "prior")  # what a picture shows of one
+TYPICAL = 6  # number of scenarios with plots besides the worst, at equal distances in the order of errors
+ESTIMATE = ("key", "value", "unit", "std", "low", "high", "prior")  # fields of an estimate in its plot
 IDENTIFIER = re.compile(r'<g id="[^"]*"')
 LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
 
 class Drawing(NamedTuple):
-    """A picture in a page."""
+    """Plot in a page."""
 
     svg: str
-    says: str  # what it shows, for those who do not see it
+    says: str  # description for screen readers
     caption: str
 
 
 class Trace(NamedTuple):
-    """A scenario's run."""
+    """Plot of a scenario's run."""
 
     index: int
     text: str  # how it ended
@@ -59,7 +59,7 @@ class Trace(NamedTuple):
 
 
 def nominal_drawing(subject: LoadedGains) -> Drawing:
-    """The nominal run uncompensated, under the literature's gains and under those of the file."""
+    """Draw the nominal run uncompensated, with the literature's gains, and with those of the file."""
     if isinstance(subject.mechanism, SixAxisMechanism):
         return _nominal_in_space(subject)
     law = subject.compensator
@@ -72,6 +72,7 @@ def nominal_drawing(subject: LoadedGains) -> Drawing:
 
 
 def _nominal_in_space(subject: LoadedGains) -> Drawing:
+    """Draw the nominal run of a six-axis mechanism."""
     run = simulate_six_axes(subject.mechanism, subject.compensator, subject.gains)
     figure = six_axes_plot(run.ticks, f"{subject.mechanism.name}, nominal run: {subject.compensator}")
     says = "Pose, forces and moment over time, beside the same contact in space"
@@ -81,7 +82,7 @@ def _nominal_in_space(subject: LoadedGains) -> Drawing:
 
 
 def map_drawing(found: MapDocument) -> Drawing:
-    """The stability map."""
+    """Draw the stability map of a document."""
     title = f"{found.mechanism}, compensation: {found.compensator}"
     figure = map_picture(_map_of(found), title, np.inf if found.limit is None else found.limit)
     says = f"Restitution error over {found.x.key} and {found.y.key}"
@@ -89,9 +90,9 @@ def map_drawing(found: MapDocument) -> Drawing:
 
 
 def estimates_drawing(found: Identification) -> Drawing:
-    """What was identified beside what was known."""
-    known = [one for one in found.estimates if None not in (one.low, one.high)]
-    entries = [{name: getattr(one, name) for name in ESTIMATE} for one in known]
+    """Draw the identified parameters and their prior values."""
+    estimates = [estimate for estimate in found.estimates if None not in (estimate.low, estimate.high)]
+    entries = [{name: getattr(estimate, name) for name in ESTIMATE} for estimate in estimates]
     says = "Every estimate's interval, and the prior's value, over the estimate"
     return Drawing(as_svg(compare(entries)), says, f"{says}.")
 
@@ -99,7 +100,7 @@ def estimates_drawing(found: Identification) -> Drawing:
 def sweep_drawings(
     store: Store, worst: Sequence[WorstScenario], say: Callable[[str], None]
 ) -> tuple[Drawing, list[Trace]]:
-    """Errors of scenarios as points, and the traces of the worst and of some others, which points lead to."""
+    """Draw the errors of scenarios as points, and the runs of the worst and of some others."""
     sweep = build_sweep(store.manifest)
     plan = regions = None
     for part in range(store.manifest.parts):
@@ -110,9 +111,9 @@ def sweep_drawings(
         regions = add_rows(plan, regions or empty_regions(plan), rows)
     assert plan is not None and regions is not None
     points = regions.points
-    texts = {one.index: _ended(one.outcome, one.worst_error, one.worst_contact) for one in worst}
-    for place in _typical(points):
-        texts.setdefault(int(points.index[place]), f"|e - e*| at most {points.size[place]:.4g}")
+    texts = {entry.index: _ended(entry.outcome, entry.worst_error, entry.worst_contact) for entry in worst}
+    for position in _typical(points):
+        texts.setdefault(int(points.index[position]), f"|e - e*| at most {points.size[position]:.4g}")
     name = sweep.mechanism.name
     figure = _points_figure(name, plan.per_scenario, points, store.manifest.limit, list(texts))
     caption = "Scenarios of the sweep. A ringed one leads to its trace below."
@@ -120,18 +121,20 @@ def sweep_drawings(
     traces = []
     for index, text in texts.items():
         say(f"scenario {index}")
-        shown = contact_plot(motion_of(sweep, index), f"{name}, scenario {index}", sensors="rig")
-        own = Drawing(as_svg(shown), f"Force and position over time of scenario {index}", f"{text}.")
-        traces.append(Trace(index, text, own))
+        run_figure = contact_plot(motion_of(sweep, index), f"{name}, scenario {index}", sensors="rig")
+        run_drawing = Drawing(
+            as_svg(run_figure), f"Force and position over time of scenario {index}", f"{text}."
+        )
+        traces.append(Trace(index, text, run_drawing))
     return drawing, traces
 
 
 @matplotlib.style.context("default")
 def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
-    """A figure as an element of a page; links to scenarios, `points`, say how these ended."""
+    """Return a figure as an SVG element; the link to a scenario has its text in `points`."""
     content = io.StringIO()
     FigureCanvasSVG(figure)
-    # Equal figures give equal elements, and what one defines has no name that another's has.
+    # A fixed salt makes equal figures give equal elements, with names that depend on their content.
     with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
         figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     svg = content.getvalue()
@@ -140,8 +143,8 @@ def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
 
     def link(match: re.Match[str]) -> str:
         index = int(match[1])
-        said = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
-        return f'<a href="#scenario-{index}" aria-label="{said}"><title>{said}</title>'
+        label = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
+        return f'<a href="#scenario-{index}" aria-label="{label}"><title>{label}</title>'
 
     return LINK.sub(link, svg).replace("xlink:href", "href")
 
@@ -150,31 +153,32 @@ def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
 def _points_figure(
     name: str, inputs: Sequence[Any], points: Points, limit: float | None, linked: Sequence[int]
 ) -> Figure:
+    """Draw the worst error of scenarios over each input, with rings around the linked scenarios."""
     number = max(1, len(inputs))
     figure = new_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
     panels: Any = figure.subplots(1, number, squeeze=False)[0]
-    places = {int(index): place for place, index in enumerate(points.index)}
-    ringed = [places[index] for index in linked if index in places]
+    positions = {int(index): column for column, index in enumerate(points.index)}
+    rings_at = [positions[index] for index in linked if index in positions]
     finite = points.size[np.isfinite(points.size) & (points.size > 0)]
     high = 1.5 * max([*finite, limit or 0.0, 1e-6])
-    shown = np.clip(np.where(np.isfinite(points.size), points.size, high), 1e-4 * high, None)
-    for place, axes in enumerate(panels):
-        across = points.inputs[place] if inputs else points.index
-        for which, label, colour, marker in (
+    errors = np.clip(np.where(np.isfinite(points.size), points.size, high), 1e-4 * high, None)
+    for column, axes in enumerate(panels):
+        across = points.inputs[column] if inputs else points.index
+        for mask, label, colour, marker in (
             (~points.failed, "not failed", SKY, "."), (points.failed, "failed", VERMILION, "x"),
         ):  # fmt: skip
-            if np.any(which):
-                axes.plot(across[which], shown[which], linestyle="none", marker=marker, markersize=3,
+            if np.any(mask):
+                axes.plot(across[mask], errors[mask], linestyle="none", marker=marker, markersize=3,
                           color=colour, label=label, rasterized=True)  # fmt: skip
-        rings = axes.scatter(across[ringed], shown[ringed], s=55, facecolors=(1, 1, 1, 0.6), edgecolors=BLACK,
-                             linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
-        rings.set_urls([f"#scenario-{int(points.index[one])}" for one in ringed])
+        rings = axes.scatter(across[rings_at], errors[rings_at], s=55, facecolors=(1, 1, 1, 0.6),
+                             edgecolors=BLACK, linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
+        rings.set_urls([f"#scenario-{int(points.index[position])}" for position in rings_at])
         if limit:
             axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
-        label = inputs[place].label if inputs else "scenario [1]"
+        label = inputs[column].label if inputs else "scenario [1]"
         axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
         plain_ticks(axes.yaxis, *axes.get_ylim())
-        if inputs and inputs[place].logarithmic:
+        if inputs and inputs[column].logarithmic:
             axes.set_xscale("log")
             plain_ticks(axes.xaxis, *axes.get_xlim())
         finish(axes, None)
@@ -184,27 +188,28 @@ def _points_figure(
 
 
 def _typical(points: Points) -> list[int]:
-    """Places of scenarios between the smallest and the largest error."""
+    """Return the indices into `points` of scenarios from the smallest to below the largest error."""
     order = np.argsort(points.size, kind="stable")
     order = order[np.isfinite(points.size[order])]
-    wanted = np.linspace(0, len(order) - 1, TYPICAL + 1)[:-1].round().astype(int) if len(order) else []
-    return [int(order[place]) for place in dict.fromkeys(wanted)]
+    ranks = np.linspace(0, len(order) - 1, TYPICAL + 1)[:-1].round().astype(int) if len(order) else []
+    return [int(order[rank]) for rank in dict.fromkeys(ranks)]
 
 
 def _ended(outcome: str, error: float | None, contact: int | None) -> str:
+    """Return a text on the end of a scenario."""
     if error is None:
         return outcome
     return f"{outcome}, e - e* = {error:+.4f}" + ("" if contact is None else f" in contact {contact}")
 
 
 def _map_of(found: MapDocument) -> Map:
-    """The map that a document describes."""
+    """Return the map of a document."""
 
     def table(values: Any) -> Any:
         return None if values is None else np.array(values, float)
 
-    def axis(one: AxisOfMap) -> MapAxis:
-        return MapAxis(one.key, "", (), one.unit, one.nominal, one.values[0], one.values[-1])
+    def axis(entry: AxisOfMap) -> MapAxis:
+        return MapAxis(entry.key, "", (), entry.unit, entry.nominal, entry.values[0], entry.values[-1])
 
     theory, radius, nominal = found.theory, found.spectral_radius, found.nominal
     closed = ClosedForms(
@@ -213,15 +218,21 @@ def _map_of(found: MapDocument) -> Map:
     )  # fmt: skip
     radii = None if radius.values is None else Radii(table(radius.x), table(radius.y), table(radius.values))
     margins = [
-        None if one is None else tuple(Margin(one[axis].low, one[axis].high) for axis in "xy")
-        for one in (nominal.margins.error, nominal.margins.contact, nominal.margins.spectral_radius)
+        None if margin is None else tuple(Margin(margin[axis].low, margin[axis].high) for axis in "xy")
+        for margin in (nominal.margins.error, nominal.margins.contact, nominal.margins.spectral_radius)
     ]
-    grown = None
-    if (own := nominal.growth) is not None:
-        half = own.per_half_oscillation
-        grown = Growth(own.spectral_radius, own.per_second, half, own.frequency, own.by_gain)
+    growth = None
+    if (nominal_growth := nominal.growth) is not None:
+        half = nominal_growth.per_half_oscillation
+        growth = Growth(
+            nominal_growth.spectral_radius,
+            nominal_growth.per_second,
+            half,
+            nominal_growth.frequency,
+            nominal_growth.by_gain,
+        )
     ratios = nominal.peak_force_ratio, nominal.duration_ratio
-    point = Nominal(nominal.restitution, nominal.error, *ratios, grown, *margins)  # pyright: ignore[reportArgumentType]
+    point = Nominal(nominal.restitution, nominal.error, *ratios, growth, *margins)  # pyright: ignore[reportArgumentType]
     return Map(
         axes=(axis(found.x), axis(found.y)),
         x=table(found.x.values),

@@ -1,6 +1,7 @@
-"""The two axes of a stability map: keys of the mechanism file, or gains, from one end to the other.
+"""Axes of a stability map: keys of the mechanism file, or gains, with a range of values.
 
-The entries of a list scale together, and its first one says how far; `contact.stiffness[1]` is one entry.
+The entries of a list are scaled together, and the range is that of the first; `contact.stiffness[1]` is one
+entry.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,42 +21,46 @@ from jaxhil.simulation.plausibility import check_run
 from tuning.sweeps.columns import unit_of
 
 GAINS = "gains."
-NOMINAL_SHARES = 0.3, 3.0  # of the nominal value, where nothing else says how far an axis goes
+NOMINAL_SHARES = 0.3, 3.0  # default range of an axis, over the nominal value
 NORMAL_ENDS = 0.001, 0.999  # probabilities at which the axis of a normal distribution ends
-LOGARITHMIC = 5.0  # from this ratio of its ends on
+LOGARITHMIC = 5.0  # ratio of its ends above which an axis is logarithmic
 ALLOWED = "PATH or PATH=LOW:HIGH, such as contact.stiffness=5e4:5e5"
 
 
 class MapAxis(NamedTuple):
-    """What varies along an axis."""
+    """Axis of a map."""
 
-    key: str  # as asked for: a dotted path, with indices into lists, or gains.NAME
-    path: str  # the key's, without indices; "" for a gain
-    entry: tuple[int, ...]  # of a list, where one is meant
+    key: str  # dotted path as given, with indices into lists, or gains.NAME
+    path: str  # path of the key without indices; "" for a gain
+    entry: tuple[int, ...]  # indices of an entry of a list; () for the whole value
     unit: str  # SI
-    nominal: float  # of the mechanism, or of the gains; of a list that of its first entry
-    low: float
-    high: float
+    nominal: float  # nominal value; for a list that of its first entry
+    low: float  # lower end of the range
+    high: float  # upper end of the range
 
     @property
     def logarithmic(self) -> bool:
+        """Return whether the values have equal ratios instead of equal differences."""
         return self.low > 0 and self.high > LOGARITHMIC * self.low
 
     def values(self, points: int) -> np.ndarray:
-        """So many values from one end to the other, (points,)."""
+        """Return `points` values from the lower to the upper end, (points,)."""
         return (np.geomspace if self.logarithmic else np.linspace)(self.low, self.high, points)
 
 
 def parse_axis(
     name: str, text: Any, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """The axis that PATH or PATH=LOW:HIGH asks for. Raises `InputError` that calls it `name`."""
+    """Return the axis for a text PATH or PATH=LOW:HIGH.
+
+    Raise `InputError`, with `name` as the name of the argument.
+    """
     if not isinstance(text, str):
         raise InputError(f"{name}: found {shown(text)}, allowed {ALLOWED}")
-    key, given, ends = text.partition("=")
+    key, separator, ends = text.partition("=")
     key = key.strip()
     axis = (_gain if key.startswith(GAINS) else _key)(name, key, mechanism, law, gains)
-    if given:
+    if separator:
         axis = axis._replace(**dict(zip(("low", "high"), _ends(name, key, ends), strict=True)))
     if not axis.low < axis.high:
         found = f"{axis.nominal:g} as its value, and nothing that says how far it goes"
@@ -64,21 +69,21 @@ def parse_axis(
 
 
 def draws(mechanism: Mechanism, axes: Sequence[MapAxis], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Values (lanes, axes) of the axes as draws of the mechanism's keys; those of gains are not in them."""
+    """Return the points `values` (lanes, axes) as draws of the mechanism's keys, without those of gains."""
     drawn: dict[str, np.ndarray] = {}
-    for place, axis in enumerate(axes):
+    for index, axis in enumerate(axes):
         if not axis.path:
             continue
         nominal = np.asarray(value_at(mechanism, axis.path), float)
         table = drawn.setdefault(axis.path, np.repeat(nominal[None], len(values), axis=0))
         part = (slice(None), *axis.entry)
-        column = values[:, place].reshape(-1, *[1] * (table[part].ndim - 1))
+        column = values[:, index].reshape(-1, *[1] * (table[part].ndim - 1))
         table[part] = table[part] * (column / axis.nominal) if nominal.ndim and axis.nominal else column
     return drawn
 
 
 def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
-    """At all four corners of the map there is a mechanism that can be run. Raises `InputError`."""
+    """Raise `InputError` unless the keys differ and the mechanisms at all four corners can be simulated."""
     if axes[0].key == axes[1].key:
         raise InputError(f"y: found {axes[1].key}, allowed another key than that of x")
     raw = to_builtins(mechanism)
@@ -93,26 +98,28 @@ def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
 
 
 def _gain(name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]) -> MapAxis:
-    known = {gain.name: gain for gain in law.gains}
-    gain = known.get(key.removeprefix(GAINS))
+    """Return the axis of a gain, with its bounds as the range."""
+    gain_by_name = {gain.name: gain for gain in law.gains}
+    gain = gain_by_name.get(key.removeprefix(GAINS))
     if gain is None:
-        allowed = ", ".join(GAINS + one for one in known) or f"no gain: {law.name} has none"
-        hint = close_match(key.removeprefix(GAINS), known)
+        allowed = ", ".join(GAINS + name for name in gain_by_name) or f"no gain: {law.name} has none"
+        hint = close_match(key.removeprefix(GAINS), gain_by_name)
         raise InputError(f"{name}: found {shown(key)}, allowed {allowed}{hint}")
     low, high, _ = bounds_of(gain, mechanism)
     return MapAxis(key, "", (), gain.unit, gains[gain.name], low, high)
 
 
 def _key(name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]) -> MapAxis:
+    """Return the axis of a key of the mechanism file, with its default range."""
     try:
         parts = parse_key(key)
     except KeyProblem:
         raise InputError(f"{name}: found {shown(key)}, allowed {ALLOWED}") from None
     entry = tuple(part for part in parts if isinstance(part, int))
     path = dotted(parts[: len(parts) - len(entry)])
-    known = [one for one in numeric_keys() if not one.startswith("uncertainty")]
-    if path not in known:
-        raise InputError(f"{name}: found {shown(key)}, allowed a real number{close_match(path, known)}")
+    paths = [name for name in numeric_keys() if not name.startswith("uncertainty")]
+    if path not in paths:
+        raise InputError(f"{name}: found {shown(key)}, allowed a real number{close_match(path, paths)}")
     value = value_at(mechanism, path)
     shape = np.shape(value)
     if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
@@ -129,11 +136,14 @@ def _key(name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Map
 
 
 def _reach(mechanism: Mechanism, path: str, entry: tuple[int, ...], nominal: float) -> tuple[float, float]:
-    """From where to where a key goes: what is drawn of it, else shares of the nominal value within what is
-    allowed; twice the same where there is no such range."""
-    known = mechanism.uncertainty.get(path)
-    if known is not None:
-        if known.distribution == "normal":
+    """Return the default range of a key.
+
+    It is the range of the key's uncertainty, or shares of the nominal value within the allowed values; if
+    there is no such range, both ends are the nominal value.
+    """
+    uncertain = mechanism.uncertainty.get(path)
+    if uncertain is not None:
+        if uncertain.distribution == "normal":
             points = np.repeat(np.array(NORMAL_ENDS)[:, None], sum(dimensions(mechanism).values()), axis=1)
             ends = quantiles(mechanism, points)[path]
         else:
@@ -148,6 +158,7 @@ def _reach(mechanism: Mechanism, path: str, entry: tuple[int, ...], nominal: flo
 
 
 def _ends(name: str, key: str, text: str) -> tuple[float, float]:
+    """Return the two numbers of LOW:HIGH. Raise `InputError`."""
     try:
         low, high = (float(end) for end in text.split(":"))
     except ValueError:

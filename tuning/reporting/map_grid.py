@@ -1,8 +1,7 @@
-"""A stability map: the restitution error over two keys, what theory says there, how far the nominal point is
-from where it ends.
+"""Stability map: restitution error over two keys, closed-form theory, and the margins of the nominal point.
 
-Gains stay what they are over the whole map: it shows what a controller meets that is not told. All points,
-and two lines through the nominal one, are lanes of one program.
+The gains are the same at every point, so that the map shows the effect of changes that the controller does
+not know. All points, and two lines through the nominal one, are batch elements of one program.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -26,20 +25,22 @@ from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spe
 from tuning.reporting.map_axes import MapAxis, draws
 
 LINE = 201  # points of each line through the nominal point
-PART = 2048  # runs at a time
-MOST_WORK = 5e7  # of eigenvalues: where the whole map would take more, the spectral radius has a coarser grid
-FEWEST = 15  # points along an axis of that
+PART = 2048  # largest number of runs computed at a time
+MOST_WORK = (
+    5e7  # cost of all eigenvalues; if the whole map costs more, the spectral radius has a coarser grid
+)
+FEWEST = 15  # smallest number of points along an axis of the coarser grid
 
 
 class Margin(NamedTuple):
-    """Where one key, going from its nominal value, meets a limit; None where the map ends first."""
+    """Nearest values of one key at which a limit is exceeded; None if the map ends first."""
 
-    low: float | None  # the nearest value below the nominal one [unit of the key]
-    high: float | None  # the nearest one above it
+    low: float | None  # nearest value below the nominal one [unit of the key]
+    high: float | None  # nearest value above the nominal one
 
 
 class Radii(NamedTuple):
-    """The spectral radius of the loop in contact, over a grid of its own."""
+    """Spectral radius of the loop in contact, over its own grid."""
 
     x: np.ndarray  # (columns,)
     y: np.ndarray  # (rows,)
@@ -47,33 +48,34 @@ class Radii(NamedTuple):
 
 
 class Nominal(NamedTuple):
-    """The point that the file describes."""
+    """Results at the nominal point, which the mechanism file describes."""
 
     restitution: float | None  # e of the contact with the largest error [1]
-    error: float | None  # its e - e* [1]; None where a contact did not end
-    # of all its contacts the largest real force over the ideal contact's peak force [1]; None likewise
+    error: float | None  # e - e* of that contact [1]; None if a contact did not end
+    # largest ratio of a real contact's peak force to the ideal one's [1]; None if a contact did not end
     peak_force_ratio: float | None
-    duration_ratio: float | None  # likewise of the duration, the one farthest from 1 [1]
-    growth: Growth | None  # of a contact that lasts, where the loop in contact is linear
-    error_margins: tuple[Margin, Margin] | None  # along x and y, to the limit; None where the error is beyond
-    # to the bounds on real peak force and duration; None where the nominal point is beyond
+    duration_ratio: float | None  # ratio of durations farthest from 1 [1]; None if a contact did not end
+    growth: Growth | None  # growth of a lasting contact; None if the loop in contact is not linear
+    error_margins: tuple[Margin, Margin] | None  # along x and y, to the limit; None if the error exceeds it
+    # along x and y, to the bounds on real peak force and duration; None if they are exceeded
     contact_margins: tuple[Margin, Margin] | None
-    radius_margins: tuple[Margin, Margin] | None  # along x and y, to a spectral radius of 1
+    # along x and y, to a spectral radius of 1; None if it is exceeded
+    radius_margins: tuple[Margin, Margin] | None
 
 
 class Map(NamedTuple):
-    """All that is known of a map."""
+    """All results of a map."""
 
-    axes: tuple[MapAxis, MapAxis]  # x and y
-    x: np.ndarray  # (columns,), in the unit of its key
-    y: np.ndarray  # (rows,)
+    axes: tuple[MapAxis, MapAxis]  # axes x and y
+    x: np.ndarray  # values along x, (columns,), in the unit of its key
+    y: np.ndarray  # values along y, (rows,), in the unit of its key
     restitution: np.ndarray  # e of the contact with the largest error (rows, columns) [1]
-    error: np.ndarray  # its e - e* (rows, columns) [1]; NaN where a contact did not end
-    peak_force_ratio: np.ndarray  # as of `Nominal` (rows, columns) [1]; NaN likewise
-    duration_ratio: np.ndarray  # likewise
-    closed: ClosedForms  # each (rows, columns)
-    radii: Radii | None  # of a contact that lasts
-    no_growth: str | None  # why there are no radii
+    error: np.ndarray  # e - e* of that contact (rows, columns) [1]; NaN if a contact did not end
+    peak_force_ratio: np.ndarray  # as in `Nominal` (rows, columns) [1]; NaN if a contact did not end
+    duration_ratio: np.ndarray  # as in `Nominal` (rows, columns) [1]; NaN if a contact did not end
+    closed: ClosedForms  # closed forms, each (rows, columns)
+    radii: Radii | None  # spectral radius of a lasting contact; None if there is none
+    no_growth: str | None  # reason why `radii` is None
     nominal: Nominal
 
 
@@ -89,9 +91,12 @@ def compute_map(
     scheduler: str | None = None,
     kept: Pieces = NOTHING_KEPT,
 ) -> Map:
-    """The map of so many points along either axis; `tell` is called with what is going on, and how many of
-    all `runs` are done. With a `scheduler` the workers of a cluster run the contacts; parts of them are
-    `kept` when finished."""
+    """Compute the map with `points` values along each axis.
+
+    `tell` is called with the current step and the number of finished runs, of `runs(points)`. With a
+    `scheduler`, the workers of a cluster run the contacts. Finished tiles of runs are stored in the
+    checkpoints `kept`.
+    """
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
         return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
@@ -101,27 +106,27 @@ def compute_map(
     middle = np.array([[axis.nominal for axis in axes]])
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
-    own, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    found = _run(mechanism, compensator, own, scenarios, tell, scheduler, kept)
-    restitution, error, force, duration, _ = found
+    point_gains, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
+    worst = _run(mechanism, compensator, point_gains, scenarios, tell, scheduler, kept)
+    restitution, error, force, duration, _ = worst
     size = points**2
 
     tell("eigenvalues of the loop in contact", runs(points))
     reason = no_growth(mechanism, compensator)
-    radii = on_lines = grown = None
+    radii = on_lines = nominal_growth = None
     if reason is None:
         plain = {name: float(value) for name, value in gains.items()}
-        grown = growth(mechanism, compensator, plain, batch(middle)[1])
-        few = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
-        grid = [axis.values(few) for axis in axes]
-        every = spectral_radii(mechanism, compensator, *batch(np.concatenate([_grid(*grid), across, up])))
-        radii = Radii(grid[0], grid[1], every[: few**2].reshape(few, few))
-        on_lines = every[few**2 :].reshape(2, LINE)
+        nominal_growth = growth(mechanism, compensator, plain, batch(middle)[1])
+        coarse = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
+        grid = [axis.values(coarse) for axis in axes]
+        all_radii = spectral_radii(mechanism, compensator, *batch(np.concatenate([_grid(*grid), across, up])))
+        radii = Radii(grid[0], grid[1], all_radii[: coarse**2].reshape(coarse, coarse))
+        on_lines = all_radii[coarse**2 :].reshape(2, LINE)
     closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
-    nominal = _nominal(found, size, axes, lines, limit)
-    if on_lines is not None and grown is not None:
-        margins = _margins(axes, lines, on_lines, 1.0) if grown.spectral_radius <= 1 else None
-        nominal = nominal._replace(growth=grown, radius_margins=margins)
+    nominal = _nominal(worst, size, axes, lines, limit)
+    if on_lines is not None and nominal_growth is not None:
+        margins = _margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
+        nominal = nominal._replace(growth=nominal_growth, radius_margins=margins)
     shape = points, points
     return Map(
         axes=axes,
@@ -139,15 +144,17 @@ def compute_map(
 
 
 def _nominal(
-    found: np.ndarray,
+    worst: np.ndarray,
     size: int,
     axes: tuple[MapAxis, MapAxis],
     lines: list[np.ndarray],
     limit: float,
 ) -> Nominal:
-    """Return the nominal point, the last of all runs, and its margins along the lines; the first `size` runs
-    are the map's."""
-    restitution, error, force, duration, unlike = found
+    """Return the nominal point, which is the last run, and its margins along the lines.
+
+    The first `size` runs are those of the map.
+    """
+    restitution, error, force, duration, unlike = worst
     if not np.isfinite(error[-1]):
         return Nominal(
             restitution=None,
@@ -174,12 +181,12 @@ def _nominal(
 
 
 def runs(points: int) -> int:
-    """How many runs a map of so many points along either axis takes."""
+    """Return the number of runs of a map with `points` values along each axis."""
     return points**2 + 2 * LINE + 1
 
 
 def run_part(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
-    """Return what `_worst` says of each lane of a part, (5, lanes)."""
+    """Run a tile of scenarios, and return the result of `_worst` for each of them, (5, lanes)."""
     return np.stack(_worst(evaluate(loop, gains, scenarios, at_least=at_least)))
 
 
@@ -192,12 +199,13 @@ def _run(
     scheduler: str | None,
     kept: Pieces,
 ) -> np.ndarray:
-    """Return what `_worst` says of each lane, part by part: each has lanes that take long and that do not."""
-    loop, order = (
-        build_loop(mechanism, compensator, scenarios),
-        np.argsort(ONE_AXIS.expected_duration(scenarios)),
-    )
-    found = np.empty((5, len(order)))
+    """Return the result of `_worst` for each run, (5, lanes), computed tile by tile.
+
+    Every tile has a mix of long and short runs, so that all tiles take a similar time.
+    """
+    loop = build_loop(mechanism, compensator, scenarios)
+    order = np.argsort(ONE_AXIS.expected_duration(scenarios))
+    worst = np.empty((5, len(order)))
     parts = -(-len(order) // PART)
     lanes = [order[number::parts] for number in range(parts)]
     inputs = digest_of((to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
@@ -206,83 +214,87 @@ def _run(
 
     def take(number: int, values: np.ndarray) -> None:
         nonlocal done
-        found[:, lanes[number]] = values
+        worst[:, lanes[number]] = values
         done += len(lanes[number])
         tell("running the contacts", done)
 
-    def asked(numbers: Iterable[int]) -> Iterator[Piece]:
+    def tile_pieces(numbers: Iterable[int]) -> Iterator[Piece]:
         for number in numbers:
             part = lanes[number]
-            own = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
-            some = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
-            yield Piece(number, (loop, own, some, len(lanes[0])))
+            tile_gains = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
+            tile_scenarios = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
+            yield Piece(number, (loop, tile_gains, tile_scenarios, len(lanes[0])))
 
     missing = []
     for number in range(parts):
-        known = kept.read(f"part {number}", (inputs, number), np.ndarray)
-        missing.append(number) if known is None else take(number, known)
+        stored = kept.read(f"part {number}", (inputs, number), np.ndarray)
+        missing.append(number) if stored is None else take(number, stored)
     if scheduler is None:
-        computed = ((number, run_part(*arguments)) for number, arguments in asked(missing))
+        computed = ((number, run_part(*arguments)) for number, arguments in tile_pieces(missing))
     else:
-        computed = on_workers(scheduler, run_part, asked(missing), setting(), f"map-{inputs[:16]}")
+        computed = on_workers(scheduler, run_part, tile_pieces(missing), setting(), f"map-{inputs[:16]}")
     for number, values in computed:
         kept.write(f"part {number}", (inputs, number), values)
         take(number, values)
-    return found
+    return worst
 
 
 def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Points of a grid row by row, (rows x columns, 2)."""
+    """Return the points of a grid row by row, (rows x columns, 2)."""
     across, up = np.meshgrid(x, y)
     return np.stack([across.ravel(), up.ravel()], axis=1)
 
 
 def _reshaped(closed: ClosedForms, points: int) -> ClosedForms:
-    """Rows and columns instead of lanes."""
-    series, root, critical = (None if one is None else one.reshape(points, points) for one in closed[:3])
+    """Return the closed forms with rows and columns instead of lanes."""
+    series, root, critical = (
+        None if values is None else values.reshape(points, points) for values in closed[:3]
+    )
     return ClosedForms(series, root, critical, closed.reason)
 
 
 def _scenarios(
     mechanism: Mechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
 ) -> Scenario:
+    """Build the scenarios of the points `values` (lanes, 2), all with the same sensor noise."""
     phase = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
-    made = build_scenarios(mechanism, phase | draws(mechanism, axes, values), seed)
-    # The noise of every lane is that of the first.
-    return made._replace(key=np.broadcast_to(made.key[:, :1], made.key.shape))  # pyright: ignore[reportArgumentType]
+    scenarios = build_scenarios(mechanism, phase | draws(mechanism, axes, values), seed)
+    # Every lane gets the noise of the first, so that points differ only by the keys.
+    return scenarios._replace(key=np.broadcast_to(scenarios.key[:, :1], scenarios.key.shape))  # pyright: ignore[reportArgumentType]
 
 
 def _gains(gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np.ndarray) -> dict[str, Any]:
-    """One value a lane of all of them where a gain varies."""
-    moving = {
-        axis.key.partition(".")[2]: values[:, place] for place, axis in enumerate(axes) if not axis.path
+    """Return the gains of the points `values` (lanes, 2): arrays over lanes if an axis is a gain."""
+    varied = {
+        axis.key.partition(".")[2]: values[:, index] for index, axis in enumerate(axes) if not axis.path
     }
-    if not moving:
+    if not varied:
         return dict(gains)
-    return {name: moving.get(name, np.full(len(values), value)) for name, value in gains.items()}
+    return {name: varied.get(name, np.full(len(values), value)) for name, value in gains.items()}
 
 
 def _worst(outcome: Outcome) -> tuple[np.ndarray, ...]:
-    """Return of each lane e and e - e* of the contact with the largest error, the largest peak force ratio,
-    the duration ratio farthest from 1, and whether a contact is unlike the ideal one.
+    """Return the worst values of each lane, five arrays (lanes,).
 
-    All are NaN where a contact did not end.
+    These are e and e - e* of the contact with the largest error, the largest peak force ratio, the duration
+    ratio farthest from 1, and whether a contact is unlike the ideal one. All are NaN if a contact did not
+    end.
     """
     used = outcome.wanted & outcome.good
     ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)
 
     def at_largest(size: Any, *values: Any) -> Iterator[np.ndarray]:
-        place = np.argmax(np.where(used, np.nan_to_num(size), -1.0), axis=0)[None]
-        for one in values:
-            yield np.where(ended, np.take_along_axis(np.asarray(one, float), place, axis=0)[0], np.nan)
+        index = np.argmax(np.where(used, np.nan_to_num(size), -1.0), axis=0)[None]
+        for value in values:
+            yield np.where(ended, np.take_along_axis(np.asarray(value, float), index, axis=0)[0], np.nan)
 
     force, duration = outcome.peak_force_ratio, outcome.duration_ratio
     with np.errstate(divide="ignore"):
-        apart = np.abs(np.log(duration))
+        deviation = np.abs(np.log(duration))
     return (
         *at_largest(np.abs(outcome.error), outcome.metrics.restitution, outcome.error),
         *at_largest(force, force),
-        *at_largest(apart, duration),
+        *at_largest(deviation, duration),
         *at_largest(outcome.unlike.astype(float), outcome.unlike),
     )
 
@@ -290,26 +302,26 @@ def _worst(outcome: Outcome) -> tuple[np.ndarray, ...]:
 def _margins(
     axes: tuple[MapAxis, MapAxis], lines: list[np.ndarray], values: np.ndarray, most: float
 ) -> tuple[Margin, Margin]:
-    """Where `values` (axes, points) along the lines, each through the nominal point, first exceed `most`."""
-    found = []
+    """Return where `values` (axes, points) along lines through the nominal point first exceed `most`."""
+    margins = []
     for axis, line, along in zip(axes, lines, values, strict=True):
         below, above = line < axis.nominal, line > axis.nominal
-        found.append(
+        margins.append(
             Margin(
                 _crossing(line[below][::-1], along[below][::-1], most),
                 _crossing(line[above], along[above], most),
             )
         )
-    return found[0], found[1]
+    return margins[0], margins[1]
 
 
 def _crossing(line: np.ndarray, values: np.ndarray, most: float) -> float | None:
-    """The first place at which values exceed the most, between two points along a straight line."""
+    """Return the first value on a line at which `values`, linearly interpolated, exceed `most`, or None."""
     beyond = np.flatnonzero(values > most)
     if not len(beyond):
         return None
-    place = int(beyond[0])
-    if place == 0 or not np.isfinite(values[place]):
-        return float(line[place])
-    share = (most - values[place - 1]) / (values[place] - values[place - 1])
-    return float(line[place - 1] + share * (line[place] - line[place - 1]))
+    index = int(beyond[0])
+    if index == 0 or not np.isfinite(values[index]):
+        return float(line[index])
+    share = (most - values[index - 1]) / (values[index] - values[index - 1])
+    return float(line[index - 1] + share * (line[index] - line[index - 1]))

@@ -1,4 +1,4 @@
-"""The picture of a stability map, in the colours and units of the other pictures."""
+"""Plot of a stability map, in the colours and units of the other plots."""
 
 from typing import Any
 
@@ -18,16 +18,15 @@ from tuning.reporting.map_grid import Map
 from tuning.sweeps.pictures import plain_ticks
 from tuning.sweeps.regions import NAMES, UNITS
 
-STEPS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors that have a contour
-LARGEST = 10.0  # error that has a colour of its own
-FEW, MANY = 4, 20  # contours on either side at most, the outermost; ticks of the colour bar
-PALE = "#F7CF85"  # an orange on which black lines are seen
+STEPS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
+LARGEST = 10.0  # largest error on the colour scale
+FEW, MANY = 4, 20  # largest number of contours, and of ticks of the colour bar, for either sign
+PALE = "#F7CF85"  # orange on which black lines are visible
 
 
 @matplotlib.style.context("default")
 def map_picture(found: Map, title: str, limit: float) -> Figure:
-    """The signed error in colours, its contours, those of theory beside them, the nominal point with its
-    margins."""
+    """Draw the signed error in colours with contours, those of theory, and the nominal point with margins."""
     figure = new_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
     axes = figure.subplots()
@@ -36,17 +35,17 @@ def map_picture(found: Map, title: str, limit: float) -> Figure:
     handles += _draw_growth(axes, found)
     handles += _draw_theory(axes, found, x, y, limit)
     handles += _draw_nominal(axes, found)
-    for axis, which in zip(found.axes, (axes.xaxis, axes.yaxis), strict=True):
+    for axis, plot_axis in zip(found.axes, (axes.xaxis, axes.yaxis), strict=True):
         low, high = _shown(axis, np.array([axis.low, axis.high]))
         # A key is text, not a formula.
         label = f"{NAMES.get(axis.key, one_line(axis.key, 60))} [{one_line(_unit(axis), 20)}]"
-        which.set_label_text(label.replace("$", r"\$"))
+        plot_axis.set_label_text(label.replace("$", r"\$"))
         if axis.logarithmic:
-            (axes.set_xscale if which is axes.xaxis else axes.set_yscale)("log")
-            plain_ticks(which, low, high)
+            (axes.set_xscale if plot_axis is axes.xaxis else axes.set_yscale)("log")
+            plain_ticks(plot_axis, low, high)
         else:
-            which.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
-        (axes.set_xlim if which is axes.xaxis else axes.set_ylim)(low, high)
+            plot_axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
+        (axes.set_xlim if plot_axis is axes.xaxis else axes.set_ylim)(low, high)
     finish(axes, None)
     axes.grid(False)
     figure.subplots_adjust(bottom=(0.7 + 0.22 * -(-len(handles) // 2)) / 7.0)
@@ -57,6 +56,7 @@ def map_picture(found: Map, title: str, limit: float) -> Figure:
 def _draw_error(
     figure: Figure, axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
+    """Draw the error in colours with contours, and return the handles for the legend."""
     error = found.error
     anchors = [BLUE, SKY, "white", PALE, VERMILION]
     colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
@@ -73,7 +73,7 @@ def _draw_error(
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.3g}" if value else "0"))
     handles: list[Any] = []
-    levels = [one for one in _levels(error, drawn) if abs(one) != drawn]
+    levels = [level for level in _levels(error, drawn) if abs(level) != drawn]
     if levels:
         lines = axes.contour(x, y, error, levels=levels, colors=BLACK, linewidths=0.8, linestyles="-")
         axes.clabel(lines, fmt=lambda value: f"{value:+.2g}", fontsize=8)
@@ -87,14 +87,14 @@ def _draw_error(
 
 
 def _draw_theory(axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float) -> list[Any]:
-    """The contours that theory has, at the levels of the map's own."""
+    """Draw the contours of the closed forms, and return the handles for the legend."""
     handles: list[Any] = []
     drawn = limit if 0 < limit < np.inf else 0.01
     for values, colour, line, label in (
         (found.closed.series, BLUE, (0, (5, 4)), "theory, small control period: series"),
         (found.closed.characteristic_root, GREEN, (0, (1, 2)), "theory: characteristic root"),
     ):
-        levels = [] if values is None else [one for one in _levels(found.error, drawn) if one > 0]
+        levels = [] if values is None else [level for level in _levels(found.error, drawn) if level > 0]
         if values is not None and levels:
             axes.contour(x, y, values - 1, levels=levels, colors=colour, linewidths=2.0, linestyles=[line])
             handles.append(Line2D([], [], color=colour, linewidth=2.0, linestyle=line, label=label))
@@ -108,17 +108,18 @@ def _draw_theory(axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: fl
 
 
 def _draw_growth(axes: Axes, found: Map) -> list[Any]:
-    """Where the spectral radius of a contact that lasts is 1."""
+    """Draw the contour at which the spectral radius of a lasting contact is 1; return its handle."""
     radii = found.radii
     if radii is None or not np.min(radii.values) < 1 < np.max(radii.values):
         return []
-    x, y = (_shown(axis, one) for axis, one in zip(found.axes, (radii.x, radii.y), strict=True))
+    x, y = (_shown(axis, values) for axis, values in zip(found.axes, (radii.x, radii.y), strict=True))
     axes.contour(x, y, radii.values, levels=[1.0], colors=GREEN, linewidths=2.2)
     label = "spectral radius 1: beyond, a contact that lasts grows"
     return [Line2D([], [], color=GREEN, linewidth=2.2, label=label)]
 
 
 def _draw_nominal(axes: Axes, found: Map) -> list[Any]:
+    """Draw the nominal point and its margins, and return its handle."""
     point = [float(_shown(axis, np.array(axis.nominal))) for axis in found.axes]
     style: dict[str, Any] = {
         "marker": "o",
@@ -130,29 +131,30 @@ def _draw_nominal(axes: Axes, found: Map) -> list[Any]:
     label = "nominal"
     if found.nominal.error_margins is not None:
         label = "nominal, and how far either key may go within the limit"
-        for place, (axis, margin) in enumerate(zip(found.axes, found.nominal.error_margins, strict=True)):
+        for index, (axis, margin) in enumerate(zip(found.axes, found.nominal.error_margins, strict=True)):
             ends = [
                 axis.low if margin.low is None else margin.low,
                 axis.high if margin.high is None else margin.high,
             ]
-            line = [list(_shown(axis, np.array(ends))), [point[1 - place]] * 2]
-            axes.plot(*(line if place == 0 else line[::-1]), color=BLACK, linewidth=1.2, linestyle=":")
+            line = [list(_shown(axis, np.array(ends))), [point[1 - index]] * 2]
+            axes.plot(*(line if index == 0 else line[::-1]), color=BLACK, linewidth=1.2, linestyle=":")
     return [Line2D([], [], linestyle=":" if "and" in label else "none", color=BLACK, label=label, **style)]
 
 
 def _levels(error: np.ndarray, limit: float, most: int = FEW) -> list[float]:
-    """Errors that contours are drawn of: 1 and 3 in each decade, and the limit, within what there is."""
-    sizes = sorted({limit, *(one for one in STEPS if one > 1.5 * limit)})
+    """Return the errors with contours: 1 and 3 in each decade, and the limit, within the range of errors."""
+    sizes = sorted({limit, *(size for size in STEPS if size > 1.5 * limit)})
     low, high = np.nanmin(error, initial=0.0), np.nanmax(error, initial=0.0)
-    above = [one for one in sizes if one < high][-most:]
-    below = [-one for one in sizes if -one > low][-most:]
+    above = [size for size in sizes if size < high][-most:]
+    below = [-size for size in sizes if -size > low][-most:]
     return sorted([*below, *above])
 
 
 def _unit(axis: MapAxis) -> str:
+    """Return the unit of an axis in the plot."""
     return UNITS.get(axis.unit, (1.0, axis.unit))[1]
 
 
 def _shown(axis: MapAxis, values: np.ndarray) -> np.ndarray:
-    """Values in the unit of the picture."""
+    """Return values in the unit of the plot."""
     return UNITS.get(axis.unit, (1.0, axis.unit))[0] * values

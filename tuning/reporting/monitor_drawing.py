@@ -1,4 +1,4 @@
-"""The picture of contacts that were monitored: each figure beside what the mechanism file predicts of it."""
+"""Plot of monitored contacts: each metric with the range that the mechanism file predicts."""
 
 from typing import Any
 
@@ -13,22 +13,23 @@ from tuning.identification.monitor.figures import FIGURES
 from tuning.reporting.documents import Monitoring
 from tuning.reporting.drawings import Drawing, as_svg
 
-WIDE = 1.96  # standard deviations of a 95 % interval
+WIDE = 1.96  # half width of a 95 % interval [standard deviations]
 
 
 def monitor_drawing(found: Monitoring) -> Drawing:
-    """All figures over the contacts."""
+    """Draw all metrics over the number of the contact."""
     says = "Figures of every contact over its number, with their predicted range"
     return Drawing(as_svg(_figure(found)), says, f"{says}, 95 % of contacts of the rig of the file.")
 
 
 @matplotlib.style.context("default")
 def _figure(found: Monitoring) -> Figure:
+    """Return the figure with one panel per metric."""
     name = one_line(found.mechanism, 60)
     figure = new_figure((9.6, 8.4), f"Contacts held against {name}", below=0.95)
     figure.subplots_adjust(hspace=0.3, wspace=0.28)
     grid: Any = figure.subplots(4, 2, sharex=True)
-    numbers = [one.contact for one in found.contacts]
+    numbers = [contact.contact for contact in found.contacts]
     for axes, (figure_name, unit, scale) in zip(grid.flat, FIGURES, strict=False):
         value, std, z = _columns(found, figure_name)
         middle = scale * (value - z * std)
@@ -53,10 +54,10 @@ def _figure(found: Monitoring) -> Figure:
 
 
 def _columns(found: Monitoring, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Value, its predicted standard deviation, and their z, of every contact; NaN for what is not known."""
+    """Return value, predicted standard deviation, and z of a metric for every contact; NaN if unknown."""
     rows = []
-    for one in found.contacts:
-        own = one.figures.get(name)
-        rows.append((None,) * 3 if own is None else (own.value, own.predicted_std, own.z))
+    for contact in found.contacts:
+        metric = contact.figures.get(name)
+        rows.append((None,) * 3 if metric is None else (metric.value, metric.predicted_std, metric.z))
     value, std, z = np.array(rows, float).reshape(-1, 3).T
     return value, std, z

@@ -1,7 +1,7 @@
-"""The page of a review board: one HTML file with all in it, readable without JavaScript and on paper.
+"""Report page for a review board: one self-contained HTML file, readable without JavaScript and on paper.
 
-Whatever comes from a file is text: the template escapes it, and the page's own policy lets no script run but
-its own, which only magnifies pictures.
+The template escapes every text from a file, and the page's content security policy allows only its own
+script, which magnifies plots.
 """
 
 import base64
@@ -25,9 +25,9 @@ HEADLINES = {
 
 
 def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes:
-    """The page of what was read."""
-    found = content.requirements(results)
-    verdict = content.verdict_of(found)
+    """Return the HTML page of the results; `say` is called with the name of each plot."""
+    requirements = content.requirements(results)
+    verdict = content.verdict_of(requirements)
     sections: list[Section | None] = [
         content.assumptions(results),
         rig_sections.identification(results),
@@ -45,19 +45,20 @@ def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made = environment.from_string(_text(TEMPLATE)).render(
+    text = environment.from_string(_text(TEMPLATE)).render(
         title=content.title_of(results),
         verdict=verdict,
         headline=HEADLINES[verdict],
-        requirements=found,
-        sections=[one for one in sections if one is not None],
+        requirements=requirements,
+        sections=[section for section in sections if section is not None],
         style=Markup(_text(STYLE)),
         script=Markup(script),
         script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         drawn=Markup,
     )
-    return made.encode("utf-8")
+    return text.encode("utf-8")
 
 
 def _text(name: str) -> str:
+    """Return the text of a file of this package."""
     return (resources.files("tuning.reporting") / name).read_text(encoding="utf-8")

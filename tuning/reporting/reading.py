@@ -1,4 +1,4 @@
-"""Results as commands wrote them, each recognised, checked against its digest, and against the others."""
+"""Reading of the results of commands: recognition, check of digests, and consistency of all results."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ from tuning.reporting.documents import (
 from tuning.sweeps.manifest import loaded_gains
 from tuning.sweeps.store import VERDICT, Store, read_store
 
-LARGEST = 200_000_000  # bytes of a document
+LARGEST = 200_000_000  # bytes; largest size of a document
 NAMES = ("manifest.json", "gains.json", "identification.json", "compare.json", "map.json")
 ALLOWED = (
     "what jaxhil identify, tune, sweep, compare, map or export wrote, its folder or the JSON file in it, or "
@@ -39,23 +39,23 @@ Kind = TypeVar("Kind")
 
 
 class Source(NamedTuple):
-    """A result that a report is made of."""
+    """Origin of a result in a report."""
 
-    command: str  # that wrote it
+    command: str  # command that wrote it
     path: Path
-    sha256: str  # of its content
+    sha256: str  # SHA-256 of its content
 
 
 @dataclass
 class Results:
-    """All that was given, one of a kind; None for what was not."""
+    """All given results, at most one of each kind; None for the others."""
 
     gains: LoadedGains | None = None  # a gain file
-    store: Store | None = None  # of a sweep
+    store: Store | None = None  # store of a sweep
     sweep: SweepVerdict | None = None
-    bundle: LoadedGains | None = None  # the gain file of a bundle, with its limits
+    bundle: LoadedGains | None = None  # gain file of a bundle, with its limits
     identification: Identification | None = None
-    identified: dict[str, Any] = field(default_factory=dict)  # the mechanism that was identified
+    identified: dict[str, Any] = field(default_factory=dict)  # content of the identified mechanism file
     monitoring: Monitoring | None = None
     comparison: Comparison | None = None
     map: MapDocument | None = None
@@ -63,25 +63,28 @@ class Results:
 
     @property
     def subject(self) -> LoadedGains | None:
-        """The gains that the report is about, if there are any."""
+        """Return the gains that the report is about, or None."""
         if self.bundle is not None or self.gains is not None:
             return self.bundle or self.gains
         return None if self.store is None else loaded_gains(self.store.manifest)
 
     @property
     def axes(self) -> int:
-        """How many axes what the report is about has, 1 or 6."""
+        """Return the number of axes of the mechanism, 1 or 6."""
         return 6 if self.subject is not None and self.subject.document.get("axes") == 6 else 1
 
     @property
     def error(self) -> str:
-        """The sign of an error: that of the restitution, or either of six axes."""
+        """Return the symbol of the error: |e - e*| for one axis, |error| for six."""
         return "|error|" if self.axes == 6 else "|e - e*|"
 
 
 def read_results(paths: list[Path]) -> Results:
-    """The results at these paths. Raises `InputError`, one line, for what is none, was changed since it was
-    written, is there twice, or belongs to something else than the others."""
+    """Read the results at these paths.
+
+    Raise `InputError` if one is no result, was changed after it was written, is there twice, or does not
+    belong to the others.
+    """
     results = Results()
     for path in paths:
         _add(results, path)
@@ -89,8 +92,9 @@ def read_results(paths: list[Path]) -> Results:
     return results
 
 
-def _add(results: Results, given: Path) -> None:
-    where, path = one_line(str(given)), _document_path(given)
+def _add(results: Results, source: Path) -> None:
+    """Read the result at a path, and store it in `results`. Raise `InputError`."""
+    where, path = one_line(str(source)), _document_path(source)
     document = _read(path, where)
     schema = document.get("schema")
     schema = schema if isinstance(schema, str) else ""
@@ -132,22 +136,23 @@ def _add(results: Results, given: Path) -> None:
         raise InputError(f"{where}: found {found}, allowed {ALLOWED}")
 
 
-def _document_path(given: Path) -> Path:
-    """The document that a path means."""
+def _document_path(source: Path) -> Path:
+    """Return the path of the document that a path, possibly a folder, stands for."""
     try:
-        if not given.is_dir():
-            return given
-        there = set(os.listdir(given))
+        if not source.is_dir():
+            return source
+        names = set(os.listdir(source))
     except (OSError, ValueError) as error:
         reason = one_line(getattr(error, "strerror", None) or str(error), 100)
-        raise InputError(f"{one_line(str(given))}: cannot be read: {reason}") from None
+        raise InputError(f"{one_line(str(source))}: cannot be read: {reason}") from None
     for name in NAMES:
-        if name in there:
-            return given / name
-    raise InputError(f"{one_line(str(given))}: found no result, allowed {ALLOWED}")
+        if name in names:
+            return source / name
+    raise InputError(f"{one_line(str(source))}: found no result, allowed {ALLOWED}")
 
 
 def _read(path: Path, where: str) -> dict[str, Any]:
+    """Read a JSON object from a file. Raise `InputError`."""
     try:
         with open_plain(path) as file:
             content = file.read(LARGEST + 1)
@@ -167,10 +172,12 @@ def _read(path: Path, where: str) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> None:
+    """Raise ValueError for NaN or infinity in JSON."""
     raise ValueError(name)
 
 
 def _check_digest(document: dict[str, Any], where: str) -> None:
+    """Raise `InputError` if a document was changed after it was written."""
     found = document.get("sha256")
     if not isinstance(found, str):
         raise InputError(f"{where}: sha256: found nothing, allowed the digest that its command writes")
@@ -181,6 +188,7 @@ def _check_digest(document: dict[str, Any], where: str) -> None:
 
 
 def _typed(document: dict[str, Any], kind: type[Kind], where: str) -> Kind:
+    """Convert a document to a struct. Raise `InputError` if it does not fit."""
     try:
         return msgspec.convert(document, kind)
     except (msgspec.ValidationError, RecursionError) as error:
@@ -188,17 +196,17 @@ def _typed(document: dict[str, Any], kind: type[Kind], where: str) -> Kind:
 
 
 def _check_sweep(store: Store, verdict: dict[str, Any], where: str) -> None:
-    """The verdict is that of the store."""
+    """Raise `InputError` if the verdict does not belong to the store."""
     if verdict["sweep_sha256"] != store.manifest.sha256:
         raise InputError(f"{where}: {VERDICT}: found the verdict of another sweep, allowed its own")
-    for one in verdict["worst"]:
-        if not 0 <= one["index"] < store.manifest.scenarios:
+    for scenario in verdict["worst"]:
+        if not 0 <= scenario["index"] < store.manifest.scenarios:
             allowed = f"0 to {store.manifest.scenarios - 1}"
-            raise InputError(f"{where}: {VERDICT}: worst: found index {one['index']}, allowed {allowed}")
+            raise InputError(f"{where}: {VERDICT}: worst: found index {scenario['index']}, allowed {allowed}")
 
 
 def _check_map(found: MapDocument, where: str) -> None:
-    """Every table has the shape of its axes, and these go up."""
+    """Raise `InputError` unless the axes increase and every table has the shape of its axes."""
     radius = found.spectral_radius
     grids: list[tuple[list[float], list[float], Sequence[Sequence[Any]]]]
     grids = [(found.x.values, found.y.values, table) for table in (found.error, found.restitution)]
@@ -212,12 +220,13 @@ def _check_map(found: MapDocument, where: str) -> None:
 
 
 def _tables(theory: Theory) -> list[list[list[float | None]]]:
-    all_of_them = theory.series, theory.characteristic_root, theory.delay_over_critical
-    return [table for table in all_of_them if table is not None]
+    """Return the tables of the closed forms that apply."""
+    tables = theory.series, theory.characteristic_root, theory.delay_over_critical
+    return [table for table in tables if table is not None]
 
 
 def _bundle(folder: Path, where: str) -> LoadedGains:
-    """The gain file of a bundle that is as it was exported, byte for byte."""
+    """Return the gain file of an unchanged bundle. Raise `InputError` for a changed one."""
     files, problems = selftest.differences(str(folder))
     for name, text in problems:
         raise InputError(f"{where}: {one_line(f'{name}: {text}', 200)}")
@@ -225,31 +234,32 @@ def _bundle(folder: Path, where: str) -> LoadedGains:
 
 
 def _set(results: Results, name: str, value: Any, where: str) -> None:
+    """Store a result. Raise `InputError` if there is already one of the same kind."""
     if getattr(results, name) is not None:
         raise InputError(f"{where}: found another result of the same kind, allowed one of each kind")
     setattr(results, name, value)
 
 
 def _check_together(results: Results) -> None:
-    """All results are of the same gains and the same mechanism. Raises `InputError`."""
+    """Raise `InputError` unless all results have the same gains and mechanism."""
     subject, store = results.subject, results.store
     if subject is None:
         return
-    held = None if store is None else loaded_gains(store.manifest)
-    for name, other in (
+    sweep_gains = None if store is None else loaded_gains(store.manifest)
+    for name, gains in (
         ("the gain file", results.gains),
-        ("the sweep", held),
+        ("the sweep", sweep_gains),
         ("the bundle", results.bundle),
     ):
-        if other is None:
+        if gains is None:
             continue
-        own = {one: getattr(other, one) for one in ("compensator", "gains", "mechanism")}
-        for what, value in own.items():
-            if value != getattr(subject, what):
-                raise InputError(f"{name}: found another {what} than that of the other results, allowed one")
-    found, mechanism = results.comparison, subject.mechanism.name
-    if found is not None and mechanism not in (one.mechanism for one in found.mechanisms):
-        names = ", ".join(one.mechanism for one in found.mechanisms)
+        parts = {part: getattr(gains, part) for part in ("compensator", "gains", "mechanism")}
+        for part, value in parts.items():
+            if value != getattr(subject, part):
+                raise InputError(f"{name}: found another {part} than that of the other results, allowed one")
+    comparison, mechanism = results.comparison, subject.mechanism.name
+    if comparison is not None and mechanism not in (entry.mechanism for entry in comparison.mechanisms):
+        names = ", ".join(entry.mechanism for entry in comparison.mechanisms)
         allowed = one_line(mechanism, 60)
         raise InputError(f"the comparison: found {one_line(names, 100)}, allowed the mechanism {allowed}")
     if results.map is not None and results.map.mechanism != mechanism:

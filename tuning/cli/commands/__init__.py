@@ -1,1 +1,1 @@
-"""One module per command, each with `run(options) -> exit code`; imported when its command runs."""
+"""Commands, one per module with `run(options)`, which returns the exit code; imported on use."""

@@ -1,4 +1,7 @@
-"""What commands check beside the front door's arguments; each raises `InputError`, one line. No jax here."""
+"""Checks of output paths and earlier results, which commands run before they import jax.
+
+Each check raises `InputError` with a message of one line.
+"""
 
 import hashlib
 import json
@@ -13,21 +16,21 @@ from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import follow, open_plain, remove_stale, writing
 from tuning.cli.options import PICTURES
 
-# Names, with any ending, that Windows keeps for devices: results may lie on a disk that both read.
+# Names that Windows reserves for devices, with any ending; results may be copied to such a system.
 DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)
-LONGEST_NAME = 120  # bytes of a folder's name; file systems allow 255, some tools fewer
-MOST_NAMES = 3  # names that a message lists
+LONGEST_NAME = 120  # bytes of a folder's name; file systems allow 255, some tools less
+MOST_NAMES = 3  # largest number of names in a message
 
 
 def picture(path: str) -> None:
-    """A picture can be written there; folders on the way are made."""
+    """Check that a plot can be written to `path`; create its parent folders."""
     if Path(path).suffix.lower() not in PICTURES:
         raise InputError(f"--plot: found {shown(path)}, allowed a name that ends in {', '.join(PICTURES)}")
     file(path)
 
 
 def file(path: str) -> None:
-    """A file can be written there: folders on the way are made, the last rid of what was left unfinished."""
+    """Check that a file can be written to `path`; create its parent folders, delete stale temporary files."""
     target = Path(path)
     with writing(target):
         target = follow(target)
@@ -36,20 +39,20 @@ def file(path: str) -> None:
 
 
 def output(folder: Path) -> None:
-    """Results can be written to a folder: made if need be, and rid of what was left unfinished there."""
+    """Check that results can be written to a folder; create it, and delete stale temporary files."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale(folder)
 
 
 def folder_name(name: str) -> str:
-    """Return a mechanism's name as the name of a folder: letters and digits of any script, in NFC.
+    """Return a folder name made from a mechanism's name: letters and digits of any script, in NFC.
 
-    Names may share one; `own_results` refuses the second.
+    Different mechanisms may get the same folder name; `own_results` then raises an error for the second one.
     """
     composed = unicodedata.normalize("NFC", name)
-    kept = "".join(one if _is_kept(one) else " " for one in composed)
-    folder = re.sub(" +", "_", kept).strip("._") or "mechanism"
+    spaced = "".join(character if _is_permitted(character) else " " for character in composed)
+    folder = re.sub(" +", "_", spaced).strip("._") or "mechanism"
     if DEVICE.fullmatch(folder):
         folder = f"name_{folder}"
     if len(folder.encode()) > LONGEST_NAME:
@@ -58,29 +61,38 @@ def folder_name(name: str) -> str:
     return folder
 
 
-def _is_kept(character: str) -> bool:
-    """Whether a folder's name may have it: a letter with its marks, a digit, a dot, a line."""
+def _is_permitted(character: str) -> bool:
+    """Return whether a folder's name may contain a character: letter, mark, digit, dot, dash, underscore."""
     return character.isalnum() or character in "._-" or unicodedata.category(character)[0] == "M"
 
 
 def own_results(
     document: Path, mark: str, pictures: Sequence[str], mechanisms: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Check that what is to be replaced in the document's folder is of an earlier run, and return it.
+    """Check that the files to be replaced come from an earlier run, and return the earlier document.
 
-    That is the document, a JSON object with the key `mark`, and the pictures beside it; of no other mechanism
-    than those named, if any are. Raise `InputError` otherwise.
+    Args:
+        document: path of the document, a JSON object.
+        mark: key that an earlier document has.
+        pictures: file names of the plots beside the document.
+        mechanisms: names of the mechanisms that the document may be about; empty for any.
+
+    Returns:
+        The earlier document; an empty dictionary if there is none.
+
+    Raises:
+        InputError: If other files, or results for other mechanisms, would be lost.
     """
     with writing(document):
-        os.fsencode(document)  # a locale may lack the letters
+        os.fsencode(document)  # raises an error if the locale cannot encode the path
     names = [name for name in (document.name, *pictures) if os.path.lexists(document.parent / name)]
-    found = _read(document)
-    if names and mark not in found:
+    earlier = _read(document)
+    if names and mark not in earlier:
         where = one_line(str(document.parent / names[0]))
         raise InputError(
             f"{where}: found a file of something else, allowed a folder without one, or --output"
         )
-    lost = sorted(mechanisms_in(found) - {*mechanisms})
+    lost = sorted(mechanisms_in(earlier) - {*mechanisms})
     if mechanisms and lost:
         where, allowed = one_line(str(document)), " or ".join(map(shown, sorted(mechanisms)[:MOST_NAMES]))
         others = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
@@ -88,22 +100,22 @@ def own_results(
             f"{where}: found results of mechanism {shown(lost[0])}{others}, expected those of {allowed}, or "
             "none: name another folder by --output, or the mechanism otherwise"
         )
-    return found
+    return earlier
 
 
 def mechanisms_in(document: Mapping[str, Any]) -> set[str]:
     """Return the names of the mechanisms that a document of results is about."""
     entries = [document, *(document.get("mechanisms") or ())]
-    named = [entry.get("mechanism") for entry in entries if isinstance(entry, Mapping)]
-    names = [one.get("name") if isinstance(one, Mapping) else one for one in named]
+    labels = [entry.get("mechanism") for entry in entries if isinstance(entry, Mapping)]
+    names = [label.get("name") if isinstance(label, Mapping) else label for label in labels]
     return {name for name in names if isinstance(name, str)}
 
 
 def _read(document: Path) -> dict[str, Any]:
-    """Return a JSON object, an empty one where there is none."""
+    """Return the JSON object in a file, or an empty one if there is none."""
     try:
         with open_plain(document) as opened:
-            found = json.loads(opened.read())
+            content = json.loads(opened.read())
     except (OSError, ValueError, TypeError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

@@ -1,4 +1,4 @@
-"""What a command is to run: from --compensator, --gains, --setting and FILE."""
+"""Selection of the mechanism, compensator and gains from --compensator, --gains, --setting and FILE."""
 
 from pathlib import Path
 
@@ -19,47 +19,54 @@ from tuning.front_door import arguments
 
 
 def named(options: Simulate | Map) -> Mechanism | None:
-    """The mechanism of FILE, None where a gain file's is meant. Raises `InputError`, for an unknown
-    compensator too, or one of six axes; imports no jax."""
+    """Return the mechanism of FILE, or None if the mechanism of the gain file is used.
+
+    Raise `InputError`, also for an unknown compensator or a six-axis mechanism. This does not import jax.
+    """
     return load(options.file, options.overrides, options.unset).mechanism if _by_file(options) else None
 
 
 def named_any(options: Simulate) -> AnyMechanism | None:
-    """Likewise, of one axis or of six."""
+    """Return the mechanism of FILE like `named`, with one axis or with six."""
     if options.compensator is not None:
         arguments.fits(options.compensator, None)
     if options.gains is not None and options.file is None:
         return None
-    found = load_any(options.file, options.overrides, options.unset).mechanism
-    arguments.fits(options.compensator or "none", found)
-    return found
+    mechanism = load_any(options.file, options.overrides, options.unset).mechanism
+    arguments.fits(options.compensator or "none", mechanism)
+    return mechanism
 
 
 def in_six_axes(options: Simulate) -> SixAxisMechanism | None:
-    """The mechanism of a gain file of six axes, None of one axis. Raises `InputError`; imports jax."""
+    """Return the mechanism of a six-axis gain file, or None if the gain file has one axis.
+
+    Raise `InputError`. This imports jax.
+    """
     from jaxhil.simulation.gain_file import load_gain_file
 
     assert options.gains is not None
     _check_setting(options)
-    found = load_gain_file(options.gains, any_axes=True).mechanism
-    if not isinstance(found, SixAxisMechanism):
+    mechanism = load_gain_file(options.gains, any_axes=True).mechanism
+    if not isinstance(mechanism, SixAxisMechanism):
         return None
     label = one_line(options.gains)
-    changed = any_from_builtins(to_builtins(found), label, options.overrides, options.unset)
+    changed = any_from_builtins(to_builtins(mechanism), label, options.overrides, options.unset)
     assert isinstance(changed, SixAxisMechanism)
     return changed
 
 
 def _by_file(options: Simulate | Map) -> bool:
+    """Check the compensator's name, and return whether the mechanism comes from FILE."""
     if options.compensator is not None:
         arguments.compensators([options.compensator])
     return options.gains is None or options.file is not None
 
 
 def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechanism, str, str | Path | None]:
-    """Mechanism, compensator, and its setting or gain file, if one is given.
+    """Return the mechanism, the compensator, and its setting or gain file, if any.
 
-    `mechanism` is what `named` returned. Raises `InputError`; imports jax."""
+    `mechanism` is the result of `named`. Raise `InputError`. This imports jax.
+    """
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
@@ -82,5 +89,6 @@ def chosen(options: Simulate | Map, mechanism: Mechanism | None) -> tuple[Mechan
 
 
 def _check_setting(options: Simulate | Map) -> None:
+    """Raise `InputError` if a setting is given together with a gain file."""
     if options.setting is not None:
         raise InputError(f"--setting: found {shown(options.setting)}, allowed none beside a gain file")

@@ -1,4 +1,4 @@
-"""`jaxhil compare`: every compensator, each tuned to its own best, on the same scenarios."""
+"""Command `jaxhil compare`: compares compensators, each tuned, on the same scenarios."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,39 +18,42 @@ PICTURES = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
-    """Compare; what is finished is reported and written, also when interrupted; to resume, it is not computed
-    again. 0, 1 if a law failed, or 130."""
+    """Compare the compensators; write and print the results that are finished, also if interrupted.
+
+    With `--resume`, finished work is not repeated. Return 0, 1 if a compensator failed, or 130 if
+    interrupted.
+    """
     options.check()
     loaded = _load(options)
     folder = Path(options.output)
     checks.output(folder)
-    names = [one.mechanism.name for one in loaded]
+    names = [entry.mechanism.name for entry in loaded]
     checks.own_results(folder / "compare.json", "mechanisms", PICTURES, names)
     prepare()
     from tuning.benchmark.study import Failed
     from tuning.transparency.pushes import PUSHES
 
     laws = options.laws
-    found: dict[str, dict[str, Any]] = {name: {} for name in names}
+    results: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
     pieces = pieces_in(options.output, options.resume)
     with terminal.progress(len(names) * len(laws), "results") as bar:
         try:
-            for one in compare_each(loaded, options, usable_cores(), bar, pieces):
-                if isinstance(one, Failed):
-                    problems.append(f"{one.law}: {one.reason}")
+            for result in compare_each(loaded, options, usable_cores(), bar, pieces):
+                if isinstance(result, Failed):
+                    problems.append(f"{result.law}: {result.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
                 else:
-                    found[one.mechanism][one.law] = one
+                    results[result.mechanism][result.law] = result
         except KeyboardInterrupt:
             interrupted = True
-    ordered = {name: [found[name][law] for law in laws if law in found[name]] for name in names}
+    ordered = {name: [results[name][law] for law in laws if law in results[name]] for name in names}
     done = [name for name in names if ordered[name]]
     document = {
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "tuned": not options.untuned,
         "transparency": PUSHES,
-        "mechanisms": [board(one, options, found[one.mechanism.name]).document for one in loaded],
+        "mechanisms": [board(entry, options, results[entry.mechanism.name]).document for entry in loaded],
         "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
         "problems": problems,
         "interrupted": interrupted,
@@ -68,14 +71,15 @@ def run(options: Compare) -> int:
         _print(options, done, ordered, document)
     say_of_pieces(pieces)
     if interrupted:
-        finished = sum(len(own) for own in ordered.values())
-        kept = f"{finished} of {len(names) * len(laws)} results finished and kept"
-        terminal.note(f"jaxhil: interrupted, {kept}; the same with --resume goes on")
+        finished = sum(len(finished_laws) for finished_laws in ordered.values())
+        progress = f"{finished} of {len(names) * len(laws)} results finished and kept"
+        terminal.note(f"jaxhil: interrupted, {progress}; the same with --resume goes on")
         return 130
     return 1 if problems else 0
 
 
 def _load(options: Compare) -> list[LoadedMechanism]:
+    """Load the mechanisms of the files and, with `--suites`, the standard suites."""
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
     loaded = [load(file, options.overrides, options.unset) for file in files or [None]]
     check_names(loaded)
@@ -83,32 +87,34 @@ def _load(options: Compare) -> list[LoadedMechanism]:
 
 
 def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
-    """Of every law with the first mechanism's gains."""
+    """Return the time per tick [us] of every compensator with the first mechanism's gains."""
     from tuning.benchmark.cost import microseconds_per_tick
     from tuning.benchmark.study import LITERATURE
 
     mechanism = loaded.mechanism
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     return {
-        own.law: microseconds_per_tick(
-            own.law, own.gains[LITERATURE], period, clearance, mechanism.approach.velocity
+        result.law: microseconds_per_tick(
+            result.law, result.gains[LITERATURE], period, clearance, mechanism.approach.velocity
         )
-        for own in ordered[mechanism.name]
+        for result in ordered[mechanism.name]
     }
 
 
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
+    """Draw the plots of errors and transparency."""
     from jaxhil.simulation.contact_plot import save
     from tuning.benchmark.plots import errors_plot, transparency_plot
 
-    drawn = errors_plot(names, ordered, options.limit), transparency_plot(names, ordered)
-    for name, figure in zip(PICTURES, drawn, strict=True):
+    figures = errors_plot(names, ordered, options.limit), transparency_plot(names, ordered)
+    for name, figure in zip(PICTURES, figures, strict=True):
         save(figure, Path(options.output) / name)
 
 
 def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
+    """Print the tables of all mechanisms, the costs, and the meaning of the columns."""
     from jaxhil.laws.compensators import COMPENSATORS
     from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
     from tuning.benchmark.tables import leaderboard, least, mechanism_table

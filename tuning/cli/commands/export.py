@@ -1,4 +1,4 @@
-"""`jaxhil export`: gains as a bundle that a rig computer can check and run by itself."""
+"""Command `jaxhil export`: writes gains as a bundle that a rig computer can check and run."""
 
 import math
 from dataclasses import fields
@@ -13,9 +13,12 @@ from tuning.front_door.export import ExportOptions, allowed_values, export
 
 
 def run(options: Export) -> int:
-    """1 if something is bad, else 0: nothing is written if the runtime's forces are not those simulated."""
-    formats = [name.strip() for given in options.formats for name in given.split(",")]
-    found = export(
+    """Export the bundle and print the result; return 1 if the verdict is bad, else 0.
+
+    Nothing is written if the runtime's forces differ from the simulated ones.
+    """
+    formats = [name.strip() for names in options.formats for name in names.split(",")]
+    result = export(
         options.gains,
         options.output,
         sweep=options.sweep,
@@ -25,16 +28,16 @@ def run(options: Export) -> int:
         **{field.name: getattr(options, field.name) for field in fields(ExportOptions)},
     )
     if options.json:
-        terminal.emit_json(found.document)
+        terminal.emit_json(result.document)
     else:
-        _print(found.document, found.sizes)
-    return 0 if found.good else 1
+        _print(result.document, result.sizes)
+    return 0 if result.good else 1
 
 
-def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
-    """The limits that the user sets, None for no limit. Raises `InputError`."""
+def _replaced(settings: tuple[str, ...]) -> dict[str, float | None]:
+    """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
     replaced: dict[str, float | None] = {}
-    for words in given:
+    for words in settings:
         name, _, text = words.partition("=")
         if name not in LIMITS:
             raise InputError(
@@ -51,13 +54,14 @@ def _replaced(given: tuple[str, ...]) -> dict[str, float | None]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
+    """Print the limits, the alarm rates, the files and the verdict."""
     from tuning.bundle.summary import alarm_rates, is_shown
 
     tables = []
     if document["limits"]:
         rows = [
-            (name, terminal.figure(one["value"], 6), one["unit"])
-            for name, one in document["limits"].items()
+            (name, terminal.figure(limit["value"], 6), limit["unit"])
+            for name, limit in document["limits"].items()
             if is_shown(name)
         ]
         tables.append(terminal.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))

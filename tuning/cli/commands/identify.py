@@ -1,4 +1,4 @@
-"""`jaxhil identify`: from a rig's logs to a mechanism file, or a mechanism file against a rig's logs."""
+"""Command `jaxhil identify`: estimates a mechanism file from a rig's logs, or checks one against them."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,10 @@ PICTURES = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.p
 
 
 def run(options: Identify) -> int:
-    """Identify, write and report; 0, or 1 where the model does not explain the rig. Or draft a mapping: 0."""
+    """Identify, write and report; or only draft a mapping, design commands or check a mechanism.
+
+    Return 1 if the model does not explain the rig, else 0.
+    """
     logs = [Path(log) for log in options.logs]
     if options.guess:
         return _guess(options, logs)
@@ -45,8 +48,8 @@ def run(options: Identify) -> int:
     from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
 
-    kept = pieces_in(options.output, options.resume)
-    asked = Options(
+    pieces = pieces_in(options.output, options.resume)
+    settings = Options(
         order=order,
         law=options.law,
         fixed=fixed,
@@ -56,31 +59,31 @@ def run(options: Identify) -> int:
         limit=options.limit,
         seed=options.seed,
         scheduler=options.scheduler,
-        kept=kept,
+        kept=pieces,
     )
     with terminal.stages(STAGES + 2 + -(-options.bootstrap // FITS)) as stages:
         stages.turn_to("reading the logs")
         campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
         if prior is None:
             _refuse_other_logs(folder / DOCUMENT, earlier, campaign)
-        found = identify(campaign, prior, asked, stages.turn_to)
-        document = _document(options, campaign, prior, found)
-        if found.mechanism is not None:
-            _write(found.mechanism, found.verdict, document, folder)
+        result = identify(campaign, prior, settings, stages.turn_to)
+        document = _document(options, campaign, prior, result)
+        if result.mechanism is not None:
+            _write(result.mechanism, result.verdict, document, folder)
             stages.turn_to("drawing")
-            _draw(found, document, folder)
-        kept.remove()
-    say_of_pieces(kept)
-    terminal.warn([*campaign.notes, *found.notes])
+            _draw(result, document, folder)
+        pieces.remove()
+    say_of_pieces(pieces)
+    terminal.warn([*campaign.notes, *result.notes])
     if options.json:
         terminal.emit_json(document)
     else:
-        _print(document, None if found.mechanism is None else folder)
-    return 0 if found.good else 1
+        _print(document, None if result.mechanism is None else folder)
+    return 0 if result.good else 1
 
 
 def _check_options(options: Identify) -> None:
-    """Check numbers and combinations of options. Raise `InputError` for what cannot be."""
+    """Check the values and combinations of options. Raise `InputError`."""
     arguments.limit(options.limit)
     arguments.integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
@@ -95,8 +98,10 @@ def _check_options(options: Identify) -> None:
 
 
 def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:
-    """Write the mechanism and the document; the document first, which tells the next run that the mechanism
-    beside it is its own."""
+    """Write the document and the mechanism file.
+
+    The document is first: with it, the next run recognises the mechanism file as its own.
+    """
     from tuning.identification.mechanism_file import to_toml
 
     from_builtins(mechanism, "identified mechanism")
@@ -107,7 +112,10 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
 
 
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
-    """Raise `InputError` if earlier results are those of other logs: no name of a prior tells rigs apart."""
+    """Raise `InputError` if earlier results in the folder come from other logs.
+
+    Without a prior, the name of the mechanism does not identify the rig.
+    """
     sources = earlier.get("sources")
     if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
         return
@@ -119,6 +127,7 @@ def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) 
 
 
 def _guess(options: Identify, logs: list[Path]) -> int:
+    """Print a draft of the mapping of the logs' columns; return 0."""
     from tuning.identification.logs.guess import draft
 
     text = draft(logs)
@@ -130,23 +139,24 @@ def _guess(options: Identify, logs: list[Path]) -> int:
 
 
 def _check(options: Identify, logs: list[Path]) -> int:
+    """Compare the logs with a mechanism, and print the result; return 1 if it does not explain them."""
     for name in ("order", "law", "fix", "bayes"):
         if getattr(options, name) != getattr(Identify(), name):
             raise InputError(f"--check: found --{name} beside it, allowed none: nothing is estimated")
-    last = options.prior
-    if last is None:
+    path = options.prior
+    if path is None:
         if len(logs) < 2:
             raise InputError("--check: found no mechanism, allowed one after the logs, or --prior")
-        last = str(logs.pop())
-    mechanism = load(last).mechanism
+        path = str(logs.pop())
+    mechanism = load(path).mechanism
     from tuning.identification.check import check
 
     with terminal.stages(2) as stages:
         stages.turn_to("reading the logs")
         campaign = _of_stage(read_logs(logs, options.map, mechanism), options.stage)
         stages.turn_to("setting them against the mechanism")
-        found = check(campaign, mechanism, options.limit)
-    document = _document(options, campaign, mechanism, found)
+        result = check(campaign, mechanism, options.limit)
+    document = _document(options, campaign, mechanism, result)
     terminal.warn(campaign.notes)
     if options.json:
         terminal.emit_json(document)
@@ -155,25 +165,25 @@ def _check(options: Identify, logs: list[Path]) -> int:
         terminal.emit(
             _left(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
         )
-    return 0 if found.good else 1
+    return 0 if result.good else 1
 
 
-def _draw(found, document: dict[str, Any], folder: Path) -> None:
-    """Pictures beside the file; one that an earlier run drew, and this one cannot, goes."""
+def _draw(result, document: dict[str, Any], folder: Path) -> None:
+    """Draw the plots, and delete those of an earlier run that this run does not draw."""
     from jaxhil.simulation.contact_plot import save
     from tuning.identification import pictures
 
-    drawn = pictures.draw(found, document["estimates"])
+    figures = pictures.draw(result, document["estimates"])
     for name in PICTURES:
         with writing(folder / name):
-            if name in drawn:
-                save(drawn[name], folder / name)
+            if name in figures:
+                save(figures[name], folder / name)
             else:
                 (folder / name).unlink(missing_ok=True)
 
 
 def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) -> Campaign:
-    """The campaign of log files; `mapping` is the file that says what their columns mean."""
+    """Read log files into a campaign; `mapping` is the path of the file that maps their columns."""
     from tuning.identification.logs.campaign import read_campaign
     from tuning.identification.logs.mapping import load_mapping
 
@@ -186,7 +196,7 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
 
 
 def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
-    """The runs of one kind, and those at rest."""
+    """Return the campaign with only the runs of one kind and those at rest."""
     if stage is None:
         return campaign
     runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
@@ -199,6 +209,7 @@ def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
 
 
 def _order(options: Identify) -> int | None:
+    """Return the order of the motion simulator, or None for 'auto'. Raise `InputError`."""
     if options.order == "auto":
         return None
     if not options.order.isdecimal() or int(options.order) > MOST_ORDER:
@@ -207,6 +218,7 @@ def _order(options: Identify) -> int | None:
 
 
 def _fixed(options: Identify) -> dict[str, Any]:
+    """Return the values that the user fixed, by key. Raise `InputError`."""
     fixed: dict[str, Any] = {}
     for text in options.fix:
         try:
@@ -221,43 +233,44 @@ def _fixed(options: Identify) -> dict[str, Any]:
 
 
 def _numbers(value: Any) -> bool:
-    """Whether it is a finite number, or a list of them."""
+    """Return whether a value is a finite number or a non-empty list of them."""
     if isinstance(value, list):
         return bool(value) and all(map(_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, found) -> dict[str, Any]:
-    kinds = [one.kind for one in campaign.runs]
+def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, result) -> dict[str, Any]:
+    """Return the JSON document of an identification or a check."""
+    kinds = [run.kind for run in campaign.runs]
     clock = campaign.timing.clock
     content = {
         "schema": SCHEMA,
-        "estimates": [_entry(one, prior) for one in found.estimates],
-        "combinations": [_entry(one, None) for one in found.combinations],
+        "estimates": [_entry(estimate, prior) for estimate in result.estimates],
+        "combinations": [_entry(estimate, None) for estimate in result.combinations],
         "confounded": [
             dict(zip(("one", "other", "correlation", "experiment"), pair, strict=True))
-            for pair in found.confounded
+            for pair in result.confounded
         ],
         "checks": [
             {
-                **{name: getattr(one, name) for name in ("name", "finding", "where")},
-                "there": bool(one.there),
-                "counts": one.counts,
-                "effect": float(one.effect),
-                "effect_on_error": float(one.effect if one.on_error is None else one.on_error),
+                **{name: getattr(line, name) for name in ("name", "finding", "where")},
+                "there": bool(line.there),
+                "counts": line.counts,
+                "effect": float(line.effect),
+                "effect_on_error": float(line.effect if line.on_error is None else line.on_error),
             }
-            for one in found.lines
+            for line in result.lines
         ],
-        "effect": found.effect,
-        "effect_on_error": found.effect_on_error,
-        "limit": found.limit,
-        "verdict": "good" if found.good else "bad",
-        "reason": found.verdict,
-        "notes": [*campaign.notes, *found.notes],
+        "effect": result.effect,
+        "effect_on_error": result.effect_on_error,
+        "limit": result.limit,
+        "verdict": "good" if result.good else "bad",
+        "reason": result.verdict,
+        "notes": [*campaign.notes, *result.notes],
         "runs": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
         "clock": None if clock is None else {**vars(clock)},
         "sources": campaign.sources,
-        "mechanism": found.mechanism,
+        "mechanism": result.mechanism,
         "seed": options.seed,
         "versions": versions(),
     }
@@ -265,43 +278,46 @@ def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, fo
     return {**plain, "sha256": digest(plain)}
 
 
-def _entry(one, prior: Mechanism | None) -> dict[str, Any]:
-    """An estimate, with what the prior says and by how many standard deviations it is off that."""
-    told = _told(prior, one.key)
+def _entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
+    """Return the JSON entry of an estimate, with the prior's value and the deviation from it in std."""
+    expected = _prior_value(prior, estimate.key)
     return {
-        "key": one.key,
-        "value": one.value,
-        "std": one.std,
-        "low": one.low,
-        "high": one.high,
-        "unit": one.unit,
-        "known": one.told,
-        "prior": told,
-        "deviation": None if told is None or not one.std else (one.value - told) / one.std,
+        "key": estimate.key,
+        "value": estimate.value,
+        "std": estimate.std,
+        "low": estimate.low,
+        "high": estimate.high,
+        "unit": estimate.unit,
+        "known": estimate.told,
+        "prior": expected,
+        "deviation": None
+        if expected is None or not estimate.std
+        else (estimate.value - expected) / estimate.std,
     }
 
 
-def _told(prior: Mechanism | None, key: str) -> float | None:
-    """The prior's value of a key; the last entry of a list repeats."""
+def _prior_value(prior: Mechanism | None, key: str) -> float | None:
+    """Return the prior's value of a key; the last entry of a list repeats."""
     if prior is None:
         return None
-    path, _, place = key.rpartition(".")
+    path, _, index = key.rpartition(".")
     try:
-        value = value_at(prior, path if place.isdigit() else key)
+        value = value_at(prior, path if index.isdigit() else key)
     except AttributeError:
         return None
     if isinstance(value, list):
-        value = value[min(int(place or 0), len(value) - 1)] if value and place.isdigit() else None
+        value = value[min(int(index or 0), len(value) - 1)] if value and index.isdigit() else None
     return float(value) if isinstance(value, (int, float)) else None
 
 
 def _print(document: dict[str, Any], folder: Path | None) -> None:
+    """Print the estimates, the checks and the verdict."""
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
-    rows = [_row(one) for one in (*document["estimates"], *document["combinations"])]
+    rows = [_row(entry) for entry in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
-    things: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
-    things.append(_left(document, "What the model leaves"))
-    things += [
+    items: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
+    items.append(_left(document, "What the model leaves"))
+    items += [
         f"{pair['one']} and {pair['other']} are hardly told apart (correlation {pair['correlation']:.3f}): "
         f"{pair['experiment']} would."
         for pair in document["confounded"]
@@ -311,32 +327,32 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
         if folder is None
         else [f"Wrote {folder / MECHANISM}, {folder / DOCUMENT} and pictures beside them"]
     )
-    terminal.emit(*things, f"{document['reason']}.", *wrote)
+    terminal.emit(*items, f"{document['reason']}.", *wrote)
 
 
 def _left(document: dict[str, Any], title: str) -> Any:
-    """The checks as a table."""
+    """Return the table of checks."""
     rows = []
-    for one in document["checks"]:
-        found = ", ".join(filter(None, (one["finding"], one["where"])))
+    for check in document["checks"]:
+        finding = ", ".join(filter(None, (check["finding"], check["where"])))
         effects = [
-            terminal.figure(one[name] * one["there"], 2) if one["counts"] else "-"
+            terminal.figure(check[name] * check["there"], 2) if check["counts"] else "-"
             for name in ("effect", "effect_on_error")
         ]
-        rows.append([one["name"], found, *effects])
+        rows.append([check["name"], finding, *effects])
     return terminal.table(title, ["check", "found", "effect on e", "on e-e*"], rows, (0, 1))
 
 
-def _row(one: dict[str, Any]) -> list[Any]:
-    """Numbers in so many digits as they are known to; how many standard deviations they are off the prior."""
+def _row(entry: dict[str, Any]) -> list[Any]:
+    """Return the table row of an estimate, with as many digits as its uncertainty supports."""
     digits = 4
-    if one["std"] and one["value"]:
-        digits = min(max(1 + math.ceil(math.log10(abs(one["value"]) / one["std"])), 2), 9)
-    off = one["deviation"]
+    if entry["std"] and entry["value"]:
+        digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 9)
+    deviation = entry["deviation"]
     return [
-        one["key"],
-        *(terminal.figure(float(one[name]), digits) for name in ("value", "low", "high")),
-        one["unit"],
-        one["prior"],
-        "-" if off is None else f"{off:+.1f} std",
+        entry["key"],
+        *(terminal.figure(float(entry[name]), digits) for name in ("value", "low", "high")),
+        entry["unit"],
+        entry["prior"],
+        "-" if deviation is None else f"{deviation:+.1f} std",
     ]

@@ -1,4 +1,4 @@
-"""`jaxhil identify --design`: commands for a rig that tell its numbers as well as its limits allow."""
+"""Command `jaxhil identify --design`: designs the rig commands that best identify a mechanism."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ COMPENSATOR = "response_error"
 
 
 def run(options: Identify) -> int:
-    """Write both commands and what they will tell; 0."""
-    given = [*options.logs, *([options.prior] if options.prior is not None else [])]
-    if len(given) != 1:
-        raise InputError(f"--design: found {len(given)} mechanisms, allowed one, roughly known")
+    """Write the commands of both runs and the predicted uncertainty; return 0."""
+    mechanisms = [*options.logs, *([options.prior] if options.prior is not None else [])]
+    if len(mechanisms) != 1:
+        raise InputError(f"--design: found {len(mechanisms)} mechanisms, allowed one, roughly known")
     if not 0.0 < options.stroke <= 1.0:
         raise InputError(f"--stroke: found {options.stroke:g} m, allowed a number > 0 and <= 1 m")
     arguments.integers(0, seed=options.seed)
-    mechanism = load(given[0]).mechanism
+    mechanism = load(mechanisms[0]).mechanism
     folder = Path(options.output)
     checks.output(folder)
     checks.own_results(folder / DOCUMENT, "predicted", ("free.csv", "press.csv"))
@@ -47,14 +47,14 @@ def run(options: Identify) -> int:
         stages.turn_to("looking for the motions that tell most")
         gains = choose_gains(mechanism, COMPENSATOR, None)[1]
         slopes_by = partial(error_slopes, mechanism, COMPENSATOR, gains)
-        found = design(mechanism, options.stroke, slopes_by, options.seed)
+        result = design(mechanism, options.stroke, slopes_by, options.seed)
     sensors = mechanism.rig.position_sensor, mechanism.rig.force_sensor
-    if not all(one.noise_std or one.quantum for one in sensors):
+    if not all(sensor.noise_std or sensor.quantum for sensor in sensors):
         terminal.warn(["where the mechanism states no noise, 5 um and 0.5 N are assumed"])
-    document = _document(options, mechanism.name, found)
+    document = _document(options, mechanism.name, result)
     period = mechanism.rig.control_period
-    for name, one in (("free", found.free), ("press", found.press)):
-        _write(folder / f"{name}.csv", one, period)
+    for name, excitation in (("free", result.free), ("press", result.press)):
+        _write(folder / f"{name}.csv", excitation, period)
     with writing(folder / DOCUMENT):
         write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
     if options.json:
@@ -65,14 +65,16 @@ def run(options: Identify) -> int:
 
 
 def _write(path: Path, excitation: Excitation, period: float) -> None:
+    """Write an excitation to a CSV file with the columns time [s] and position_desired [m]."""
     rows = [f"{period * n:.9g},{x:.9g}\n" for n, x in enumerate(excitation.position.tolist())]
     with writing(path):
         write_whole(path, "".join(["time,position_desired\n", *rows]).encode("ascii"))
 
 
-def _document(options: Identify, name: str, found: Design) -> dict[str, Any]:
-    effects = np.sqrt(np.mean(found.slopes**2, axis=0)) * found.std
-    numbers = zip(found.keys, found.values, found.std, effects, strict=True)
+def _document(options: Identify, name: str, design: Design) -> dict[str, Any]:
+    """Return the JSON document of the design."""
+    effects = np.sqrt(np.mean(design.slopes**2, axis=0)) * design.std
+    numbers = zip(design.keys, design.values, design.std, effects, strict=True)
     content = {
         "schema": SCHEMA,
         "mechanism": one_line(name),
@@ -80,18 +82,19 @@ def _document(options: Identify, name: str, found: Design) -> dict[str, Any]:
             {"key": key, "value": value, "std": std, "effect": effect, "unit": _unit(key)}
             for key, value, std, effect in numbers
         ],
-        "error": found.error,
-        "flat": found.flat,
+        "error": design.error,
+        "flat": design.flat,
         "runs": {
             kind: {
-                "crest_factor": one.crest,
-                "rms": float(np.sqrt(0.5 * np.sum(one.amplitude**2))),
-                "rows": len(one.position),
+                "crest_factor": excitation.crest,
+                "rms": float(np.sqrt(0.5 * np.sum(excitation.amplitude**2))),
+                "rows": len(excitation.position),
                 "lines": [
-                    [f, a] for f, a in zip(one.frequency.tolist(), one.amplitude.tolist(), strict=True)
+                    [f, a]
+                    for f, a in zip(excitation.frequency.tolist(), excitation.amplitude.tolist(), strict=True)
                 ],
             }
-            for kind, one in (("free", found.free), ("press", found.press))
+            for kind, excitation in (("free", design.free), ("press", design.press))
         },
         "stroke": options.stroke,
         "seed": options.seed,
@@ -102,6 +105,7 @@ def _document(options: Identify, name: str, found: Design) -> dict[str, Any]:
 
 
 def _unit(key: str) -> str:
+    """Return the unit of a key, without its list indices."""
     parts = key.split(".")
     while parts[-1].isdigit():
         parts.pop()
@@ -109,17 +113,18 @@ def _unit(key: str) -> str:
 
 
 def _print(document: dict[str, Any], folder: Path) -> None:
+    """Print the predicted uncertainty, the crest factors and the files."""
     rows = [
-        [one[name] for name in ("key", "value", "std", "unit", "effect")] for one in document["predicted"]
+        [entry[name] for name in ("key", "value", "std", "unit", "effect")] for entry in document["predicted"]
     ]
     headings = ["number", "value", "std", "unit", "effect on e"]
-    things: list[Any] = [terminal.table("What logs of both runs will tell", headings, rows, (0, 3))]
+    items: list[Any] = [terminal.table("What logs of both runs will tell", headings, rows, (0, 3))]
     runs = document["runs"]
-    things.append(
+    items.append(
         f"Together they leave {document['error']:.2g} of e, flat spectra within the same limits "
         f"{document['flat']:.2g} times that; crest factors {runs['free']['crest_factor']:.2f} and "
         f"{runs['press']['crest_factor']:.2f}."
     )
     files = ", ".join(str(folder / name) for name in ("free.csv", "press.csv"))
-    things.append(f"Wrote {files} and {folder / DOCUMENT}")
-    terminal.emit(*things)
+    items.append(f"Wrote {files} and {folder / DOCUMENT}")
+    terminal.emit(*items)

@@ -1,4 +1,4 @@
-"""`jaxhil map`: the restitution error over two keys of a mechanism."""
+"""Command `jaxhil map`: computes the restitution error over two keys of a mechanism."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -17,7 +17,7 @@ from tuning.front_door.options import check_options
 
 
 def run(options: Map) -> int:
-    """Compute, write and report the map; 0."""
+    """Compute, write and report the map; return 0."""
     check_options(options)
     mechanism = named(options)
     target = Path(options.output)
@@ -25,19 +25,21 @@ def run(options: Map) -> int:
     prepare()
     mechanism, compensator, gains = chosen(options, mechanism)
     checks.own_results(target / DOCUMENT, "theory", [PICTURE], [mechanism.name])
-    asked = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
-    made = map(mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **asked)
+    settings = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
+    stability_map = map(
+        mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **settings
+    )
     meaning.say(mechanism, None if options.json else terminal.emit_line)
     if options.json:
-        terminal.emit_json(made.document)
+        terminal.emit_json(stability_map.document)
     else:
-        terminal.emit(*_lines(made.document))
+        terminal.emit(*_lines(stability_map.document))
         terminal.emit_line(f"Wrote {one_line(str(target / DOCUMENT))} and {PICTURE}")
     return 0
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """The nominal point, its margins, and what theory does not say and why."""
+    """Yield sentences on the nominal point, its margins, and why theory is missing."""
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
     if error is None:
@@ -60,11 +62,11 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
         yield f"No spectral radius: {document['spectral_radius']['none_because']}."
     else:
         radius, rate = growth["spectral_radius"], growth["per_second"]
-        said = f"{'grows' if rate > 0 else 'decays'} by {abs(rate):.4g} per second"
-        said += f" at {growth['frequency']:.3g} Hz"
+        text_of_rate = f"{'grows' if rate > 0 else 'decays'} by {abs(rate):.4g} per second"
+        text_of_rate += f" at {growth['frequency']:.3g} Hz"
         half = growth["per_half_oscillation"]
         factor = "" if half is None else f", by the factor {half:.4f} over half an oscillation"
-        yield f"A contact that lasts {said}{factor} (spectral radius {radius:.6f} a control period)."
+        yield f"A contact that lasts {text_of_rate}{factor} (spectral radius {radius:.6f} a control period)."
         if growth["by_gain"]:
             slopes = ", ".join(f"{slope:+.3g} by {name}" for name, slope in growth["by_gain"].items())
             yield f"Derivative of the spectral radius, in SI units: {slopes}."
@@ -83,12 +85,13 @@ def _allowed(document: Mapping[str, Any]) -> str:
 
 
 def _margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the range of each key in which a condition holds."""
     for axis in "xy":
-        known, values = margins[axis], document[axis]["values"]
+        margin, values = margins[axis], document[axis]["values"]
         ends = [
-            f"{document[axis]['values'][place]:.4g} (the map's end)"
-            if known[end] is None
-            else f"{known[end]:.4g}"
-            for end, place in (("low", 0), ("high", len(values) - 1))
+            f"{document[axis]['values'][index]:.4g} (the map's end)"
+            if margin[end] is None
+            else f"{margin[end]:.4g}"
+            for end, index in (("low", 0), ("high", len(values) - 1))
         ]
         yield f"{document[axis]['key']}: from {ends[0]} to {ends[1]} {document[axis]['unit']}"

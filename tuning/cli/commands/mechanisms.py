@@ -1,4 +1,4 @@
-"""`jaxhil mechanisms`: the built-in mechanism files and the standard suites, and the schema of such files."""
+"""Command `jaxhil mechanisms`: lists the built-in mechanism files and suites, or prints the schema."""
 
 import math
 from typing import Any
@@ -21,7 +21,7 @@ from tuning.cli.options import Mechanisms
 
 
 def run(options: Mechanisms) -> int:
-    """List them; always 0."""
+    """Print the lists or the schema; return 0."""
     if options.schema:
         terminal.emit_json(json_schema())
         return 0
@@ -29,10 +29,10 @@ def run(options: Mechanisms) -> int:
     tables = {
         title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
     }
-    in_space = [_entry_in_space(name) for name in six_axis_names()]
+    six_axes = [_six_axis_entry(name) for name in six_axis_names()]
     if options.json:
         mechanisms, suites = tables.values()
-        terminal.emit_json({"mechanisms": mechanisms, "suites": suites, "six_axes": in_space})
+        terminal.emit_json({"mechanisms": mechanisms, "suites": suites, "six_axes": six_axes})
         return 0
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():
@@ -40,24 +40,26 @@ def run(options: Mechanisms) -> int:
             terminal.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
             *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
         )
-    rows = [[*(one[key] for key in COLUMNS), " ".join(one["laws"])] for one in in_space]
+    rows = [[*(entry[key] for key in COLUMNS), " ".join(entry["laws"])] for entry in six_axes]
     terminal.emit(
         terminal.table(
             "Built-in mechanisms of six axes (simulate alone knows them so far)",
             ["name", "masses [kg]", "pairs of shapes", "laws"], rows, texts=(0, 1, 3),
         ),
-        *(f"{one['name']}: {one['source']}\n" for one in in_space),
+        *(f"{entry['name']}: {entry['source']}\n" for entry in six_axes),
     )  # fmt: skip
     terminal.emit(f"The files are in {builtin_path(DEFAULT).parent}; `jaxhil init NAME` copies one.")
     return 0
 
 
 def _row(entry: dict[str, Any]) -> list[Any]:
+    """Return the table row of a one-axis mechanism."""
     frequencies = " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-"
     return [entry["name"], entry["law"], entry["contacts"], entry["mass"], frequencies]
 
 
 def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
+    """Return the JSON entry of a one-axis mechanism."""
     return {
         "name": name,
         "law": mechanism.contact.law,
@@ -73,7 +75,8 @@ def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
 COLUMNS = ("name", "masses", "pairs")
 
 
-def _entry_in_space(name: str) -> dict[str, Any]:
+def _six_axis_entry(name: str) -> dict[str, Any]:
+    """Return the JSON entry of a six-axis mechanism."""
     mechanism = load_any(name).mechanism
     assert isinstance(mechanism, SixAxisMechanism)
     contacts = mechanism.contact.values()
@@ -89,7 +92,7 @@ def _entry_in_space(name: str) -> dict[str, Any]:
 
 
 def _frequencies(mechanism: Mechanism) -> list[float]:
-    """sqrt(k/M)/(2 pi) [Hz] of every stiffness in the file, each once; none for a power law."""
+    """Return sqrt(k/M)/(2 pi) [Hz] for every distinct stiffness; an empty list for a power law."""
     if contact_law(mechanism.contact.law).stiffness_unit != "N/m":
         return []
     stiffness: list[float] = []

@@ -1,4 +1,4 @@
-"""`jaxhil monitor`: whether the rig still is the one that was identified, contact by contact."""
+"""Command `jaxhil monitor`: compares later contacts with the identified mechanism, one by one."""
 
 from pathlib import Path
 from typing import Any
@@ -19,23 +19,26 @@ UNSTATED = (
 
 
 def run(options: Monitor) -> int:
-    """Hold contacts against the mechanism; 1 where the rig is beyond the file's uncertainty, else 0."""
+    """Compare the contacts of the logs with the mechanism, and print the result.
+
+    Return 1 if the rig changed by more than the file's uncertainty, else 0.
+    """
     loaded = load(options.mechanism)
     with terminal.stages(2) as stages:
         stages.turn_to("reading the logs")
         campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
         stages.turn_to("setting the contacts against the mechanism")
-        found = monitor(campaign, loaded.mechanism)
+        result = monitor(campaign, loaded.mechanism)
     content = {
         "schema": SCHEMA,
         "mechanism": loaded.label,
         "mechanism_sha256": loaded.sha256,
-        "state": found.state,
-        "reason": found.verdict,
-        "alarm": _counted(found.alarm),
-        "since": _counted(found.since),
-        "changes": [{"figure": one.name, "value": one.value, "std": one.std} for one in found.changes],
-        "contacts": [_contact(number, found) for number in range(len(found.contacts))],
+        "state": result.state,
+        "reason": result.verdict,
+        "alarm": _counted(result.alarm),
+        "since": _counted(result.since),
+        "changes": [{"figure": item.name, "value": item.value, "std": item.std} for item in result.changes],
+        "contacts": [_contact(number, result) for number in range(len(result.contacts))],
         "notes": [*campaign.notes, *([] if loaded.mechanism.uncertainty else [UNSTATED])],
         "sources": campaign.sources,
         "versions": versions(),
@@ -47,32 +50,36 @@ def run(options: Monitor) -> int:
         terminal.emit_json(document)
     else:
         _print(document)
-    return 1 if found.state == "bad" else 0
+    return 1 if result.state == "bad" else 0
 
 
 def _counted(number: int | None) -> int | None:
-    """Contacts are counted from 1."""
+    """Return an index as a number that counts from 1; None stays None."""
     return None if number is None else number + 1
 
 
-def _contact(number: int, found: Monitored) -> dict[str, Any]:
-    one = found.contacts[number]
+def _contact(number: int, result: Monitored) -> dict[str, Any]:
+    """Return the JSON entry of one contact."""
+    contact = result.contacts[number]
     figures = {
         name: {"value": float(value), "predicted_std": float(std), "z": float(z)}
-        for (name, _, _), value, std, z in zip(FIGURES, one.value, one.predicted_std, one.z, strict=True)
+        for (name, _, _), value, std, z in zip(
+            FIGURES, contact.value, contact.predicted_std, contact.z, strict=True
+        )
     }
-    return {"contact": number + 1, "log": one.source, "state": one.state, "figures": figures}
+    return {"contact": number + 1, "log": contact.source, "state": contact.state, "figures": figures}
 
 
 def _print(document: dict[str, Any]) -> None:
+    """Print the table of contacts and the verdict."""
     headings = ["contact", *(_heading(name, unit) for name, unit, _ in FIGURES)]
     rows = [
         [
-            one["contact"],
-            *(_shown(one["figures"][name]["value"], scale) for name, _, scale in FIGURES),
-            one["state"],
+            contact["contact"],
+            *(_shown(contact["figures"][name]["value"], scale) for name, _, scale in FIGURES),
+            contact["state"],
         ]
-        for one in document["contacts"]
+        for contact in document["contacts"]
     ]
     title = f"By {document['mechanism']}: 0 where the rig is that of the file"
     table = terminal.table(title, [*headings, "state"], rows, texts=(len(headings),))
@@ -85,10 +92,11 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _heading(name: str, unit: str) -> str:
-    """On three lines, so that all columns find room."""
+    """Return a column's heading on three lines, so that all columns fit."""
     first, _, last = name.rpartition(" ")
     return "\n".join([first, last, "" if unit == "1" else f"[{unit}]"])
 
 
 def _shown(value: float | None, scale: float) -> str:
+    """Return a scaled value as text, or a dash for None."""
     return "-" if value is None else f"{scale * value:+.2g}"

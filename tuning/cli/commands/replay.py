@@ -1,4 +1,4 @@
-"""`jaxhil replay`: one scenario of a sweep again; the exit code says whether it is the same to the bit."""
+"""Command `jaxhil replay`: runs one scenario of a sweep again and compares it bit by bit."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ KEYS = (*KEYS, "energy_in", "energy_out")
 
 
 def run(options: Replay) -> int:
-    """Run the scenario, print its contacts; 0 if all numbers are the stored ones, else 1."""
+    """Run the scenario and print its contacts; return 0 if all numbers equal the stored ones, else 1."""
     arguments.integers(0, index=options.index)
     if options.plot is not None:
         checks.picture(options.plot)
@@ -26,14 +26,14 @@ def run(options: Replay) -> int:
     from tuning.sweeps.store import read_store
 
     store = read_store(Path(options.store))
-    found = replay(store, options.index)
-    document = _document(options, store, found)
+    result = replay(store, options.index)
+    document = _document(options, store, result)
     document["unlike"] = unlike_here(store.manifest)
     if options.plot is not None:
         from jaxhil.simulation.contact_plot import save
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
-        save(picture_of(found.sweep, options.index, title), follow(options.plot))
+        save(picture_of(result.sweep, options.index, title), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(document)
@@ -42,21 +42,22 @@ def run(options: Replay) -> int:
     return 0 if document["verdict"] == "good" else 1
 
 
-def _document(options: Replay, store, found) -> dict[str, Any]:
+def _document(options: Replay, store, result) -> dict[str, Any]:
+    """Return the JSON document of the replayed scenario."""
     from tuning.sweeps.columns import ERRORS_IN_SPACE, PER_EPISODE, slots, texts_of
 
     row = {
         name: texts_of(name)[int(values[0])] if name.startswith(("status_", "outcome")) else values[0].item()
-        for name, values in found.again.items()
+        for name, values in result.again.items()
     }
-    mechanism = found.sweep.mechanism
-    model = found.sweep.model
+    mechanism = result.sweep.mechanism
+    model = result.sweep.model
     keys = KEYS if model.axes == 1 else (*ERRORS_IN_SPACE, *PER_EPISODE)
     return {
         "store": str(store.folder),
         "index": options.index,
         "mechanism": mechanism.name,
-        "compensator": model.compensator_name(found.sweep.loop),
+        "compensator": model.compensator_name(result.sweep.loop),
         "inputs": {
             column.name: row[column.name] for column in store.manifest.columns if column.kind == "input"
         },
@@ -65,12 +66,13 @@ def _document(options: Replay, store, found) -> dict[str, Any]:
             for number in sorted({slot.number for slot in slots(mechanism)})
         ],
         "outcome": row["outcome"],
-        "different": found.different,
-        "verdict": "bad" if found.different else "good",
+        "different": result.different,
+        "verdict": "bad" if result.different else "good",
     }
 
 
 def _print(document: dict[str, Any]) -> None:
+    """Print inputs, contacts and the verdict."""
     inputs = terminal.table(
         f"{document['mechanism']}, compensation: {document['compensator']}, scenario {document['index']}",
         ["input", "drawn"],
@@ -86,22 +88,22 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _contacts(document: dict[str, Any]) -> Any:
-    """The table of contacts, or of episodes."""
+    """Return the table of contacts (one axis) or episodes (six axes)."""
     if "contacts" in document:
-        what, runs, errors = "contact", document["contacts"], ["error"]
-        told = [[terminal.signed(one["error"])] for one in runs]
+        kind, runs, errors = "contact", document["contacts"], ["error"]
+        cells = [[terminal.signed(run["error"])] for run in runs]
     else:
-        what, runs, errors = "episode", document["episodes"], ["energy error", "twist error"]
-        told = [[terminal.signed(one["energy_error"]), one["twist_error"]] for one in runs]
+        kind, runs, errors = "episode", document["episodes"], ["energy error", "twist error"]
+        cells = [[terminal.signed(run["energy_error"]), run["twist_error"]] for run in runs]
     rows = [
         (
-            *(number, one["restitution"], one["reference_restitution"], *error),
-            *(one["peak_force"], terminal.ratio(one["peak_force"], one["reference_peak_force"])),
-            *(1e3 * one["duration"], terminal.ratio(one["duration"], one["reference_duration"])),
-            *(1e3 * one["approach_velocity"], one["status"]),
+            *(number, entry["restitution"], entry["reference_restitution"], *error),
+            *(entry["peak_force"], terminal.ratio(entry["peak_force"], entry["reference_peak_force"])),
+            *(1e3 * entry["duration"], terminal.ratio(entry["duration"], entry["reference_duration"])),
+            *(1e3 * entry["approach_velocity"], entry["status"]),
         )
-        for number, (one, error) in enumerate(zip(runs, told, strict=True), start=1)
+        for number, (entry, error) in enumerate(zip(runs, cells, strict=True), start=1)
     ]
-    headings = [what, "e", "e*", *errors, "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
+    headings = [kind, "e", "e*", *errors, "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
     headings += ["speed [mm/s]", "status"]
-    return terminal.table(f"{what.capitalize()}s", headings, rows, texts=(len(headings) - 1,))
+    return terminal.table(f"{kind.capitalize()}s", headings, rows, texts=(len(headings) - 1,))

@@ -1,4 +1,4 @@
-"""`jaxhil report`: one page of what the other commands wrote."""
+"""Command `jaxhil report`: writes one page from the results of the other commands."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ ENDINGS = (".html", ".htm")
 
 
 def run(options: Report) -> int:
-    """Write the page; 1 if its verdict is bad, else 0."""
+    """Write the page; return 1 if its verdict is bad, else 0."""
     if not options.results:
         raise InputError("RESULT: found nothing, allowed what jaxhil identify, tune, sweep, ... wrote")
     target = Path(options.output)
@@ -24,16 +24,16 @@ def run(options: Report) -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_stale(target.parent)
     prepare()
-    made = report(options.results, progress=True)
-    made.save(target)
+    page = report(options.results, progress=True)
+    page.save(target)
     if options.json:
         terminal.emit_json(
-            {"report": str(target), "verdict": made.verdict, "requirements": made.requirements}
+            {"report": str(target), "verdict": page.verdict, "requirements": page.requirements}
         )
     else:
-        rows = [tuple(one.values()) for one in made.requirements]
+        rows = [tuple(requirement.values()) for requirement in page.requirements]
         heads = ["judged", "required", "result", "margin", "verdict"]
         tables = [terminal.table("Requirements", heads, rows, texts=range(5))] if rows else []
-        terminal.emit(*tables, f"Verdict: {made.verdict}.")
-        terminal.emit_line(f"Wrote {one_line(str(target))}, {len(made.html) / 1e6:.2g} MB")
-    return 1 if made.verdict == "bad" else 0
+        terminal.emit(*tables, f"Verdict: {page.verdict}.")
+        terminal.emit_line(f"Wrote {one_line(str(target))}, {len(page.html) / 1e6:.2g} MB")
+    return 1 if page.verdict == "bad" else 0

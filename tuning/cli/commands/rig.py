@@ -1,4 +1,4 @@
-"""`jaxhil rig`: the controller as a process of its own, against a rig played in real time over UDP."""
+"""Command `jaxhil rig`: runs the controller against a simulated rig in real time over UDP."""
 
 import sys
 import tempfile
@@ -12,14 +12,14 @@ from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
 from tuning.front_door import arguments
 
-LONGEST_EMPTY = 30.0  # s of empty loop at most
-EMPTY_SHARE = 0.2  # of the run's duration
+LONGEST_EMPTY = 30.0  # s; longest duration of the empty loop
+EMPTY_SHARE = 0.2  # duration of the empty loop over the run's duration
 MOST_TICKS = 2_000_000
-MOST_ROWS = 12  # contacts shown one by one
+MOST_ROWS = 12  # largest number of contacts in the printed table
 
 
 def run(options: RigOptions) -> int:
-    """Play an empty loop and the run; 0 if all is good, 1 if not, 130 if interrupted."""
+    """Run an empty loop, then the controller; return 0 if all is good, 1 if not, 130 if interrupted."""
     arguments.limit(options.limit)
     arguments.integers(0, seed=options.seed)
     _check_injection(options)
@@ -58,9 +58,9 @@ def run(options: RigOptions) -> int:
             priority=options.realtime,
         )
         session = run_session(setup, scratch, terminal.note, _Progress(period).tell)
-    # jax is imported here for the first time: none of it runs beside the loop.
+    # jax is first imported here, so that it does not disturb the loop.
     references = reference_restitutions(mechanism, session.contacts)
-    found = judge(setup, session, references, options.limit, document["compensator"])
+    result = judge(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
         from jaxhil.simulation.contact_plot import save
         from tuning.rig.plot import latency_plot
@@ -69,16 +69,16 @@ def run(options: RigOptions) -> int:
         save(latency_plot(session, title, period), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
-        terminal.emit_json(found)
+        terminal.emit_json(result)
     else:
-        _print(found)
+        _print(result)
     if session.interrupted:
         raise KeyboardInterrupt
-    return 0 if found["verdict"] == "good" else 1
+    return 0 if result["verdict"] == "good" else 1
 
 
 def check_bundle_code(folder: Path, compensator: str) -> None:
-    """If the folder is a bundle, it is intact and its code what is run here. Raises `InputError`."""
+    """Raise `InputError` if the folder is a bundle that is damaged or has other code than this version."""
     from tuning.bundle.checking import check_code
     from tuning.bundle.manifest import is_bundle
 
@@ -88,7 +88,7 @@ def check_bundle_code(folder: Path, compensator: str) -> None:
 
 
 def controller_folder(compensator: str, scratch: Path) -> Path:
-    """The folder `scratch`, with what the controller's process is in every bundle of a compensator."""
+    """Write the files of the controller's process, as in a bundle, to `scratch`, and return it."""
     from tuning.bundle.content import code_files
 
     for name, content in code_files(compensator).items():
@@ -97,7 +97,7 @@ def controller_folder(compensator: str, scratch: Path) -> Path:
 
 
 def load(gains: Path) -> tuple[dict[str, Any], Any]:
-    """The gain file's document and mechanism, checked as on the rig. Raises InputError."""
+    """Return the gain file's document and mechanism, checked like on the rig. Raise `InputError`."""
     from jaxhil.mechanism.file import from_builtins
     from jaxhil.rig import GainFileError
     from jaxhil.rig.gain_file import check_gain_document, read_gain_document
@@ -112,7 +112,7 @@ def load(gains: Path) -> tuple[dict[str, Any], Any]:
 
 
 def stroke(document: dict[str, Any]) -> tuple[float, float]:
-    """The least and largest position command [m] that a gain document allows."""
+    """Return the smallest and the largest position command [m] that a gain document allows."""
     from jaxhil.rig.gain_file import check_gain_document
 
     limits = check_gain_document(document).limits
@@ -120,13 +120,13 @@ def stroke(document: dict[str, Any]) -> tuple[float, float]:
 
 
 class _Progress:
-    """How far the loop is, in few bytes: it is reported from within."""
+    """Progress of the loop on standard error; short texts, because the loop itself writes them."""
 
     def __init__(self, period: float) -> None:
         self._period, self._terminal = period, sys.stderr.isatty()
 
     def tell(self, done: int, total: int) -> None:
-        """So many ticks of so many are done."""
+        """Report that `done` of `total` ticks are finished."""
         seconds = round(done * self._period)
         if self._terminal:
             sys.stderr.write(f"\r{seconds} of {total * self._period:.0f} s \r")
@@ -137,6 +137,7 @@ class _Progress:
 
 
 def _check_injection(options: RigOptions) -> None:
+    """Check the probabilities and delays of the injected faults. Raise `InputError`."""
     if not 0.0 <= options.drops < 1.0:
         raise InputError(f"--drops: found {options.drops:g}, allowed a probability >= 0 and < 1")
     for name in ("jitter", "delay"):
@@ -146,17 +147,19 @@ def _check_injection(options: RigOptions) -> None:
 
 
 def _print(found: dict[str, Any]) -> None:
+    """Print the tables and remarks."""
     loops = {"empty loop": found["empty_loop"], "controller": found["run"]}
     reached = {name: loop for name, loop in loops.items() if loop is not None}
     terminal.emit(*_tables(found, reached), *_remarks(found, reached))
 
 
 def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
+    """Return the tables of ticks, times and contacts."""
     ticks = terminal.table(
         f"{found['mechanism']}, {found['compensator']}, {1 / found['control_period']:g} Hz over UDP: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
         [
-            (name, *(loop[key] for key in ("ticks", "missed", *(f"missed_by_{one}" for one in _CAUSES))))
+            (name, *(loop[key] for key in ("ticks", "missed", *(f"missed_by_{cause}" for cause in _CAUSES))))
             for name, loop in reached.items()
         ],
     )
@@ -172,11 +175,11 @@ def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
     )
     rows = [
         (
-            *(number, one["number"] + 1, terminal.figure(one["restitution"], 5)),
-            *(terminal.figure(one["reference_restitution"], 5), terminal.signed(one["error"])),
-            *(one["peak_force"], 1e3 * one["duration"], one["status"]),
+            *(number, contact["number"] + 1, terminal.figure(contact["restitution"], 5)),
+            *(terminal.figure(contact["reference_restitution"], 5), terminal.signed(contact["error"])),
+            *(contact["peak_force"], 1e3 * contact["duration"], contact["status"]),
         )
-        for number, one in enumerate(found["contacts"][:MOST_ROWS], start=1)
+        for number, contact in enumerate(found["contacts"][:MOST_ROWS], start=1)
     ]
     headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
     contacts = terminal.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
@@ -184,6 +187,7 @@ def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
 
 
 def _remarks(found: dict[str, Any], reached: dict[str, Any]) -> list[str]:
+    """Return the sentences below the tables; the last ones are the verdict."""
     lines = []
     if len(found["contacts"]) > MOST_ROWS:
         lines.append(f"... and {len(found['contacts']) - MOST_ROWS} more contacts.")
@@ -207,10 +211,10 @@ def _remarks(found: dict[str, Any], reached: dict[str, Any]) -> list[str]:
         for name, loop in reached.items()
         if loop["stood_still"] > 0
     ]
-    doubts = found["run"]["controller"]["doubts"] if found["run"] is not None else {}
-    if doubts:
-        said = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in doubts.items())
-        lines.append(f"Of {sum(doubts.values())} contacts the law says that it did not know them: {said}.")
+    flags = found["run"]["controller"]["doubts"] if found["run"] is not None else {}
+    if flags:
+        counts = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in flags.items())
+        lines.append(f"Of {sum(flags.values())} contacts the law says that it did not know them: {counts}.")
     if found["tripped"]:
         lines.append(f"The controller {found['tripped']}.")
     if found["interrupted"]:

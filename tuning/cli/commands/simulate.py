@@ -1,4 +1,4 @@
-"""`jaxhil simulate`: the contacts of one mechanism, run once."""
+"""Command `jaxhil simulate`: runs the contacts of one mechanism once."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +16,12 @@ from tuning.front_door import arguments, meaning
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
-# What a law may estimate of the rig: its heading, in thousandths of the unit, and how many digits of those.
+# Estimates of a compensator: the column's heading and decimals; values are shown times 1000.
 ESTIMATES = {"force_delay": ("force delay [ms]", 2)}
 
 
 def run(options: Simulate) -> int:
-    """Run the contacts, report each; 0 if `Run.reasons` finds nothing bad, else 1."""
+    """Run the contacts and report each; return 0 if `Run.reasons` is empty, else 1."""
     arguments.limit(options.limit)
     arguments.integers(0, seed=options.seed)
     if options.plot is not None:
@@ -49,25 +49,25 @@ def run(options: Simulate) -> int:
     mechanism, compensator, gains = chosen(options, mechanism)
     _check(mechanism, compensator, gains)
     meaning.say(mechanism, None if options.json else terminal.emit_line)
-    done = simulate(mechanism, compensator, gains, seed=options.seed)
-    reasons = done.reasons(options.limit)
+    result = simulate(mechanism, compensator, gains, seed=options.seed)
+    reasons = result.reasons(options.limit)
     if options.plot is not None:
-        done.plot(options.plot)
+        result.plot(options.plot)
         terminal.note(f"wrote {options.plot}")
     if options.log is not None:
-        done.to_csv(options.log)
+        result.to_csv(options.log)
         terminal.note(f"wrote {options.log}")
-    contacts = [_entry(contact) for contact in done.contacts]
+    contacts = [_entry(contact) for contact in result.contacts]
     if options.json:
         terminal.emit_json(
             {
                 "mechanism": mechanism.name,
-                "compensator": done.compensator,
-                "gains": done.gains,
+                "compensator": result.compensator,
+                "gains": result.gains,
                 "contacts": contacts,
-                "status": done.status,
-                "reason": _reason(done.status),
-                "meaning": done.meaning,
+                "status": result.status,
+                "reason": _reason(result.status),
+                "meaning": result.meaning,
                 "limit": options.limit,
                 "bounds": BOUNDS,
                 "reasons": reasons,
@@ -75,12 +75,12 @@ def run(options: Simulate) -> int:
             }
         )
     else:
-        _print(options, done, contacts, reasons)
+        _print(options, result, contacts, reasons)
     return 1 if reasons else 0
 
 
 def _check(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> None:
-    """It can be run: until that is known nothing is said of it. Raises `InputError`."""
+    """Raise `InputError` if the mechanism cannot be simulated with these gains."""
     from jaxhil.simulation.gain_choice import choose_gains
     from jaxhil.simulation.plausibility import check_run
 
@@ -89,21 +89,22 @@ def _check(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> 
 
 
 def _reason(status: str) -> str | None:
-    """What the status of a run that ended badly says."""
+    """Return the explanation of a run's status, or None if the run ended well."""
     from jaxhil.simulation.metrics import STATUS_REASONS
 
     return STATUS_REASONS.get(status)
 
 
 def _entry(contact: "ContactResult") -> dict[str, Any]:
-    """A contact as JSON says it: delay and plane only of a law that estimates them."""
+    """Return the JSON entry of a contact, without the estimates that its compensator does not make."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
 
 
-def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], reasons: list[str]) -> None:
+def _print(options: Simulate, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]) -> None:
+    """Print the table of contacts and the verdict."""
     from jaxhil.simulation.contact_bounds import STATED
 
-    # Contacts that were not reached are told apart, below the table.
+    # Contacts that were not reached are counted below the table.
     contacts = [contact for contact in contacts if contact["status"] != "not reached"]
     estimates = [name for name in ESTIMATES if any(name in contact for contact in contacts)]
     rows = [
@@ -126,12 +127,12 @@ def _print(options: Simulate, done: "Run", contacts: list[dict[str, Any]], reaso
     headings += ["speed [mm/s]"]
     headings += [*(ESTIMATES[name][0] for name in estimates), "status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
-    title = f"{done.mechanism.name}, compensation: {done.compensator}"
-    title += f", {rule}" if done.compensator != "none" else ""
-    wanted = len(done.contacts)
+    title = f"{result.mechanism.name}, compensation: {result.compensator}"
+    title += f", {rule}" if result.compensator != "none" else ""
+    number_wanted = len(result.contacts)
     lines = []
-    if len(contacts) < wanted:
-        lines.append(f"{wanted - len(contacts)} of {wanted} contacts were not reached.")
+    if len(contacts) < number_wanted:
+        lines.append(f"{number_wanted - len(contacts)} of {number_wanted} contacts were not reached.")
     if reasons:
         lines += [f"Bad: {reason}." for reason in reasons]
     else:

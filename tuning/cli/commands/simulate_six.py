@@ -1,4 +1,4 @@
-"""`jaxhil simulate` on a mechanism of six axes."""
+"""Command `jaxhil simulate` for a six-axis mechanism."""
 
 import shutil
 from pathlib import Path
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from jaxhil.sixdof.run import Episode, SixAxisRun
 
 FILMS = (".gif", ".mp4")
-GOOD = ("rebounded", "captured")  # how a run may end
+GOOD = ("rebounded", "captured")  # statuses of a run that ended well
 
 
 def check(options: Simulate) -> None:
-    """What six axes do not have yet is not asked for. Raises `InputError`."""
+    """Raise `InputError` for options that six axes do not support."""
     if options.setting is not None:
         found = f"--setting: found {shown(options.setting)}"
         raise InputError(f"{found}, allowed none: in six axes there is none so far")
@@ -32,6 +32,7 @@ def check(options: Simulate) -> None:
 
 
 def _check_film(path: str) -> None:
+    """Check that an animation can be written to `path`. Raise `InputError`."""
     suffix = Path(path).suffix.lower()
     if suffix not in FILMS:
         raise InputError(f"--animate: found {shown(path)}, allowed a name that ends in {', '.join(FILMS)}")
@@ -43,35 +44,35 @@ def _check_film(path: str) -> None:
 
 
 def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
-    """Run the episodes, report each; 0 if both errors of each are within the limit, else 1."""
+    """Run the episodes and report each; return 0 if both errors are within the limit, else 1."""
     if options.reference:
         return _run_in_space(options, mechanism)
     from jaxhil.sixdof.run import simulate_six_axes
 
     gains = None if options.gains is None else Path(options.gains)
-    done = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
-    good = done.status in GOOD and all(_worst(episode) <= options.limit for episode in done.episodes)
-    good = good and not any(_unlike(done))
-    terminal.warn(f"{mechanism.name}: {warning}" for warning in done.meaning.warnings)
-    _write(options, done)
+    result = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
+    good = result.status in GOOD and all(_worst(episode) <= options.limit for episode in result.episodes)
+    good = good and not any(_unlike(result))
+    terminal.warn(f"{mechanism.name}: {warning}" for warning in result.meaning.warnings)
+    _write(options, result)
     if options.json:
-        terminal.emit_json(_document(options, done, good))
+        terminal.emit_json(_document(options, result, good))
     else:
-        terminal.emit_line(done.meaning.line(mechanism.name))
-        _print(options, done, good)
+        terminal.emit_line(result.meaning.line(mechanism.name))
+        _print(options, result, good)
     return 0 if good else 1
 
 
 def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
-    """Follow the bodies without a rig, and report them; 0 if something touches, else 1."""
+    """Simulate and report the ideal contact without a rig; return 0 if anything touches, else 1."""
     from jaxhil.sixdof.alone import simulate_in_space
 
-    done = simulate_in_space(mechanism)
-    episode = done.episode
+    result = simulate_in_space(mechanism)
+    episode = result.episode
     if options.json:
         episodes = [episode._asdict()] if episode.reference_touches else []
         document = {"mechanism": mechanism.name, "axes": 6, "episodes": episodes}
-        terminal.emit_json(document | {"reference_final": done.final._asdict(), "status": done.status})
+        terminal.emit_json(document | {"reference_final": result.final._asdict(), "status": result.status})
     else:
         headings = ["m_n [kg]", "approach [mm/s]", "e*", "peak [N]", "peak [N m]", "in touch [ms]", "touches"]
         row = [
@@ -82,69 +83,79 @@ def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
             episode.reference_peak_moment,
             1e3 * episode.reference_duration,
             episode.reference_touches,
-            done.status,
+            result.status,
         ]
         table = terminal.table(f"{mechanism.name}, in space", [*headings, "status"], [row], texts=(7,))
-        speed, turning = ([f"{part:.4g}" for part in done.final.twist[at : at + 3]] for at in (0, 3))
-        after = f"After {done.final.time:.4g} s: velocity ({', '.join(speed)}) m/s, "
+        speed, turning = ([f"{part:.4g}" for part in result.final.twist[at : at + 3]] for at in (0, 3))
+        after = f"After {result.final.time:.4g} s: velocity ({', '.join(speed)}) m/s, "
         terminal.emit(table, after + f"angular velocity ({', '.join(turning)}) rad/s of C against T.")
     return 0 if episode.reference_touches else 1
 
 
 def _worst(episode: "Episode") -> float:
+    """Return the larger of an episode's energy and twist errors."""
     return max(abs(episode.energy_error), episode.twist_error)
 
 
-def _unlike(done: "SixAxisRun") -> list[bool]:
-    """Return of every episode whether its real contact is unlike the ideal one."""
+def _unlike(result: "SixAxisRun") -> list[bool]:
+    """Return for every episode whether the real contact is unlike the ideal one."""
     from jaxhil.simulation.contact_bounds import unlike_ideal
 
-    period = done.mechanism.rig.control_period
+    period = result.mechanism.rig.control_period
     return [
-        unlike_ideal(one.peak_force, one.reference_peak_force, one.duration, one.reference_duration, period)
-        for one in done.episodes
+        unlike_ideal(
+            episode.peak_force,
+            episode.reference_peak_force,
+            episode.duration,
+            episode.reference_duration,
+            period,
+        )
+        for episode in result.episodes
     ]
 
 
-def _write(options: Simulate, done: "SixAxisRun") -> None:
-    title = f"{done.mechanism.name}, compensation: {done.compensator}"
+def _write(options: Simulate, result: "SixAxisRun") -> None:
+    """Write the plot, the animation and the log that the options request."""
+    title = f"{result.mechanism.name}, compensation: {result.compensator}"
     if options.plot is not None:
         from jaxhil.files import follow, writing
         from jaxhil.simulation.contact_plot import save
         from tuning.pictures.six_axes import six_axes_plot
 
         with writing(options.plot):
-            save(six_axes_plot(done.ticks, title), follow(options.plot))
+            save(six_axes_plot(result.ticks, title), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.animate is not None:
         from jaxhil.files import follow, writing
         from tuning.pictures.animation import animate
 
         with writing(options.animate):
-            animate(done.ticks, title, follow(options.animate))
+            animate(result.ticks, title, follow(options.animate))
         terminal.note(f"wrote {options.animate}")
     if options.log is not None:
-        done.to_csv(options.log)
+        result.to_csv(options.log)
         terminal.note(f"wrote {options.log}")
 
 
-def _document(options: Simulate, done: "SixAxisRun", good: bool) -> dict[str, Any]:
+def _document(options: Simulate, result: "SixAxisRun", good: bool) -> dict[str, Any]:
+    """Return the JSON document of the run."""
     return {
-        "mechanism": done.mechanism.name,
+        "mechanism": result.mechanism.name,
         "axes": 6,
-        "compensator": done.compensator,
-        "gains": done.gains,
-        "episodes": [episode._asdict() for episode in done.episodes],
-        "final": done.final._asdict(),
-        "reference_final": done.reference_final._asdict(),
-        "status": done.status,
-        "meaning": done.meaning._asdict(),
+        "compensator": result.compensator,
+        "gains": result.gains,
+        "episodes": [episode._asdict() for episode in result.episodes],
+        "final": result.final._asdict(),
+        "reference_final": result.reference_final._asdict(),
+        "status": result.status,
+        "meaning": result.meaning._asdict(),
         "limit": options.limit,
         "verdict": "good" if good else "bad",
     }
 
 
-def _print(options: Simulate, done: "SixAxisRun", good: bool) -> None:
+def _print(options: Simulate, result: "SixAxisRun", good: bool) -> None:
+    """Print the table of episodes and the verdict."""
     rows = [
         [
             number,
@@ -157,23 +168,24 @@ def _print(options: Simulate, done: "SixAxisRun", good: bool) -> None:
             1e3 * episode.duration,
             episode.status,
         ]
-        for number, episode in enumerate(done.episodes, start=1)
+        for number, episode in enumerate(result.episodes, start=1)
     ]
     headings = [
         "episode", "energy error", "twist error", "e", "e*", "peak [N]", "peak [N m]", "in touch [ms]",
         "status",
     ]  # fmt: skip
-    title = f"{done.mechanism.name}, compensation: {done.compensator}"
+    title = f"{result.mechanism.name}, compensation: {result.compensator}"
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
-    title += f", {rule}" if done.compensator != "none" else ""
+    title += f", {rule}" if result.compensator != "none" else ""
     terminal.emit(
         terminal.table(title, headings, rows, texts=(len(headings) - 1,)),
-        *(_more(number, episode) for number, episode in enumerate(done.episodes, start=1)),
-        _verdict(options, done, good),
+        *(_more(number, episode) for number, episode in enumerate(result.episodes, start=1)),
+        _verdict(options, result, good),
     )
 
 
 def _more(number: int, episode: "Episode") -> str:
+    """Return a sentence with the parts of an episode's twist error and the ideal contact's values."""
     parts = f"normal {episode.normal_part:+.3f}, lateral {episode.lateral_part:.3f}"
     parts += f", rotational {episode.rotational_part:.3f}"
     space = f"{episode.reference_peak_force:.4g} N, {episode.reference_peak_moment:.3g} N m"
@@ -182,21 +194,25 @@ def _more(number: int, episode: "Episode") -> str:
     return f"Episode {number}: twist error {parts}; in space {space}; {touches}."
 
 
-def _verdict(options: Simulate, done: "SixAxisRun", good: bool) -> str:
+def _verdict(options: Simulate, result: "SixAxisRun", good: bool) -> str:
+    """Return the verdict and its reason."""
     from jaxhil.simulation.contact_bounds import BRIEFLY, STATED
 
-    if done.status == "miss":
+    if result.status == "miss":
         return "Bad: nothing touched."
-    if done.status not in GOOD:
-        return f"Bad: the run ended with status '{done.status}'."
+    if result.status not in GOOD:
+        return f"Bad: the run ended with status '{result.status}'."
     if good:
         return f"Good: every energy and twist error is within {options.limit:g}, {STATED}."
-    if all(_worst(episode) <= options.limit for episode in done.episodes):
-        number = _unlike(done).index(True)
-        one = done.episodes[number]
-        force, time = one.peak_force / one.reference_peak_force, one.duration / one.reference_duration
-        what = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
-        return f"Bad: episode {number + 1}: {what}, allowed {BRIEFLY}."
-    worst = max(done.episodes, key=_worst)
+    if all(_worst(episode) <= options.limit for episode in result.episodes):
+        number = _unlike(result).index(True)
+        episode = result.episodes[number]
+        force, time = (
+            episode.peak_force / episode.reference_peak_force,
+            episode.duration / episode.reference_duration,
+        )
+        reason = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
+        return f"Bad: episode {number + 1}: {reason}, allowed {BRIEFLY}."
+    worst = max(result.episodes, key=_worst)
     errors = f"{worst.energy_error:+.4f} and {worst.twist_error:.4f}"
     return f"Bad: the largest energy and twist errors are {errors}, allowed {options.limit:g}."

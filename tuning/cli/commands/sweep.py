@@ -1,4 +1,4 @@
-"""`jaxhil sweep`: many scenarios, a failure probability with its interval, and the worst of them."""
+"""Command `jaxhil sweep`: failure probability with its interval, and the worst of many scenarios."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tuning.front_door.sweep import run_study
 
 
 def run(options: Sweep) -> int:
-    """Run what the store lacks, report all of it; 0 if the verdict is good, else 1."""
+    """Run the scenarios that the store lacks, and report all; return 0 if the verdict is good, else 1."""
     options.check()
     path = readable_gain_file(options.gains)
     prepare()

@@ -1,4 +1,4 @@
-"""What `jaxhil sweep` prints of its document."""
+"""Tables and lines that `jaxhil sweep` prints from its document."""
 
 from typing import Any
 
@@ -7,11 +7,12 @@ from tuning import terminal
 
 
 def emit(document: dict[str, Any]) -> None:
-    """Tables and the verdict, on standard output."""
+    """Print the tables and the verdict on standard output."""
     terminal.emit(*_tables(document), *_lines(document))
 
 
 def _tables(document: dict[str, Any]) -> list[Any]:
+    """Return the tables of outcomes, quantiles, worst scenarios and additional studies."""
     number = document["scenarios"]
     title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
     outcomes = terminal.table(
@@ -19,18 +20,18 @@ def _tables(document: dict[str, Any]) -> list[Any]:
         ["outcome", "scenarios", "share"],
         [(name, count, count / number) for name, count in document["outcomes"].items()],
     )
-    # All inputs beside each other would not fit; `replay` and the store have them.
+    # The inputs are too many for one table; `replay` prints them.
     worst = terminal.table(
         "Worst scenarios",
         ["index", "outcome", "error", "episode" if document["axes"] == 6 else "contact"],
         [
             (
-                one["index"],
-                one["outcome"],
-                terminal.signed(one["worst_error"]),
-                terminal.figure(one["worst_contact"]),
+                scenario["index"],
+                scenario["outcome"],
+                terminal.signed(scenario["worst_error"]),
+                terminal.figure(scenario["worst_contact"]),
             )
-            for one in document["worst"]
+            for scenario in document["worst"]
         ],
         texts=(1,),
     )
@@ -44,6 +45,7 @@ def _tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _lines(document: dict[str, Any]) -> list[str]:
+    """Return the sentences below the tables; the last ones are the verdict and the paths."""
     from jaxhil.simulation.contact_bounds import BRIEFLY
     from jaxhil.simulation.metrics import STATUS_REASONS
     from tuning.sweeps.columns import UNLIKE, UNLIKENESS
@@ -85,34 +87,37 @@ def _lines(document: dict[str, Any]) -> list[str]:
 
 
 def _quantiles(document: dict[str, Any], symbol: str):
+    """Return the table of error quantiles with their confidence intervals."""
     return terminal.table(
         f"Worst {symbol} of a scenario",
         ["share of scenarios", "|error| up to", "95 % from", "to"],
         [
             (
-                f"{100 * one['order']:g} %",
-                _size(one["value"]),
-                _size(one["low"]),
-                _size(one["high"], "no bound"),
+                f"{100 * quantile['order']:g} %",
+                _size(quantile["value"]),
+                _size(quantile["low"]),
+                _size(quantile["high"], "no bound"),
             )
-            for one in document["error_quantiles"]
+            for quantile in document["error_quantiles"]
         ],
     )
 
 
 def _drivers(drivers: dict[str, Any], symbol: str):
+    """Return the table of Sobol indices."""
     return terminal.table(
         f"What drives the worst {symbol}, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
         f"{drivers['evaluations']} runs): shares of the variance",
         ["input", "first order", "95 % from", "to", "total", "95 % from", "to"],
         [
-            (one.input, *("-" if number != number else f"{number:.3f}" for number in one[1:]))
-            for one in drivers["inputs"]
+            (shares.input, *("-" if number != number else f"{number:.3f}" for number in shares[1:]))
+            for shares in drivers["inputs"]
         ],
     )
 
 
 def _rare(rare: dict[str, Any]):
+    """Return the table of the subset simulation."""
     return terminal.table(
         "Subset simulation",
         [
@@ -136,21 +141,24 @@ def _rare(rare: dict[str, Any]):
 
 
 def _sequential(document: dict[str, Any]) -> list[str]:
+    """Return a sentence on the width of the interval if `--until-width` was given."""
     width = document["until_width"]
     if width is None:
         return []
     probability, most = document["failure_probability"], document["most_scenarios"]
-    found = probability["high"] - probability["low"]
-    if found <= width:
+    reached = probability["high"] - probability["low"]
+    if reached <= width:
         return [
-            f"Stopped after {document['scenarios']} of at most {most}: {found:.3g} wide, {width:g} wanted."
+            f"Stopped after {document['scenarios']} of at most {most}: {reached:.3g} wide, {width:g} wanted."
         ]
-    return [f"Not as narrow as wanted after all {most} scenarios: {found:.3g} wide, {width:g} wanted."]
+    return [f"Not as narrow as wanted after all {most} scenarios: {reached:.3g} wide, {width:g} wanted."]
 
 
 def _size(value: float, endless: str = "no result") -> str:
+    """Return an error as text, or `endless` for infinity."""
     return endless if value == float("inf") else f"{value:.4g}"
 
 
 def _share(value: float) -> str:
+    """Return a share in percent as text, or a dash for infinity."""
     return "-" if value == float("inf") else f"{100 * value:.3g} %"

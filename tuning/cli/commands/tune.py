@@ -1,4 +1,4 @@
-"""`jaxhil tune`: gains for every mechanism file, judged on scenarios that tuning never saw."""
+"""Command `jaxhil tune`: tunes gains for every mechanism file and evaluates them on fresh scenarios."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,25 +25,28 @@ if TYPE_CHECKING:
 
 PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW = "overview.png"
-MOST_DRAWN = 4  # mechanisms whose plots are drawn; of more there is one picture of all
+MOST_DRAWN = 4  # largest number of mechanisms with plots each; more mechanisms share one plot
 
 
 def run(options: Tune) -> int:
-    """Tune file by file. What is finished is written at once and stays, whatever happens to the rest; to
-    resume, it is not tuned again."""
+    """Tune the mechanisms of all files, and return the exit code.
+
+    The results of a mechanism are written as soon as it is finished. With `--resume`, finished work is not
+    repeated.
+    """
     if options.pareto:
         prepare()
     options.check()
     if options.start or options.setting is not None:
-        # What is wrong with these is reported before what is wrong with the files.
+        # Errors in these options are reported before errors in the files.
         prepare()
         options.settings()
         options.known()
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
-        # Before jax starts: a folder that cannot be written costs no tuning.
-        _check_output(Path(options.output), [one.mechanism for one in loaded])
+        # This is checked before jax starts, so that no tuning is lost if the folder cannot be written.
+        _check_output(Path(options.output), [entry.mechanism for entry in loaded])
         loaded = _understood(options, loaded, problems)
     if loaded:
         pieces = pieces_in(options.output, options.resume)
@@ -69,7 +72,7 @@ def run(options: Tune) -> int:
         return 130
     if problems:
         if entries:
-            # What was said of them at once has scrolled away.
+            # The problems are repeated, because the first notes have scrolled away.
             terminal.note(f"jaxhil: {len(problems)} could not be done:")
             for problem in problems:
                 terminal.note(f"jaxhil: {problem}")
@@ -78,42 +81,43 @@ def run(options: Tune) -> int:
 
 
 def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
-    """What is to be replaced there is of an earlier run for the same mechanisms. Raises `InputError`.
+    """Raise `InputError` if the output folder holds files that are not results for these mechanisms.
 
-    Warn where only the name is the same.
+    Warn if only the name of a mechanism is the same.
     """
     checks.output(output)
-    for one in mechanisms:
-        path = output / folder_name(one.name) / "gains.json"
-        found = checks.own_results(path, "compensator", PICTURES, [one.name])
-        if found and found.get("mechanism") != to_builtins(one):
-            terminal.warn(
-                [f"{one_line(str(path))}: replaced: it is of another mechanism of the name {shown(one.name)}"]
-            )
+    for mechanism in mechanisms:
+        path = output / folder_name(mechanism.name) / "gains.json"
+        earlier = checks.own_results(path, "compensator", PICTURES, [mechanism.name])
+        if earlier and earlier.get("mechanism") != to_builtins(mechanism):
+            name = shown(mechanism.name)
+            terminal.warn([f"{one_line(str(path))}: replaced: it is of another mechanism of the name {name}"])
     if len(mechanisms) > MOST_DRAWN and not any(output.glob("*/gains.json")):
         checks.own_results(output / "gains.json", "compensator", [OVERVIEW])
 
 
 class _Interrupted(Exception):
+    """Error that carries the entries of the mechanisms that were finished before an interruption."""
+
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
 
 
 def _load(options: Tune) -> tuple[list[LoadedAny], list[str]]:
-    """The files that can be used, and what is wrong with the others."""
+    """Load the mechanism files, and return the usable ones and the problems with the others."""
     loaded, problems, folders = [], [], {}
     for file in _expand(options.files, problems):
         try:
-            one = load_any(file, options.overrides, options.unset)
-            options.fits(one.mechanism)
-            folder = folder_name(one.mechanism.name)
-            if (other := folders.get(folder.casefold())) is not None:
+            entry = load_any(file, options.overrides, options.unset)
+            options.fits(entry.mechanism)
+            folder = folder_name(entry.mechanism.name)
+            if (first_label := folders.get(folder.casefold())) is not None:
                 raise InputError(
-                    f"{one.label}: name: found {shown(one.mechanism.name)}, allowed a name whose folder, "
-                    f"{one_line(folder)}, differs by more than capitals from that of {other}"
+                    f"{entry.label}: name: found {shown(entry.mechanism.name)}, allowed a name whose folder, "
+                    f"{one_line(folder)}, differs by more than capitals from that of {first_label}"
                 )
-            folders[folder.casefold()] = one.label
-            loaded.append(one)
+            folders[folder.casefold()] = entry.label
+            loaded.append(entry)
         except InputError as error:
             problem = getattr(error, "option", str(error))
             problems.append(problem)
@@ -122,34 +126,34 @@ def _load(options: Tune) -> tuple[list[LoadedAny], list[str]]:
 
 
 def _understood(options: Tune, loaded: list[LoadedAny], problems: list[str]) -> list[LoadedAny]:
-    """The mechanisms that can be run; of each it is said what it means."""
+    """Return the mechanisms that can be simulated, and print a summary of each; report the others."""
     prepare()
     options.settings()
-    kept = []
-    for one in loaded:
+    usable = []
+    for entry in loaded:
         try:
-            meaning.check(one.mechanism, one.label)
+            meaning.check(entry.mechanism, entry.label)
         except InputError as error:
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
         else:
-            meaning.say(one.mechanism, None if options.json else terminal.emit_line)
-            kept.append(one)
-    return kept
+            meaning.say(entry.mechanism, None if options.json else terminal.emit_line)
+            usable.append(entry)
+    return usable
 
 
 def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
-    """Every file, a directory standing for its .toml files; the default mechanism if nothing is given."""
+    """Return every file, a folder replaced by its .toml files; [None] for the default mechanism."""
     expanded: list[str | None] = []
     for file in files:
         if not Path(file).is_dir():
             expanded.append(file)
             continue
-        found = sorted(str(path) for path in Path(file).glob("*.toml"))
-        if not found:
+        inside = sorted(str(path) for path in Path(file).glob("*.toml"))
+        if not inside:
             problems.append(f"{one_line(file)}: found no mechanism file, allowed a folder with .toml files")
             terminal.note(f"jaxhil: {problems[-1]}")
-        expanded.extend(found)
+        expanded.extend(inside)
     return expanded if files else [None]
 
 
@@ -159,6 +163,7 @@ def _tune_all(
     problems: list[str],
     pieces: "Pieces",
 ) -> list[dict[str, Any]]:
+    """Tune all mechanisms, write and print the results, and return their entries in order."""
     prepare()
     entries, done, fronts = {}, {}, {}
     drawn = len(loaded) <= MOST_DRAWN
@@ -185,7 +190,7 @@ def _tune_all(
     except KeyboardInterrupt:
         raise _Interrupted(_in_order(entries)) from None
     if len(loaded) > 1 and done:
-        _overview(options, [one.found for one in _in_order(done)], _in_order(entries), drawn)
+        _overview(options, [gains.found for gains in _in_order(done)], _in_order(entries), drawn)
     if not options.json and drawn:
         for index in sorted(fronts):
             tune_pareto.print_front(options, done[index].found, fronts[index], entries[index]["pareto"])
@@ -197,7 +202,7 @@ def _tune_all(
 
 
 def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
-    """All mechanisms in one table and, where none has pictures of its own, in one picture."""
+    """Print the table of all mechanisms, and draw one common plot if they have no plots each."""
     if not drawn:
         from jaxhil.simulation.contact_plot import save
         from tuning.pictures.plots import overview_plot
@@ -208,13 +213,14 @@ def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], 
 
 
 def _in_order(by_index: dict[int, Any]) -> list[Any]:
+    """Return the values of a dictionary, sorted by index."""
     return [by_index[index] for index in sorted(by_index)]
 
 
 def _finish(
     options: Tune, loaded: LoadedAny, result: TunedGains, drawn: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write what was found for one mechanism."""
+    """Write the gain file and the plots of one mechanism, and return its entry."""
     from tuning.gains.tasks import has_sensor_noise
 
     folder = Path(options.output) / folder_name(loaded.mechanism.name)
@@ -222,10 +228,10 @@ def _finish(
         make_folder(folder)
         remove_stale(folder)
     result.save(folder / "gains.json")
-    found, plots = result.found, []
+    tuned, plots = result.found, []
     if drawn:
         say(f"{loaded.mechanism.name}: drawing")
-        plots = _draw(found, options, folder)
+        plots = _draw(tuned, options, folder)
     return {
         "mechanism": loaded.mechanism.name,
         "file": loaded.label,
@@ -234,50 +240,51 @@ def _finish(
         "gain_file": str(folder / "gains.json"),
         "plots": plots,
         "gains": result.document["gains"],
-        "literature": found.literature,
-        "figures": found.figures,
+        "literature": tuned.literature,
+        "figures": tuned.figures,
         **result.parts,
-        "nominal": found.nominal,
+        "nominal": tuned.nominal,
         "without_noise": result.without_noise,
         **result.command._asdict(),
-        "quietest_within_limit": found.quiet,
+        "quietest_within_limit": tuned.quiet,
         "warnings": result.warnings,
-        "tuned_intervals": found.intervals.plain() if found.intervals else None,
-        "honesty": found.transparency,
-        "starts": [_start(start) for start in found.starts],
-        "carried_over": _carried_over(found),
-        "freedom": {name: one._asdict() for name, one in found.freedom.items()},
-        "certified": found.global_comparison._asdict() if found.global_comparison else None,
-        "timings": found.timings,
+        "tuned_intervals": tuned.intervals.plain() if tuned.intervals else None,
+        "honesty": tuned.transparency,
+        "starts": [_start(start) for start in tuned.starts],
+        "carried_over": _carried_over(tuned),
+        "freedom": {name: tolerance._asdict() for name, tolerance in tuned.freedom.items()},
+        "certified": tuned.global_comparison._asdict() if tuned.global_comparison else None,
+        "timings": tuned.timings,
         "sensor_noise": has_sensor_noise(loaded.mechanism),
-        "better_than_literature": is_better(found.figures["tuned"], found.figures["literature"]),
+        "better_than_literature": is_better(tuned.figures["tuned"], tuned.figures["literature"]),
         "verdict": result.verdict,
     }
 
 
 def _start(start) -> dict[str, Any]:
+    """Return the JSON entry of a start of the solver."""
     return {
         name: value for name, value in start._asdict().items() if name not in ("coordinates", "curvature")
     }
 
 
 def _carried_over(result) -> list[dict[str, Any]]:
-    """Which starts began at gains tuned before, and for what mechanism."""
+    """Return the starts that began at earlier tuned gains, with their mechanisms and distances."""
     from tuning.gains.transfer import distance
 
     return [
         {
             "start": result.usual_starts + number,
-            "source": one.source,
-            "mechanism": one.mechanism.name,
-            "distance": distance(result.mechanism, one.mechanism),
+            "source": earlier.source,
+            "mechanism": earlier.mechanism.name,
+            "distance": distance(result.mechanism, earlier.mechanism),
         }
-        for number, one in enumerate(result.first, start=1)
+        for number, earlier in enumerate(result.first, start=1)
     ]
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
-    """Import and compile what drawing needs, while the solver's program compiles on another core."""
+    """Import and compile the code for the plots while the solver compiles on another core."""
     from jaxhil.laws.compensators import literature_gains
     from jaxhil.simulation.motion import prepare_motion
     from tuning.gains.tune import uncompensated
@@ -288,11 +295,12 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
 
 
 def is_better(figures, other) -> bool:
-    """Fewer contacts that fail or, as many failing, a smaller rms error."""
+    """Return whether `figures` have fewer failed contacts or, if equal, a smaller rms error."""
     return figures.failed < other.failed or (figures.failed == other.failed and figures.rms < other.rms)
 
 
 def _draw(result, options: Tune, folder: Path) -> list[str]:
+    """Draw the plots of one mechanism, and return their paths."""
     from jaxhil.simulation.contact_plot import contact_plot, save
     from jaxhil.simulation.motion import nominal_motion
     from tuning.gains.tune import uncompensated
@@ -316,6 +324,7 @@ def _draw(result, options: Tune, folder: Path) -> list[str]:
 
 
 def _verdict(entries, problems, interrupted) -> str:
+    """Return the verdict on all mechanisms."""
     if interrupted:
         return "interrupted"
     if problems:

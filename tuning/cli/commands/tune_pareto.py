@@ -1,4 +1,4 @@
-"""`jaxhil tune --pareto N`: gains that trade accuracy for something else, a gain file for each point."""
+"""Pareto fronts of `jaxhil tune --pareto N`, with one gain file for each point."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,12 +25,12 @@ def trade(
     bar: terminal.Progress,
     pieces: "Pieces",
 ) -> dict[int, Any]:
-    """Fronts of the mechanisms that are `done`, written beside their gains and added to their entries."""
-    order, made = sorted(done), {}
+    """Compute and write the fronts of the tuned mechanisms, add them to `entries`, and return them."""
+    order, fronts = sorted(done), {}
     results = [done[index] for index in order]
-    asked = options.pareto, options.pareto_against, bar, pieces, options.scheduler
-    for place, points in tune_pareto.trade(results, *asked):
-        index = order[place]
+    arguments = options.pareto, options.pareto_against, bar, pieces, options.scheduler
+    for number, points in tune_pareto.trade(results, *arguments):
+        index = order[number]
         folder = Path(entries[index]["gain_file"]).parent
         try:
             entry = _write(options, points, folder)
@@ -38,20 +38,20 @@ def trade(
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
             continue
-        entries[index]["pareto"], made[index] = entry, points[0].front
-    return made
+        entries[index]["pareto"], fronts[index] = entry, points[0].front
+    return fronts
 
 
 def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -> None:
-    """Every point, and the quietest that is accurate enough."""
+    """Print every point, and the point of least cost whose error is within the limit."""
     rows: list[list[Any]] = [
         ["literature's rule", None, *_numbers(result, front.literature), ""],
         ["tuned", None, *_numbers(result, front.tuned), ""],
     ]
     for number, point in enumerate(front.points, start=1):
-        like = next(n for n, other in enumerate(front.points, start=1) if other.place == point.place)
-        place = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
-        rows.append([str(number), point.weight, *_numbers(result, point), place])
+        like = next(n for n, earlier in enumerate(front.points, start=1) if earlier.place == point.place)
+        remark = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
+        rows.append([str(number), point.weight, *_numbers(result, point), remark])
     axis = front.axis
     weight = axis.weight.replace("_", " ")
     headings = ["point", weight, axis.name, *([] if _is_rms(result) else ["objective"])]
@@ -62,7 +62,7 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
         rows,
         texts=(0, len(rows[0]) - 1),
     )
-    paths = [one["gain_file"] for one in entry["points"]]
+    paths = [traded["gain_file"] for traded in entry["points"]]
     lines = [f"wrote {paths[0]} to {paths[-1]}", f"wrote {entry['plot']}"]
     enough = [
         (point.place[1], number, point.figures.rms)
@@ -83,44 +83,45 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
 
 
 def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
-    """Write a gain file for each point and the picture of all; what `--json` says of them."""
+    """Write a gain file for each point and the plot of all, and return the entry for `--json`."""
     from jaxhil.simulation.contact_plot import save
     from tuning.pictures.plots import front_plot
 
     front, result, entries = points[0].front, points[0].tuned.found, []
     for number, point in enumerate(points, start=1):
-        place = folder / FOLDER / f"{number:02d}"
-        for one in (folder / FOLDER, place):
-            with writing(one):
-                make_folder(one)
-                remove_stale(one)
-        point.save(place / "gains.json")
-        gains = {"gain_file": str(place / "gains.json"), "gains": point.document["gains"]}
+        point_folder = folder / FOLDER / f"{number:02d}"
+        for target in (folder / FOLDER, point_folder):
+            with writing(target):
+                make_folder(target)
+                remove_stale(target)
+        point.save(point_folder / "gains.json")
+        gains = {"gain_file": str(point_folder / "gains.json"), "gains": point.document["gains"]}
         entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})
     _remove_others(folder / FOLDER, len(entries))
     plot = folder / "pareto.png"
     save(front_plot(front, result, options.limit), plot)
     axis = front.axis
-    beside = {
-        name: {axis.cost: one.cost, "error": one.error, "figures": one.figures}
-        for name, one in (("literature", front.literature), ("tuned", front.tuned))
+    others = {
+        name: {axis.cost: fixed.cost, "error": fixed.error, "figures": fixed.figures}
+        for name, fixed in (("literature", front.literature), ("tuned", front.tuned))
     }
-    return {"against": axis.name, "points": entries, **beside, "plot": str(plot)}
+    return {"against": axis.name, "points": entries, **others, "plot": str(plot)}
 
 
 def _remove_others(folder: Path, number: int) -> None:
-    """Gain files of a longer front that was written here before do not belong to this one."""
-    for place in folder.iterdir():
-        name = place.name
-        ours = name.isdecimal() and int(name) > number and name == f"{int(name):02d}"
-        if ours and not place.is_symlink() and _is_gain_file(place / "gains.json"):
-            (place / "gains.json").unlink()
-            if not any(place.iterdir()):
-                place.rmdir()
+    """Remove the gain files of an earlier, longer front from the folder."""
+    for path in folder.iterdir():
+        name = path.name
+        is_beyond = name.isdecimal() and int(name) > number and name == f"{int(name):02d}"
+        if is_beyond and not path.is_symlink() and _is_gain_file(path / "gains.json"):
+            (path / "gains.json").unlink()
+            if not any(path.iterdir()):
+                path.rmdir()
 
 
 def _is_gain_file(path: Path) -> bool:
-    # Takes jax, which refusals do without.
+    """Return whether a path is a valid gain file."""
+    # This imports jax, which a refused command must not load.
     from jaxhil.simulation.gain_file import load_gain_file
 
     try:
@@ -132,15 +133,21 @@ def _is_gain_file(path: Path) -> bool:
 
 
 def _is_rms(result: Any) -> bool:
-    """Whether the objective without what is traded is the rms error itself."""
-    one = result.settings.objective
-    weights = one.divergence_weight, one.command_weight, one.chatter_weight, one.transparency_weight
-    return (one.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
+    """Return whether the objective without the traded term is the rms error itself."""
+    objective = result.settings.objective
+    weights = (
+        objective.divergence_weight,
+        objective.command_weight,
+        objective.chatter_weight,
+        objective.transparency_weight,
+    )
+    return (objective.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
 
 
 def _numbers(result: Any, point: Any) -> list[Any]:
-    one = point.figures
-    errors = [one.rms] if _is_rms(result) else [point.error, one.rms]
-    # An error is no factor.
+    """Return the cells of a point: cost, errors, and failed contacts."""
+    figures = point.figures
+    errors = [figures.rms] if _is_rms(result) else [point.error, figures.rms]
+    # A small cost is an error, not a factor.
     cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
-    return [cost, *errors, one.p99, one.max, one.failed]
+    return [cost, *errors, figures.p99, figures.max, figures.failed]

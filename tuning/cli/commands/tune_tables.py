@@ -1,4 +1,4 @@
-"""What `jaxhil tune` prints of its results: one mechanism in detail, or many side by side."""
+"""Tables that `jaxhil tune` prints: one mechanism in detail, or many in one table."""
 
 import math
 from typing import Any
@@ -9,9 +9,9 @@ from tuning.front_door.tune_verdict import verdict_line
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
-    """All mechanisms side by side."""
+    """Print one table with all mechanisms."""
     rows = []
-    # A column of noughts would only push the names onto two lines.
+    # A column of zeros would only make the names wrap.
     some_failed = any(result.figures["tuned"].failed for result in results)
     for result, entry in zip(results, entries, strict=True):
         tuned = result.figures["tuned"]
@@ -26,7 +26,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
     headings += ["above best"] if results[0].global_comparison else []
     error = (
         "e - e*, or of both errors in six axes,"
-        if any("energy_error" in one for one in entries)
+        if any("energy_error" in entry for entry in entries)
         else "e - e*"
     )
     terminal.emit(
@@ -42,7 +42,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 
 def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
-    """Errors, gains and starts of one mechanism, and the verdict."""
+    """Print errors, gains and starts of one mechanism, and the verdict."""
     if "energy_error" in entry:
         tables = [_two_errors(options, result, entry)]
     else:
@@ -59,18 +59,26 @@ def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
 
 
 def _errors(options: Tune, result: Any, better: bool) -> Any:
+    """Return the table of restitution errors before tuning, with the literature's gains and tuned."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     judged, rows = {**result.figures}, []
     if result.without_noise is not None:
         names["without noise"], judged["without noise"] = "tuned, without noise", result.without_noise
     for key, label in names.items():
-        one = judged[key]
+        figures = judged[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
         rows.append(
             (
-                *(label, one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{100 * one.diverging:.0f} %"),
-                *(f"{one.peak_ratio:.3f}", f"{one.chatter:.3f}", one.failed),
+                *(
+                    label,
+                    figures.rms,
+                    figures.p99,
+                    figures.max,
+                    f"{figures.mean:+.4f}",
+                    f"{100 * figures.diverging:.0f} %",
+                ),
+                *(f"{figures.peak_ratio:.3f}", f"{figures.chatter:.3f}", figures.failed),
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
@@ -82,16 +90,23 @@ def _errors(options: Tune, result: Any, better: bool) -> Any:
 
 
 def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
-    """Of six axes: what remains of the energy and of the twist."""
+    """Return the table of energy and twist errors of a six-axis mechanism."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     if not entry["better_than_literature"]:
         names["tuned"] = "tuned (NOT better than the literature's)"
     rows = []
     for key, label in names.items():
         for error in ("energy_error", "twist_error"):
-            one = entry[error][key]
-            figures = one.rms, one.p99, one.max, f"{one.mean:+.4f}", f"{one.peak_ratio:.3f}", one.failed
-            rows.append((label if error == "energy_error" else "", error.replace("_", " "), *figures))
+            figures = entry[error][key]
+            cells = (
+                figures.rms,
+                figures.p99,
+                figures.max,
+                f"{figures.mean:+.4f}",
+                f"{figures.peak_ratio:.3f}",
+                figures.failed,
+            )
+            rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
     count = int(result.outcomes["tuned"].wanted.sum()) // 2
     return terminal.table(
         f"{result.mechanism.name}: errors of {count} episodes in {options.validation} fresh scenarios",
@@ -102,7 +117,7 @@ def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
 
 
 def _gains(options: Tune, result: Any) -> list[Any]:
-    """The table of gains; none of a law without any."""
+    """Return a list with the table of gains; an empty one if the compensator has no gains."""
     from jaxhil.laws.compensators import compensator_of
 
     mechanism = result.mechanism
@@ -120,7 +135,7 @@ def _gains(options: Tune, result: Any) -> list[Any]:
 
 
 def _aims(options: Tune, result: Any) -> list[str]:
-    """Say which gains were sought, where that depends on what was found."""
+    """Return a sentence on the aim of tuning, least noise or least error, if results decided it."""
     if not result.settings.quiet or result.without_noise is None or not result.starts:
         return []
     if result.quiet:
@@ -131,33 +146,34 @@ def _aims(options: Tune, result: Any) -> list[str]:
 
 
 def _how_sure(result: Any) -> list[str]:
-    """What there is to say of how sure the optimum is."""
-    sure_of = []
+    """Return sentences on the tolerance of the gains, the starts and the global search."""
+    lines = []
     if result.freedom:
-        sure_of.append(
+        lines.append(
             "Free: the share of its range by which a gain may move, alone or with the others moved along, "
             "before the loss rises by 1 %."
         )
     ends = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
     if result.settings.probed and len(ends) > 1:
         above = 100 * (ends[-1] / ends[0] - 1)
-        sure_of.append(
+        lines.append(
             f"Starts: {len(ends)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
         )
     if result.global_comparison:
-        one = result.global_comparison
-        sure_of.append(
-            f"Best of {one.evaluations} evaluations anywhere: {one.best:.4g}; tuned, with {one.spent}: "
-            f"{one.tuned:.4g}, {100 * abs(one.above):.1f} % {'above' if one.above > 0 else 'below'} it."
+        search = result.global_comparison
+        lines.append(
+            f"Best of {search.evaluations} evaluations anywhere: {search.best:.4g}; tuned, with "
+            f"{search.spent}: {search.tuned:.4g}, "
+            f"{100 * abs(search.above):.1f} % {'above' if search.above > 0 else 'below'} it."
         )
-    return sure_of
+    return lines
 
 
 def _transparency(result: Any) -> Any:
-    """Whether it still is a test of the hardware, with the literature's and with tuned gains."""
+    """Return the table of transparency metrics with the literature's and the tuned gains."""
     labels = {"literature": "literature's rule", "tuned": "tuned"}
     rows = [
-        [label, *(_with_ends(one) for one in result.transparency[key].values())]
+        [label, *(_with_ends(metric) for metric in result.transparency[key].values())]
         for key, label in labels.items()
     ]
     return terminal.table(
@@ -168,19 +184,20 @@ def _transparency(result: Any) -> Any:
 
 
 def _with_ends(figure: Any) -> str:
+    """Return a metric with its confidence interval as text."""
     value, low, high = (terminal.figure(float(number), 3) for number in figure)
     return f"{value} ({low} to {high})"
 
 
 def _starts(options: Tune, result: Any) -> Any:
-    """Every start; a column of where they began, where one did not begin as usual."""
-    figure = "objective" if result.settings.probed else options.objective
-    headings = ["start", "status", "steps", f"{figure} on training scenarios"]
+    """Return the table of all starts; it has a column for their origins if any was not the default."""
+    objective_name = "objective" if result.settings.probed else options.objective
+    headings = ["start", "status", "steps", f"{objective_name} on training scenarios"]
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
     if not result.first:
         return terminal.table("Starts", headings, rows, texts=(1,))
-    begun = ["literature", *["spread"] * (len(rows) - 1)]
-    for number, one in enumerate(result.first, start=result.usual_starts):
-        begun[number] = f"gains of {one.source}"
-    rows = [[*row, place] for row, place in zip(rows, begun, strict=True)]
+    origins = ["literature", *["spread"] * (len(rows) - 1)]
+    for number, earlier in enumerate(result.first, start=result.usual_starts):
+        origins[number] = f"gains of {earlier.source}"
+    rows = [[*row, origin] for row, origin in zip(rows, origins, strict=True)]
     return terminal.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

@@ -1,4 +1,4 @@
-"""`jaxhil verify`: does the runtime on the rig do what was simulated and tuned? The exit code says so."""
+"""Command `jaxhil verify`: checks that the rig's runtime reproduces the simulated controller."""
 
 from typing import Any
 
@@ -8,24 +8,30 @@ from tuning.front_door.verify import verify
 
 
 def run(options: Verify) -> int:
-    """0 if the runtime agrees; 1 if not, or if the file is corrupt; 2 if there is nothing to read."""
-    found = verify(
+    """Verify a bundle or gain file, and print the result.
+
+    Return 0 if the runtime agrees with the simulation, and 1 if it does not or a file is corrupt; an
+    unreadable file raises an error.
+    """
+    result = verify(
         options.path, key=options.key, scenarios=options.scenarios, seed=options.seed, progress=True
     )
-    document = found.document
+    document = result.document
     if options.json:
         terminal.emit_json(document)
     else:
         _print(document)
-    return 0 if found.good else 1
+    return 0 if result.good else 1
 
 
 def _exponential(value: float | None) -> str:
-    # What is not finite comes as None.
+    """Return a number in exponential notation, or a dash for None."""
+    # The document stores values that are not finite as None.
     return "-" if value is None else f"{value:.1e}"
 
 
 def _print(document: dict[str, Any]) -> None:
+    """Print the tables of the verification and the verdict."""
     from jaxhil.simulation.contact_bounds import BRIEFLY
 
     tables: list[Any] = list(document.get("self_test", ()))
@@ -49,13 +55,16 @@ def _print(document: dict[str, Any]) -> None:
                 ["contact", "e", "e simulated", "force / ideal", "duration / ideal", "status", "simulated"],
                 [
                     (
-                        *(number, terminal.figure(one["restitution"], 9)),
-                        terminal.figure(one["simulated_restitution"], 9),
-                        *(terminal.figure(one["peak_force_ratio"]), terminal.figure(one["duration_ratio"])),
-                        one["status"],
-                        one["simulated_status"],
+                        *(number, terminal.figure(contact["restitution"], 9)),
+                        terminal.figure(contact["simulated_restitution"], 9),
+                        *(
+                            terminal.figure(contact["peak_force_ratio"]),
+                            terminal.figure(contact["duration_ratio"]),
+                        ),
+                        contact["status"],
+                        contact["simulated_status"],
                     )
-                    for number, one in enumerate(document["closed_loop"], start=1)
+                    for number, contact in enumerate(document["closed_loop"], start=1)
                 ],
                 texts=(5, 6),
             ),
