@@ -204,8 +204,8 @@ def _own_files(folder: Path) -> list[str]:
         return []
     if not is_bundle(folder):
         raise InputError(f"{where}: found {shown(inside[0])} and no bundle, {allowed}")
-    found, problems = selftest.differences(str(folder))
-    files = [*found]
+    contents, problems = selftest.differences(str(folder))
+    files = [*contents]
     for name, text in problems:
         if not name.endswith(selftest.CACHE):
             raise InputError(f"{where}: {one_line(name, 80)}: {text}; {allowed}")

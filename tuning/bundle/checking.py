@@ -84,16 +84,16 @@ def run_selftest(checked: Checked, name: str) -> tuple[list[str], list[str]]:
             (folder / path).write_bytes(content)
         command = [sys.executable, *isolated, str(folder / "selftest.py")]
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False
             )
         except subprocess.TimeoutExpired:
             return [], [f"selftest.py: found no end within {LONGEST:g} s"]
-    lines = [one_line(line) for line in (done.stdout + done.stderr).splitlines()]
-    if not done.returncode:
+    lines = [one_line(line) for line in (process.stdout + process.stderr).splitlines()]
+    if not process.returncode:
         return lines, []
     failed = [line.removeprefix("FAIL").strip() for line in lines if line.startswith("FAIL ")]
-    return lines, failed or [f"selftest.py: ended with exit code {done.returncode}"]
+    return lines, failed or [f"selftest.py: ended with exit code {process.returncode}"]
 
 
 def _intact(folder: Path, signed_by: Verifier | None) -> Checked:

@@ -65,13 +65,13 @@ def _bound(statement: ast.stmt) -> list[str]:
     return [node.id for node in stores if isinstance(node.ctx, ast.Store)]
 
 
-def _only(statement: ast.stmt, wanted: set[str]) -> ast.stmt:
+def _only(statement: ast.stmt, names: set[str]) -> ast.stmt:
     """Return an import of only the wanted names, with the present name of the rig's package."""
     assert isinstance(statement, (ast.Import, ast.ImportFrom))
-    names = [alias for alias in statement.names if (alias.asname or alias.name.partition(".")[0]) in wanted]
+    aliases = [alias for alias in statement.names if (alias.asname or alias.name.partition(".")[0]) in names]
     if isinstance(statement, ast.Import):
-        return ast.Import(names)
+        return ast.Import(aliases)
     module = statement.module or ""
     if module.startswith(FORMER):
         module = PACKAGE + module.removeprefix(FORMER)
-    return ast.ImportFrom(module, names, statement.level)
+    return ast.ImportFrom(module, aliases, statement.level)

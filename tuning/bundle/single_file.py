@@ -132,7 +132,7 @@ def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str
         yield f"from {module} {line}" if isinstance(node, ast.ImportFrom) else line
 
 
-def _in_order(wanted: Iterable[str], generated: dict[str, Source]) -> list[Source]:
+def _in_order(names: Iterable[str], generated: dict[str, Source]) -> list[Source]:
     """Return the wanted modules and all modules that they import, each after its own imports.
 
     Modules in `generated` are not read from files.
@@ -149,7 +149,7 @@ def _in_order(wanted: Iterable[str], generated: dict[str, Source]) -> list[Sourc
             visit(needed, (*above, name))
         ordered[name] = source
 
-    for name in wanted:
+    for name in names:
         visit(name, ())
     return list(ordered.values())
 

@@ -140,14 +140,14 @@ def setting(compensator: str, value: Any) -> None:
         raise ArgumentError("setting", shown(value), allowed)
 
 
-def several(given: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
+def several(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
     """Return a value as a list, and whether it was a list.
 
     A value of one of the `kinds`, a mapping, or a value that is not iterable becomes a list of one entry.
     """
-    if isinstance(given, kinds) or not isinstance(given, Iterable) or isinstance(given, Mapping):
-        return [given], False
-    return list(given), True
+    if isinstance(value, kinds) or not isinstance(value, Iterable) or isinstance(value, Mapping):
+        return [value], False
+    return list(value), True
 
 
 def folder(name: str, value: Any) -> Path:
@@ -157,22 +157,22 @@ def folder(name: str, value: Any) -> Path:
     return Path(value)
 
 
-def mechanisms(given: Any) -> tuple[list[LoadedMechanism], bool]:
+def mechanisms(value: Any) -> tuple[list[LoadedMechanism], bool]:
     """Return one-axis mechanisms as a list, and whether several were given.
 
     Each is given as the result of `jaxhil.load`, or as a name or path that it accepts. Raise `InputError`.
     """
-    listed, is_list = _listed(given)
-    checked = [as_mechanism(value) for value in listed]
+    listed, is_list = _listed(value)
+    checked = [as_mechanism(entry) for entry in listed]
     return [
         LoadedMechanism(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked
     ], is_list
 
 
-def any_mechanisms(given: Any) -> tuple[list[LoadedAny], bool]:
+def any_mechanisms(value: Any) -> tuple[list[LoadedAny], bool]:
     """Return mechanisms with one axis or six as a list, like `mechanisms`."""
-    listed, is_list = _listed(given)
-    checked = [as_any_mechanism(value) for value in listed]
+    listed, is_list = _listed(value)
+    checked = [as_any_mechanism(entry) for entry in listed]
     return [LoadedAny(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked], is_list
 
 
@@ -184,24 +184,24 @@ def _listed(value: Any) -> tuple[list[Any], bool]:
     return listed, is_list
 
 
-def gain_file(given: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
+def gain_file(value: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
     """Return the loaded gains of a path, a folder, or an object with a gain file's `document`.
 
     Six axes are accepted only with `any_axes`.
     """
     from jaxhil.simulation.gain_file import check_document, load_gain_file
 
-    document = getattr(given, "document", None)
+    document = getattr(value, "document", None)
     if isinstance(document, Mapping):
         return check_document(dict(document), any_axes=any_axes)
-    path = folder(argument, given)
+    path = folder(argument, value)
     return load_gain_file(path / "gains.json" if path.is_dir() else path, any_axes)
 
 
-def readable_gain_file(given: Any, argument: str = "gains") -> Path:
+def readable_gain_file(value: Any, argument: str = "gains") -> Path:
     """Return the path of a gain file, given itself or its folder. Raise `InputError` if it is unreadable."""
     try:
-        path = folder(argument, given)
+        path = folder(argument, value)
         if path.is_dir():
             path = path / "gains.json"
         with open_input(path) as file:
@@ -210,7 +210,7 @@ def readable_gain_file(given: Any, argument: str = "gains") -> Path:
         if isinstance(error, InputError):
             raise
         reason = getattr(error, "strerror", None) or str(error)
-        where = one_line(os.fspath(given)) or repr(given)
+        where = one_line(os.fspath(value)) or repr(value)
         raise InputError(f"{where}: cannot be read: {one_line(reason)}") from None
     return path
 

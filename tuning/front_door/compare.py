@@ -170,16 +170,16 @@ def check_names(loaded: Sequence[LoadedMechanism]) -> None:
         labels[name] = entry.label
 
 
-def board(one: LoadedMechanism, options: CompareOptions, found: "Mapping[str, LawFigures]") -> Board:
+def board(entry: LoadedMechanism, options: CompareOptions, results: "Mapping[str, LawFigures]") -> Board:
     """Return the result for one mechanism, from the compensators that are finished."""
     from jaxhil.laws.compensators import COMPENSATORS
     from tuning.benchmark.tables import winners
 
-    laws = [found[law] for law in options.laws if law in found]
+    laws = [results[law] for law in options.laws if law in results]
     best = winners(laws) if laws else {}
     document = {
-        "mechanism": one.mechanism.name,
-        "file": one.label,
+        "mechanism": entry.mechanism.name,
+        "file": entry.label,
         "laws": [
             {
                 "law": result.law,

@@ -204,7 +204,7 @@ def _cluster(address: str | None) -> AbstractContextManager["Workers | None"]:
 def _complete(
     options: SweepOptions,
     store: "Store",
-    done,
+    finished_sweep,
     document: dict[str, Any],
     progress: bool,
     keep: bool,
@@ -233,11 +233,15 @@ def _complete(
 
     steps: dict[str, Callable[[], Any]] = {"plots": plots}
     if store.manifest.precision == "float32":
-        steps["float32"] = lambda: compare_precisions(done)._asdict()
+        steps["float32"] = lambda: compare_precisions(finished_sweep)._asdict()
     if options.drivers is not None:
-        steps["drivers"] = lambda: sweep_studies.drivers(options, store, done, unwritten, progress, workers)
+        steps["drivers"] = lambda: sweep_studies.drivers(
+            options, store, finished_sweep, unwritten, progress, workers
+        )
     if options.rare is not None:
-        steps["rare"] = lambda: sweep_studies.rare(options, store, done, unwritten, progress, workers)
+        steps["rare"] = lambda: sweep_studies.rare(
+            options, store, finished_sweep, unwritten, progress, workers
+        )
     write()
     for key, step in steps.items():
         document[key] = step()
@@ -245,7 +249,9 @@ def _complete(
     return unwritten
 
 
-def _document(options: SweepOptions, store: "Store", done, tally, rate: float | None) -> dict[str, Any]:
+def _document(
+    options: SweepOptions, store: "Store", finished_sweep, tally, rate: float | None
+) -> dict[str, Any]:
     """Return the JSON document of a sweep, without the additional studies."""
     from tuning.sweeps.run import describe_outcomes
     from tuning.sweeps.tally import error_quantiles, failure_probability
@@ -260,9 +266,9 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "store": str(store.folder),
         "sweep_sha256": manifest.sha256,
         "gains_sha256": manifest.gains_sha256,
-        "mechanism": done.mechanism.name,
-        "axes": done.model.axes,
-        "compensator": done.model.compensator_name(done.loop),
+        "mechanism": finished_sweep.mechanism.name,
+        "axes": finished_sweep.model.axes,
+        "compensator": finished_sweep.model.compensator_name(finished_sweep.loop),
         "scenarios": tally.scenarios,
         "most_scenarios": manifest.scenarios,
         **{key: getattr(manifest, key) for key in ("seed", "sampling", "precision", "limit", "until_width")},
@@ -271,7 +277,7 @@ def _document(options: SweepOptions, store: "Store", done, tally, rate: float | 
         "left_out_of_replicates": tally.left_out,
         "error_quantiles": [quantile._asdict() for quantile in error_quantiles(tally)],
         "outcomes": describe_outcomes(tally),
-        "worst": [_scenario(store, done.mechanism, index) for _, _, index in tally.worst],
+        "worst": [_scenario(store, finished_sweep.mechanism, index) for _, _, index in tally.worst],
         "scenarios_per_second": rate,
         "acceptable": options.acceptable,
         "verdict": "good" if good else "bad",

@@ -84,7 +84,7 @@ def tune_each(
     from tuning.gains.tune_all import tune_all
     from tuning.gains.work import Work
 
-    settings, known = options.settings(), options.known()
+    settings, earlier = options.settings(), options.known()
     mechanisms = [entry.mechanism for entry in loaded]
     number = len(loaded)
     work = Work(lambda text, share, before: bar.tell(text, share * number, before * number))
@@ -94,7 +94,7 @@ def tune_each(
         options.compensator,
         settings,
         work,
-        known,
+        earlier,
         pieces=checkpoints,
         scheduler=options.scheduler,
     )

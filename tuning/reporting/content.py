@@ -62,9 +62,9 @@ def requirements(results: Results) -> list[Requirement]:
     return [*_of_sweep(results), *_of_watchdog(results), *of_rig]
 
 
-def verdict_of(found: Sequence[Requirement]) -> str:
+def verdict_of(items: Sequence[Requirement]) -> str:
     """Return bad if any requirement is bad, good if all are good, else unknown."""
-    verdicts = {requirement.verdict for requirement in found}
+    verdicts = {requirement.verdict for requirement in items}
     if BAD in verdicts:
         return BAD
     return GOOD if verdicts == {GOOD} else UNKNOWN

@@ -81,17 +81,17 @@ def _nominal_in_space(subject: LoadedGains) -> Drawing:
     return Drawing(as_svg(figure), says, f"The nominal run. {errors}.")
 
 
-def map_drawing(found: MapDocument) -> Drawing:
+def map_drawing(document: MapDocument) -> Drawing:
     """Draw the stability map of a document."""
-    title = f"{found.mechanism}, compensation: {found.compensator}"
-    figure = map_picture(_map_of(found), title, np.inf if found.limit is None else found.limit)
-    says = f"Restitution error over {found.x.key} and {found.y.key}"
+    title = f"{document.mechanism}, compensation: {document.compensator}"
+    figure = map_picture(_map_of(document), title, np.inf if document.limit is None else document.limit)
+    says = f"Restitution error over {document.x.key} and {document.y.key}"
     return Drawing(as_svg(figure), says, f"{says}, under gains that stay the same.")
 
 
-def estimates_drawing(found: Identification) -> Drawing:
+def estimates_drawing(document: Identification) -> Drawing:
     """Draw the identified parameters and their prior values."""
-    estimates = [estimate for estimate in found.estimates if None not in (estimate.low, estimate.high)]
+    estimates = [estimate for estimate in document.estimates if None not in (estimate.low, estimate.high)]
     entries = [{name: getattr(estimate, name) for name in ESTIMATE} for estimate in estimates]
     says = "Every estimate's interval, and the prior's value, over the estimate"
     return Drawing(as_svg(compare(entries)), says, f"{says}.")
@@ -202,7 +202,7 @@ def _ended(outcome: str, error: float | None, contact: int | None) -> str:
     return f"{outcome}, e - e* = {error:+.4f}" + ("" if contact is None else f" in contact {contact}")
 
 
-def _map_of(found: MapDocument) -> Map:
+def _map_of(document: MapDocument) -> Map:
     """Return the map of a document."""
 
     def table(values: Any) -> Any:
@@ -211,7 +211,7 @@ def _map_of(found: MapDocument) -> Map:
     def axis(entry: AxisOfMap) -> MapAxis:
         return MapAxis(entry.key, "", (), entry.unit, entry.nominal, entry.values[0], entry.values[-1])
 
-    theory, radius, nominal = found.theory, found.spectral_radius, found.nominal
+    theory, radius, nominal = document.theory, document.spectral_radius, document.nominal
     closed = ClosedForms(
         table(theory.series), table(theory.characteristic_root), table(theory.delay_over_critical),
         theory.none_because,
@@ -234,13 +234,13 @@ def _map_of(found: MapDocument) -> Map:
     ratios = nominal.peak_force_ratio, nominal.duration_ratio
     point = Nominal(nominal.restitution, nominal.error, *ratios, growth, *margins)  # pyright: ignore[reportArgumentType]
     return Map(
-        axes=(axis(found.x), axis(found.y)),
-        x=table(found.x.values),
-        y=table(found.y.values),
-        restitution=table(found.restitution),
-        error=table(found.error),
-        peak_force_ratio=table(found.peak_force_ratio),
-        duration_ratio=table(found.duration_ratio),
+        axes=(axis(document.x), axis(document.y)),
+        x=table(document.x.values),
+        y=table(document.y.values),
+        restitution=table(document.restitution),
+        error=table(document.error),
+        peak_force_ratio=table(document.peak_force_ratio),
+        duration_ratio=table(document.duration_ratio),
         closed=closed,
         radii=radii,
         no_growth=radius.none_because,

@@ -89,13 +89,13 @@ def compute_map(
     seed: int,
     tell: Callable[[str, float], None],
     scheduler: str | None = None,
-    kept: Pieces = NOTHING_KEPT,
+    checkpoints: Pieces = NOTHING_KEPT,
 ) -> Map:
     """Compute the map with `points` values along each axis.
 
     `tell` is called with the current step and the number of finished runs, of `runs(points)`. With a
     `scheduler`, the workers of a cluster run the contacts. Finished tiles of runs are stored in the
-    checkpoints `kept`.
+    `checkpoints`.
     """
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
@@ -107,7 +107,7 @@ def compute_map(
     across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
     across[:, 0], up[:, 1] = lines
     point_gains, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    worst = _run(mechanism, compensator, point_gains, scenarios, tell, scheduler, kept)
+    worst = _run(mechanism, compensator, point_gains, scenarios, tell, scheduler, checkpoints)
     restitution, error, force, duration, _ = worst
     size = points**2
 
@@ -197,7 +197,7 @@ def _run(
     scenarios: Scenario,
     tell: Callable[[str, float], None],
     scheduler: str | None,
-    kept: Pieces,
+    checkpoints: Pieces,
 ) -> np.ndarray:
     """Return the result of `_worst` for each run, (5, lanes), computed tile by tile.
 
@@ -209,14 +209,14 @@ def _run(
     parts = -(-len(order) // PART)
     lanes = [order[number::parts] for number in range(parts)]
     inputs = digest_of((to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
-    done = 0
-    tell("running the contacts", done)
+    finished = 0
+    tell("running the contacts", finished)
 
     def take(number: int, values: np.ndarray) -> None:
-        nonlocal done
+        nonlocal finished
         worst[:, lanes[number]] = values
-        done += len(lanes[number])
-        tell("running the contacts", done)
+        finished += len(lanes[number])
+        tell("running the contacts", finished)
 
     def tile_pieces(numbers: Iterable[int]) -> Iterator[Piece]:
         for number in numbers:
@@ -227,14 +227,14 @@ def _run(
 
     missing = []
     for number in range(parts):
-        stored = kept.read(f"part {number}", (inputs, number), np.ndarray)
+        stored = checkpoints.read(f"part {number}", (inputs, number), np.ndarray)
         missing.append(number) if stored is None else take(number, stored)
     if scheduler is None:
         computed = ((number, run_part(*arguments)) for number, arguments in tile_pieces(missing))
     else:
         computed = on_workers(scheduler, run_part, tile_pieces(missing), setting(), f"map-{inputs[:16]}")
     for number, values in computed:
-        kept.write(f"part {number}", (inputs, number), values)
+        checkpoints.write(f"part {number}", (inputs, number), values)
         take(number, values)
     return worst
 

@@ -25,17 +25,20 @@ PALE = "#F7CF85"  # orange on which black lines are visible
 
 
 @matplotlib.style.context("default")
-def map_picture(found: Map, title: str, limit: float) -> Figure:
+def map_picture(stability_map: Map, title: str, limit: float) -> Figure:
     """Draw the signed error in colours with contours, those of theory, and the nominal point with margins."""
     figure = new_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
     axes = figure.subplots()
-    x, y = (_shown(axis, values) for axis, values in zip(found.axes, (found.x, found.y), strict=True))
-    handles = _draw_error(figure, axes, found, x, y, limit)
-    handles += _draw_growth(axes, found)
-    handles += _draw_theory(axes, found, x, y, limit)
-    handles += _draw_nominal(axes, found)
-    for axis, plot_axis in zip(found.axes, (axes.xaxis, axes.yaxis), strict=True):
+    x, y = (
+        _shown(axis, values)
+        for axis, values in zip(stability_map.axes, (stability_map.x, stability_map.y), strict=True)
+    )
+    handles = _draw_error(figure, axes, stability_map, x, y, limit)
+    handles += _draw_growth(axes, stability_map)
+    handles += _draw_theory(axes, stability_map, x, y, limit)
+    handles += _draw_nominal(axes, stability_map)
+    for axis, plot_axis in zip(stability_map.axes, (axes.xaxis, axes.yaxis), strict=True):
         low, high = _shown(axis, np.array([axis.low, axis.high]))
         # A key is text, not a formula.
         label = f"{NAMES.get(axis.key, one_line(axis.key, 60))} [{one_line(_unit(axis), 20)}]"
@@ -54,10 +57,10 @@ def map_picture(found: Map, title: str, limit: float) -> Figure:
 
 
 def _draw_error(
-    figure: Figure, axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float
+    figure: Figure, axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
     """Draw the error in colours with contours, and return the handles for the legend."""
-    error = found.error
+    error = stability_map.error
     anchors = [BLUE, SKY, "white", PALE, VERMILION]
     colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
     finite = np.abs(error[np.isfinite(error)])
@@ -86,19 +89,21 @@ def _draw_error(
     return handles
 
 
-def _draw_theory(axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: float) -> list[Any]:
+def _draw_theory(axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, limit: float) -> list[Any]:
     """Draw the contours of the closed forms, and return the handles for the legend."""
     handles: list[Any] = []
     drawn = limit if 0 < limit < np.inf else 0.01
     for values, colour, line, label in (
-        (found.closed.series, BLUE, (0, (5, 4)), "theory, small control period: series"),
-        (found.closed.characteristic_root, GREEN, (0, (1, 2)), "theory: characteristic root"),
+        (stability_map.closed.series, BLUE, (0, (5, 4)), "theory, small control period: series"),
+        (stability_map.closed.characteristic_root, GREEN, (0, (1, 2)), "theory: characteristic root"),
     ):
-        levels = [] if values is None else [level for level in _levels(found.error, drawn) if level > 0]
+        levels = (
+            [] if values is None else [level for level in _levels(stability_map.error, drawn) if level > 0]
+        )
         if values is not None and levels:
             axes.contour(x, y, values - 1, levels=levels, colors=colour, linewidths=2.0, linestyles=[line])
             handles.append(Line2D([], [], color=colour, linewidth=2.0, linestyle=line, label=label))
-    critical = found.closed.delay_over_critical
+    critical = stability_map.closed.delay_over_critical
     if critical is not None and np.min(critical) < 1 < np.max(critical):
         style: dict[str, Any] = {"linestyles": [(0, (5, 4))], "linewidths": 2.2}
         axes.contour(x, y, critical, levels=[1.0], colors=BLUE, **style)
@@ -107,20 +112,20 @@ def _draw_theory(axes: Axes, found: Map, x: np.ndarray, y: np.ndarray, limit: fl
     return handles
 
 
-def _draw_growth(axes: Axes, found: Map) -> list[Any]:
+def _draw_growth(axes: Axes, stability_map: Map) -> list[Any]:
     """Draw the contour at which the spectral radius of a lasting contact is 1; return its handle."""
-    radii = found.radii
+    radii = stability_map.radii
     if radii is None or not np.min(radii.values) < 1 < np.max(radii.values):
         return []
-    x, y = (_shown(axis, values) for axis, values in zip(found.axes, (radii.x, radii.y), strict=True))
+    x, y = (_shown(axis, values) for axis, values in zip(stability_map.axes, (radii.x, radii.y), strict=True))
     axes.contour(x, y, radii.values, levels=[1.0], colors=GREEN, linewidths=2.2)
     label = "spectral radius 1: beyond, a contact that lasts grows"
     return [Line2D([], [], color=GREEN, linewidth=2.2, label=label)]
 
 
-def _draw_nominal(axes: Axes, found: Map) -> list[Any]:
+def _draw_nominal(axes: Axes, stability_map: Map) -> list[Any]:
     """Draw the nominal point and its margins, and return its handle."""
-    point = [float(_shown(axis, np.array(axis.nominal))) for axis in found.axes]
+    point = [float(_shown(axis, np.array(axis.nominal))) for axis in stability_map.axes]
     style: dict[str, Any] = {
         "marker": "o",
         "markersize": 8,
@@ -129,9 +134,11 @@ def _draw_nominal(axes: Axes, found: Map) -> list[Any]:
     }
     axes.plot(*point, label="nominal", linestyle="none", markeredgewidth=1.6, zorder=5, **style)
     label = "nominal"
-    if found.nominal.error_margins is not None:
+    if stability_map.nominal.error_margins is not None:
         label = "nominal, and how far either key may go within the limit"
-        for index, (axis, margin) in enumerate(zip(found.axes, found.nominal.error_margins, strict=True)):
+        for index, (axis, margin) in enumerate(
+            zip(stability_map.axes, stability_map.nominal.error_margins, strict=True)
+        ):
             ends = [
                 axis.low if margin.low is None else margin.low,
                 axis.high if margin.high is None else margin.high,

@@ -16,31 +16,31 @@ from tuning.reporting.drawings import Drawing, as_svg
 WIDE = 1.96  # half width of a 95 % interval [standard deviations]
 
 
-def monitor_drawing(found: Monitoring) -> Drawing:
+def monitor_drawing(document: Monitoring) -> Drawing:
     """Draw all metrics over the number of the contact."""
     says = "Figures of every contact over its number, with their predicted range"
-    return Drawing(as_svg(_figure(found)), says, f"{says}, 95 % of contacts of the rig of the file.")
+    return Drawing(as_svg(_figure(document)), says, f"{says}, 95 % of contacts of the rig of the file.")
 
 
 @matplotlib.style.context("default")
-def _figure(found: Monitoring) -> Figure:
+def _figure(document: Monitoring) -> Figure:
     """Return the figure with one panel per metric."""
-    name = one_line(found.mechanism, 60)
+    name = one_line(document.mechanism, 60)
     figure = new_figure((9.6, 8.4), f"Contacts held against {name}", below=0.95)
     figure.subplots_adjust(hspace=0.3, wspace=0.28)
     grid: Any = figure.subplots(4, 2, sharex=True)
-    numbers = [contact.contact for contact in found.contacts]
+    numbers = [contact.contact for contact in document.contacts]
     for axes, (figure_name, unit, scale) in zip(grid.flat, FIGURES, strict=False):
-        value, std, z = _columns(found, figure_name)
+        value, std, z = _columns(document, figure_name)
         middle = scale * (value - z * std)
         axes.fill_between(
             numbers, middle - WIDE * scale * std, middle + WIDE * scale * std,
             color=SKY, alpha=0.35, linewidth=0, label="predicted, 95 %",
         )  # fmt: skip
         axes.plot(numbers, scale * value, color=BLUE, marker="o", markersize=4, linewidth=1, label="measured")
-        if found.since is not None:
+        if document.since is not None:
             style: dict[str, Any] = {"color": VERMILION, "linestyle": "--", "linewidth": 1.3}
-            axes.axvline(found.since - 0.5, label="a change is likely since", **style)
+            axes.axvline(document.since - 0.5, label="a change is likely since", **style)
         axes.set_ylabel(f"{figure_name} [{unit}]", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         finish(axes, None)
@@ -53,10 +53,10 @@ def _figure(found: Monitoring) -> Figure:
     return figure
 
 
-def _columns(found: Monitoring, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _columns(document: Monitoring, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return value, predicted standard deviation, and z of a metric for every contact; NaN if unknown."""
     rows = []
-    for contact in found.contacts:
+    for contact in document.contacts:
         metric = contact.figures.get(name)
         rows.append((None,) * 3 if metric is None else (metric.value, metric.predicted_std, metric.z))
     value, std, z = np.array(rows, float).reshape(-1, 3).T

@@ -178,12 +178,12 @@ def _no_constant(name: str) -> None:
 
 def _check_digest(document: dict[str, Any], where: str) -> None:
     """Raise `InputError` if a document was changed after it was written."""
-    found = document.get("sha256")
-    if not isinstance(found, str):
+    stated = document.get("sha256")
+    if not isinstance(stated, str):
         raise InputError(f"{where}: sha256: found nothing, allowed the digest that its command writes")
-    if found != digest(document):
+    if stated != digest(document):
         raise InputError(
-            f"{where}: sha256: found {shown(found)}, allowed that of the content: it was changed"
+            f"{where}: sha256: found {shown(stated)}, allowed that of the content: it was changed"
         )
 
 
@@ -205,12 +205,14 @@ def _check_sweep(store: Store, verdict: dict[str, Any], where: str) -> None:
             raise InputError(f"{where}: {VERDICT}: worst: found index {scenario['index']}, allowed {allowed}")
 
 
-def _check_map(found: MapDocument, where: str) -> None:
+def _check_map(document: MapDocument, where: str) -> None:
     """Raise `InputError` unless the axes increase and every table has the shape of its axes."""
-    radius = found.spectral_radius
+    radius = document.spectral_radius
     grids: list[tuple[list[float], list[float], Sequence[Sequence[Any]]]]
-    grids = [(found.x.values, found.y.values, table) for table in (found.error, found.restitution)]
-    grids += [(found.x.values, found.y.values, table) for table in _tables(found.theory)]
+    grids = [
+        (document.x.values, document.y.values, table) for table in (document.error, document.restitution)
+    ]
+    grids += [(document.x.values, document.y.values, table) for table in _tables(document.theory)]
     if radius.values is not None:
         grids.append((radius.x or [], radius.y or [], radius.values))
     for x, y, table in grids:

@@ -48,7 +48,7 @@ def run(options: Compare) -> int:
         except KeyboardInterrupt:
             interrupted = True
     ordered = {name: [results[name][law] for law in laws if law in results[name]] for name in names}
-    done = [name for name in names if ordered[name]]
+    finished_names = [name for name in names if ordered[name]]
     document = {
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "tuned": not options.untuned,
@@ -63,12 +63,12 @@ def run(options: Compare) -> int:
     path = folder / "compare.json"
     with writing(path):
         write_whole(path, terminal.as_json(document).encode("ascii"))
-    if done and not interrupted:
-        _draw(options, done, ordered)
+    if finished_names and not interrupted:
+        _draw(options, finished_names, ordered)
     if options.json:
         terminal.emit_json(document)
     else:
-        _print(options, done, ordered, document)
+        _print(options, finished_names, ordered, document)
     say_of_pieces(pieces)
     if interrupted:
         finished = sum(len(finished_laws) for finished_laws in ordered.values())

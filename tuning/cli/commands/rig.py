@@ -146,17 +146,18 @@ def _check_injection(options: RigOptions) -> None:
             raise InputError(f"--{name}: found {value:g}, allowed 0 to 1 s")
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(document: dict[str, Any]) -> None:
     """Print the tables and remarks."""
-    loops = {"empty loop": found["empty_loop"], "controller": found["run"]}
+    loops = {"empty loop": document["empty_loop"], "controller": document["run"]}
     reached = {name: loop for name, loop in loops.items() if loop is not None}
-    terminal.emit(*_tables(found, reached), *_remarks(found, reached))
+    terminal.emit(*_tables(document, reached), *_remarks(document, reached))
 
 
-def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
+def _tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
     """Return the tables of ticks, times and contacts."""
+    rate = f"{1 / document['control_period']:g} Hz over UDP"
     ticks = terminal.table(
-        f"{found['mechanism']}, {found['compensator']}, {1 / found['control_period']:g} Hz over UDP: ticks",
+        f"{document['mechanism']}, {document['compensator']}, {rate}: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
         [
             (name, *(loop[key] for key in ("ticks", "missed", *(f"missed_by_{cause}" for cause in _CAUSES))))
@@ -179,47 +180,47 @@ def _tables(found: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
             *(terminal.figure(contact["reference_restitution"], 5), terminal.signed(contact["error"])),
             *(contact["peak_force"], 1e3 * contact["duration"], contact["status"]),
         )
-        for number, contact in enumerate(found["contacts"][:MOST_ROWS], start=1)
+        for number, contact in enumerate(document["contacts"][:MOST_ROWS], start=1)
     ]
     headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
-    contacts = terminal.table(f"Contacts: {len(found['contacts'])}", headings, rows, texts=(7,))
+    contacts = terminal.table(f"Contacts: {len(document['contacts'])}", headings, rows, texts=(7,))
     return [ticks, times, *([contacts] if rows else [])]
 
 
-def _remarks(found: dict[str, Any], reached: dict[str, Any]) -> list[str]:
+def _remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[str]:
     """Return the sentences below the tables; the last ones are the verdict."""
     lines = []
-    if len(found["contacts"]) > MOST_ROWS:
-        lines.append(f"... and {len(found['contacts']) - MOST_ROWS} more contacts.")
-    if found["largest_error"] is not None:
-        lines.append(f"Largest error of {found['judged']} contacts: {found['largest_error']:+.5f}.")
+    if len(document["contacts"]) > MOST_ROWS:
+        lines.append(f"... and {len(document['contacts']) - MOST_ROWS} more contacts.")
+    if document["largest_error"] is not None:
+        lines.append(f"Largest error of {document['judged']} contacts: {document['largest_error']:+.5f}.")
     lines += [
         f"{loop['replayed']} ticks of the controller took more than their share of CPU time, and at most "
         f"{1e6 * loop['replayed_most']:.0f} µs when the same packets were gone through again."
         for loop in reached.values()
         if loop["replayed"]
     ]
-    if found["stalled"]:
+    if document["stalled"]:
         lines.append(
-            f"{found['stalled']} contacts are not judged: the machine left the controller without time for "
-            "more than three periods."
+            f"{document['stalled']} contacts are not judged: the machine left the controller without time "
+            "for more than three periods."
         )
-    if found["resets"]:
-        lines.append(f"{len(found['resets'])} times the controller tripped over that, and was reset.")
+    if document["resets"]:
+        lines.append(f"{len(document['resets'])} times the controller tripped over that, and was reset.")
     lines += [
         f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
         for name, loop in reached.items()
         if loop["stood_still"] > 0
     ]
-    flags = found["run"]["controller"]["doubts"] if found["run"] is not None else {}
+    flags = document["run"]["controller"]["doubts"] if document["run"] is not None else {}
     if flags:
         counts = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in flags.items())
         lines.append(f"Of {sum(flags.values())} contacts the law says that it did not know them: {counts}.")
-    if found["tripped"]:
-        lines.append(f"The controller {found['tripped']}.")
-    if found["interrupted"]:
+    if document["tripped"]:
+        lines.append(f"The controller {document['tripped']}.")
+    if document["interrupted"]:
         lines.append("Interrupted: this is what was measured.")
-    return lines + ([f"Bad: {reason}" for reason in found["reasons"]] or [f"Good: {found['good']}"])
+    return lines + ([f"Bad: {reason}" for reason in document["reasons"]] or [f"Good: {document['good']}"])
 
 
 _CAUSES = ("controller", "injection", "machine")

@@ -80,8 +80,8 @@ def _lines(document: dict[str, Any]) -> list[str]:
     if document["scenarios_per_second"]:
         lines.append(f"{document['scenarios_per_second']:.0f} scenarios per second.")
     acceptable = document["acceptable"]
-    wanted = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
-    lines.append(f"{document['verdict'].capitalize()}: {wanted}. Wrote {one_line(document['store'])}")
+    requirement = "no scenario may fail" if acceptable is None else f"acceptable up to {acceptable:g}"
+    lines.append(f"{document['verdict'].capitalize()}: {requirement}. Wrote {one_line(document['store'])}")
     lines += [f"Wrote {one_line(path)}" for path in document["plots"]]
     return lines
 
