@@ -1,8 +1,8 @@
-"""The runtime against the jax compensators: two controllers, written independently, on the same readings.
+"""Agreement of the runtime and the JAX compensators, written independently, on the same readings.
 
-On every built-in mechanism's recorded ticks and on a million random ones the force commands agree to 1e-11 of
-the command's range, those of laws whose recursion is long to 1e-9. Counted and
-compared separately are
+On the recorded ticks of every built-in mechanism and on a million random ticks, the force commands agree to
+1e-11 of the command's range; those of compensators with a long recursion agree to 1e-9. Two groups are
+counted and compared separately:
 
 - ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.replay`), and
 - lanes that magnify rounding: where successive regressors of the identification are nearly parallel, or gains
@@ -39,9 +39,9 @@ from tuning.verification.replay import REPLAY_LIMIT, LaneReplay, replay
 pytestmark = pytest.mark.users_options
 
 RING = 256  # samples, more than any identification delay at the shortest period
-RUNS = 6  # of a mechanism that are recorded
-RECORD = 3072  # ticks, more than any record has: its programs serve every mechanism
-# It is the laws that are compared, also beyond what a rig's controller lets out.
+RUNS = 6  # recorded runs of a mechanism
+RECORD = 3072  # ticks, longer than any record, so that all mechanisms share programs
+# Compare the compensators alone, also beyond the limits of a rig's controller.
 UNLIMITED = {
     name: limit.default if limit.default in (0.0, 0.5, 1.0) else math.copysign(math.inf, limit.default)
     for name, limit in LIMITS.items()
@@ -53,7 +53,7 @@ MECHANISMS = [
 
 
 class Readings(NamedTuple):
-    """A batch of lanes: what either controller is given, (ticks, lanes), gains and constants, (lanes,)."""
+    """Batch of lanes: signals (ticks, lanes), gains and constants (lanes,), as given to either controller."""
 
     signals: Signals
     gains: dict[str, np.ndarray]
@@ -61,7 +61,7 @@ class Readings(NamedTuple):
 
 
 class Count(NamedTuple):
-    """What a comparison covered; the largest differences as fractions of the command's range."""
+    """Coverage of a comparison; the largest differences are fractions of the command's range."""
 
     ticks: int
     compared: int
@@ -74,7 +74,7 @@ class Count(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=0)
 def simulate(name, signals, gains, constants):
-    """The jax compensator's force commands and identified parameters, (ticks, lanes), of any readings."""
+    """Return the JAX compensator's force commands and identified parameters, (ticks, lanes)."""
     law = COMPENSATORS[name]
     prepared = law.prepare(gains, constants)
 
@@ -90,7 +90,7 @@ def simulate(name, signals, gains, constants):
 
 
 def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) -> list[LaneReplay]:
-    """Every lane's readings, or the first `ticks` of each, through both controllers."""
+    """Replay every lane's readings, or the first `ticks` of each, through both controllers."""
     command, identified = jax.device_get(simulate(name, *readings))
     lanes = []
     for lane in range(command.shape[1]):
@@ -106,7 +106,7 @@ def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) 
 
 
 class Jittered(float):
-    """A float whose every result is moved to a neighbour, or not, at random."""
+    """Float whose results are moved at random to a neighbouring value or not."""
 
     generator = random.Random(0)
 
@@ -127,7 +127,7 @@ for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"
 
 
 def rounding_spread(name: str, readings: Readings, lane: int, ticks: int) -> float:
-    """How far apart [N] the runtime's own commands of the first `ticks` come when it rounds at random."""
+    """Return the spread [N] of the runtime's commands in the first `ticks` under random rounding."""
     gains = {gain: Jittered(values[lane]) for gain, values in readings.gains.items()}
     period, clearance = readings.constants.control_period[lane], readings.constants.clearance[lane]
     signals = [leaf[:ticks, lane].tolist() for leaf in readings.signals]
@@ -143,7 +143,7 @@ def rounding_spread(name: str, readings: Readings, lane: int, ticks: int) -> flo
 
 
 def compare(name: str, readings: Readings, ticks: list[int] | None = None) -> Count:
-    """Both controllers on the readings; fails where they differ by more than the limit and than they may."""
+    """Compare both controllers; fail where they differ by more than the limit and than rounding explains."""
     replays = lane_replays(name, readings, ticks)
     limit = 1e-9 if name in LONG_LAWS else REPLAY_LIMIT
     assert {lane.status for lane in replays} == {"ok"}
@@ -168,7 +168,7 @@ def compare(name: str, readings: Readings, ticks: list[int] | None = None) -> Co
 
 
 def random_gains(name: str, rng: np.random.Generator, mechanism) -> dict[str, float]:
-    """Each gain anywhere within its bounds, or in half of the cases on either or by the literature's rule."""
+    """Draw each gain within its bounds; in half of the cases at a bound or by the literature's rule."""
     gains = {}
     for gain in COMPENSATORS[name].gains:
         lower, upper = gain.lower(mechanism), gain.upper(mechanism)
@@ -180,7 +180,7 @@ def random_gains(name: str, rng: np.random.Generator, mechanism) -> dict[str, fl
 
 
 def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
-    """White noise; contacts of all sizes, plain, noisy, coarsely quantised, or coming to a standstill."""
+    """Draw white noise and contacts of all sizes: plain, noisy, coarsely quantised, or halting."""
     rng = np.random.default_rng(seed)
     mechanisms = [MECHANISMS[lane % len(MECHANISMS)] for lane in range(lanes)]
     gains = [random_gains(name, rng, mechanism) for mechanism in mechanisms]
@@ -224,7 +224,7 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 
 
 LONG_LAWS = ("impulse_ledger",)
-# Its covariance is ill-conditioned after readings that no contact makes: more lanes magnify rounding.
+# Its covariance is ill-conditioned after readings that no contact produces: more lanes magnify rounding.
 MAGNIFIED = {"impulse_ledger": 0.1}  # share of lanes, where it is not 0.02
 
 
@@ -235,7 +235,7 @@ MAGNIFIED = {"impulse_ledger": 0.1}  # share of lanes, where it is not 0.02
         pytest.param("response_error", 510, marks=pytest.mark.slow),
     ],
 )
-def test_random_ticks(name, lanes):
+def test_runtime_and_jax_commands_agree_on_random_ticks(name, lanes):
     ticks = RECORD if lanes == RUNS else 2000
     count = compare(name, random_readings(name, lanes, ticks, seed=1))
     print(name, count)
@@ -248,7 +248,7 @@ def test_random_ticks(name, lanes):
     "mechanism_name",
     [pytest.param(name, marks=() if name == "varying" else pytest.mark.slow) for name in builtin_names()],
 )
-def test_recorded_ticks(mechanism_name):
+def test_runtime_and_jax_commands_agree_on_recorded_ticks(mechanism_name):
     mechanism, sha256, _ = load(mechanism_name)
     law = COMPENSATORS["response_error"]
     gains = {gain.name: gain.nominal(mechanism) for gain in law.gains}
@@ -260,7 +260,7 @@ def test_recorded_ticks(mechanism_name):
         seen = replay(lane, gain_file)
         assert seen.status == "ok" and seen.ticks > 100 and seen.parted is None, (index, seen)
         assert max(seen.difference, seen.near_difference) <= REPLAY_LIMIT, (index, seen)
-    # The same readings, padded to a common length, serve every compensator with gains of any kind.
+    # Pad the readings to a common length and reuse them for every compensator with random gains.
     ticks = [len(lane.command) for lane in lanes]
     assert max(ticks) <= RECORD
     signals = Signals(
@@ -277,12 +277,12 @@ def test_recorded_ticks(mechanism_name):
         count = compare(name, Readings(signals, columns, constants), ticks)
         print(mechanism_name, name, count)
         assert count.ticks == count.compared == sum(ticks)
-        # One of the draws has such a prior.
+        # One of the draws has a prior with so large a variance.
         assert count.magnified <= (name in LONG_LAWS)
 
 
-def test_a_contact_held_for_long():
-    """Pushed in, held for 1e4 ticks, pulled out: on neither side anything winds up."""
+def test_runtime_and_jax_commands_agree_in_long_held_contact():
+    """Push in, hold for 1e4 ticks, pull out: no state may wind up on either side."""
     forgetting = np.array([0.8, 0.9, 0.98])
     gains = {
         gain.name: np.full(3, gain.nominal(MECHANISMS[0])) for gain in COMPENSATORS["response_error"].gains
@@ -303,7 +303,7 @@ def test_a_contact_held_for_long():
 
 @st.composite
 def small_readings(draw):
-    """A few contacts on a lattice, where much lies exactly on a threshold, with any gains within bounds."""
+    """Draw contacts on a lattice, where many values lie exactly on a threshold, with gains within bounds."""
     mechanism = draw(st.sampled_from(MECHANISMS))
     shares = hnp.arrays(np.int64, (4, 64), elements=st.integers(-8, 8))
     force, position, velocity, measured = draw(shares) / 8.0
@@ -324,6 +324,6 @@ def small_readings(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(small_readings())
-def test_readings_on_thresholds(readings):
+def test_runtime_and_jax_commands_agree_on_thresholds(readings):
     count = compare("response_error", readings)
     assert count.ticks == 64

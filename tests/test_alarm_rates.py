@@ -1,9 +1,9 @@
-"""The watchdog's rates of alarm on fresh scenarios are within what the verdict of `jaxhil export` says.
+"""The watchdog's alarm rates on fresh scenarios agree with the verdict of `jaxhil export`.
 
-Every built-in mechanism, and one whose damping and delay are both uncertain, at the literature's gains. The
-limit of the error is one that a third of the runs exceed: good and bad runs are then frequent enough to tell
-rates apart. Limits and verdict come from draws of one seed, the fresh rates from draws of another, through
-the controller in C. Run with `pytest -m slow -s tests/test_alarm_rates.py`.
+Cases: every built-in mechanism, and one whose damping and delay are both uncertain, at the literature's
+gains. The error limit is one that a third of the runs exceed: good and bad runs are then frequent enough to
+tell rates apart. Limits and verdict come from draws of one seed, the fresh rates from draws of another,
+through the controller in C. Run with `pytest -m slow -s tests/test_alarm_rates.py`.
 """
 
 import numpy as np
@@ -33,31 +33,31 @@ CASES = {
 
 
 def third(loaded):
-    """An error that about a third of the runs exceed, to two digits."""
+    """Return an error that about a third of the runs exceed, to two digits."""
     (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, LANES))
     error = np.where(chunk.contacts.status == OK, np.abs(chunk.contacts.error), np.inf)
     return float(f"{np.quantile(np.max(error, axis=0), 2 / 3):.1e}")
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_fresh_rates_are_within_what_the_verdict_says(case, tmp_path):
+def test_alarm_rates_on_fresh_scenarios_lie_within_stated_intervals(case, tmp_path):
     name, overrides, compensator = CASES[case]
     parsed = load(name, overrides).mechanism
     loaded = gains(parsed, literature_gains(parsed, compensator), compensator)
     limit = third(loaded)
-    one, rates = export(loaded, limit, tmp_path, CALIBRATED, LANES)
-    (count,) = counted(loaded, [one], FRESH, LANES, in_python=2)
+    gain_file, rates = export(loaded, limit, tmp_path, CALIBRATED, LANES)
+    (count,) = counted(loaded, [gain_file], FRESH, LANES, in_python=2)
     print(f"\n{case}, {compensator}: limit {limit:g}, margin {rates['restitution_margin']:.2g}", end="")
     print(f" widened from {rates['widened_from']:.2g}" if rates["widened_from"] else "", end="")
     noticed = rates["noticed_from"]["error"]
     print(f", 95 % noticed from {noticed:.2g}" if noticed else ", no error noticed", rates["verdict"])
     missed = len(count.missed)
-    # What the watchdog would have said of a run that another guard stopped, nobody knows.
-    found = {
+    # Whether the watchdog would have raised an alarm in a run that another guard stopped is unknown.
+    counts = {
         "false_alarms": (len(count.false), len(count.false), count.good),
         "missed_alarms": (missed, missed + count.guarded, count.bad),
     }
-    for kind, (alarms, most, runs) in found.items():
+    for kind, (alarms, most, runs) in counts.items():
         stated = rates[kind]
         low, high = binomial_interval(alarms, runs)[1], binomial_interval(most, runs)[2]
         print(

@@ -1,4 +1,6 @@
-"""What is said of the watchdog's alarms: good, bad or unknown, which sweep would tell, what is noticed."""
+"""Verdicts on the watchdog's alarm rates: good, bad or unknown, the sweep that would decide, and the smallest
+error that is detected.
+"""
 
 import numpy as np
 import pytest
@@ -9,12 +11,12 @@ from tuning.watchdog.verdict import ALLOWED, Allowed, judged
 
 
 def rates(false, missed, held_out=1000):
-    """As of so many alarms among so many runs, either kind."""
-    found = {"held_out_runs": held_out}
+    """Return the alarm rates for these counts (alarms, runs) of either kind."""
+    result = {"held_out_runs": held_out}
     for kind, (alarms, runs) in (("false_alarms", false), ("missed_alarms", missed)):
         _, low, high = binomial_interval(alarms, runs)
-        found[kind] = {"alarms": alarms, "runs": runs, "low": float(low), "high": float(high)}
-    return found
+        result[kind] = {"alarms": alarms, "runs": runs, "low": float(low), "high": float(high)}
+    return result
 
 
 @pytest.mark.parametrize(
@@ -30,69 +32,69 @@ def rates(false, missed, held_out=1000):
         ((0, 0), (0, 0), "unknown", [], ["false", "missed"]),
     ],
 )
-def test_the_verdict_follows_from_the_ends_of_the_intervals(false, missed, verdict, bad, unknown):
-    found = judged(rates(false, missed), ALLOWED, 2000)
-    assert found["verdict"] == verdict
-    assert [text.split()[0] for text in found["reasons"]] == bad
-    assert [text.split()[0] for text in found["unknown"]] == unknown
-    assert found["false_alarms"]["allowed"] == 0.01 and found["missed_alarms"]["allowed"] == 0.02
+def test_alarm_verdict_follows_from_interval_bounds(false, missed, verdict, bad, unknown):
+    result = judged(rates(false, missed), ALLOWED, 2000)
+    assert result["verdict"] == verdict
+    assert [text.split()[0] for text in result["reasons"]] == bad
+    assert [text.split()[0] for text in result["unknown"]] == unknown
+    assert result["false_alarms"]["allowed"] == 0.01 and result["missed_alarms"]["allowed"] == 0.02
 
 
-def test_what_is_allowed_is_the_callers():
-    found = rates((30, 100), (0, 200))
-    assert judged(found, Allowed(0.5, 0.02), 400)["verdict"] == "good"
-    assert judged(found, Allowed(0.1, 0.02), 400)["verdict"] == "bad"
-    assert judged(found, Allowed(0.3, 0.001), 400)["verdict"] == "unknown"
-    assert judged(found, Allowed(1.0, 1.0), 400)["verdict"] == "good"
+def test_alarm_verdict_uses_rates_allowed_by_caller():
+    result = rates((30, 100), (0, 200))
+    assert judged(result, Allowed(0.5, 0.02), 400)["verdict"] == "good"
+    assert judged(result, Allowed(0.1, 0.02), 400)["verdict"] == "bad"
+    assert judged(result, Allowed(0.3, 0.001), 400)["verdict"] == "unknown"
+    assert judged(result, Allowed(1.0, 1.0), 400)["verdict"] == "good"
 
 
 @pytest.mark.parametrize(
     ("missed", "words"),
     [
-        # 183 runs decide if none is missed: of 2000 scenarios 40 made judged ones.
+        # 183 runs decide if no alarm is missed; 40 of 2000 scenarios were evaluated.
         ((0, 40), "at this rate a sweep of about 9200 scenarios tells"),
         ((0, 0), "no such run among 1000: a sweep of at least 50000 scenarios tells"),
         ((1, 50), "at this rate no sweep would tell"),
     ],
 )
-def test_it_is_said_which_sweep_would_tell(missed, words):
+def test_unknown_alarm_verdict_states_sufficient_sweep_size(missed, words):
     (text,) = judged(rates((0, 500), missed), ALLOWED, 2000)["unknown"]
     assert text.endswith(f"allowed 0.02; {words}")
 
 
 @pytest.mark.parametrize("allowed", [0.001, 0.02, 0.3])
 @pytest.mark.parametrize(("failures", "number"), [(0, 0), (0, 30), (1, 200), (3, 60), (40, 100)])
-def test_so_many_decide_and_fewer_do_not(failures, number, allowed):
-    found = number_to_decide(failures, number, allowed)
+def test_number_to_decide_is_smallest_sufficient_number(failures, number, allowed):
+    number_found = number_to_decide(failures, number, allowed)
     share = failures / max(number, 1)
-    assert found is not None
+    assert number_found is not None
 
     def decided(runs):
         _, low, high = binomial_interval(round(share * runs), runs)
         return high <= allowed if share < allowed else low > allowed
 
-    fewer = range(max(0, int(0.97 * found) - 3), found)
-    assert decided(found) and not all(decided(runs) for runs in fewer)
+    fewer = range(max(0, int(0.97 * number_found) - 3), number_found)
+    assert decided(number_found) and not all(decided(runs) for runs in fewer)
 
 
-def test_the_error_from_which_on_contacts_are_noticed():
+def test_noticed_from_finds_smallest_error_detected_at_95_percent():
     rng = np.random.default_rng(0)
     error = rng.normal(0.0, 0.01, 4000)
-    found = noticed_from(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)
+    result = noticed_from(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)
     size = np.abs(error)
-    within = size >= found["error"]
-    assert 0.018 < found["error"] < 0.022 and found["contacts"] == np.sum(within)
-    assert found["largest"] == np.max(size)
+    within = size >= result["error"]
+    assert 0.018 < result["error"] < 0.022 and result["contacts"] == np.sum(within)
+    assert result["largest"] == np.max(size)
     noticed = np.abs(error) > 0.02
     assert noticed_from(error, noticed)["error"] < 0.02
-    # The next smaller one is not noticed often enough.
-    found, order = noticed_from(error, noticed), np.sort(size)[::-1]
-    below = order[found["contacts"]]
-    assert np.mean(noticed[size >= found["error"]]) >= 0.95 > np.mean(noticed[size >= below])
+    # The next smaller error is not detected often enough.
+    result, order = noticed_from(error, noticed), np.sort(size)[::-1]
+    below = order[result["contacts"]]
+    assert np.mean(noticed[size >= result["error"]]) >= 0.95 > np.mean(noticed[size >= below])
 
 
 @pytest.mark.parametrize(("contacts", "noticed"), [(0, True), (19, True), (200, False)])
-def test_no_such_error_is_made_up(contacts, noticed):
+def test_noticed_from_returns_none_without_evidence(contacts, noticed):
     error = np.linspace(0.0, 0.05, contacts)
-    found = noticed_from(error, np.full(contacts, noticed))
-    assert found == {"error": None, "contacts": 0, "largest": 0.05 if contacts else None}
+    result = noticed_from(error, np.full(contacts, noticed))
+    assert result == {"error": None, "contacts": 0, "largest": 0.05 if contacts else None}

@@ -1,5 +1,7 @@
-"""Nothing of a bundle is run that this version does not export, whatever the bundle says of itself; nothing
-in its folder is waited for, or followed out of it."""
+"""Checks of an exported bundle: only files that this version exports are run, whatever its manifest claims.
+
+The checks never wait for a file, and never follow a link out of the folder.
+"""
 
 import hashlib
 import json
@@ -38,7 +40,7 @@ def folder(tmp_path):
 
 @pytest.fixture(autouse=True)
 def _in_time():
-    """What hangs fails."""
+    """Fail a test that hangs."""
 
     def too_long(number, frame):
         raise TimeoutError(f"longer than {SHORT} s")
@@ -62,7 +64,7 @@ def document_of(files):
 
 
 def resealed(manifest):
-    """A manifest's content, of any form, with checks of itself that fit."""
+    """Return the content of a manifest of any form, with checksums of itself that fit."""
     body = json.dumps(manifest, indent=1).encode().removesuffix(b"\n}")
     return body + selftest.own_seal(body)
 
@@ -72,13 +74,13 @@ def entry(content, **changes):
 
 
 def plain_manifest(files, **others):
-    """The manifest's content as data, with other entries of files beside."""
+    """Return the manifest's content as data, with additional file entries."""
     made = json.loads(files["manifest.json"])
     made = {name: value for name, value in made.items() if not name.startswith("own_")}
     return {**made, "files": {**made["files"], **others}}
 
 
-def test_what_was_exported_is_what_this_version_exports(files, folder):
+def test_bundle_check_accepts_exported_bundle(files, folder):
     checked = check_bundle(placed(folder, files))
     assert (checked.reasons, checked.signature) == ([], "not signed")
     assert checked.files == files and checked.document == document_of(files)
@@ -86,23 +88,23 @@ def test_what_was_exported_is_what_this_version_exports(files, folder):
 
 
 @pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
-def test_a_bundle_that_vouches_for_itself_is_not_run(files, folder, tmp_path, name):
-    """Its manifest fits all files, one of which leaves a mark where it is run."""
+def test_self_consistent_foreign_bundle_is_not_run(files, folder, tmp_path, name):
+    """Change one file so that it leaves a trace if it is run, and let the manifest fit all files."""
     trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
-    own = signed({**files, name: files[name] + trap}, document_of(files))
-    found = tuning.verify(placed(folder, own))
-    assert not found.good and found.document["self_test"] == []
-    first, last = found.reasons
+    signed_files = signed({**files, name: files[name] + trap}, document_of(files))
+    verdict = tuning.verify(placed(folder, signed_files))
+    assert not verdict.good and verdict.document["self_test"] == []
+    first, last = verdict.reasons
     assert first == f"{name}: is not what this version exports"
     assert last.startswith("nothing of it was run: it says that this version, jaxhil ")
     assert (check_code(folder, "phase_lead") == []) is (name not in CODE)
     assert not (tmp_path / "ran").exists()
 
 
-def test_files_too_many_and_too_few_are_not_of_this_version(files, folder):
-    some = {name: content for name, content in files.items() if name != "udp_controller.py"}
-    own = signed({**some, "sitecustomize.py": b"open('ran', 'w')"}, document_of(files))
-    reasons = check_bundle(placed(folder, own)).reasons
+def test_bundle_check_reports_missing_and_extra_files(files, folder):
+    remaining = {name: content for name, content in files.items() if name != "udp_controller.py"}
+    signed_files = signed({**remaining, "sitecustomize.py": b"open('ran', 'w')"}, document_of(files))
+    reasons = check_bundle(placed(folder, signed_files)).reasons
     assert reasons[:2] == [
         "sitecustomize.py: is no file that this version exports",
         "udp_controller.py: is not here",
@@ -118,27 +120,27 @@ def test_files_too_many_and_too_few_are_not_of_this_version(files, folder):
         (b"base64,iVBOR", b"base64,iVBO="),
     ],
 )
-def test_a_summary_with_a_script_is_not_of_this_version(files, folder, old, new):
+def test_bundle_check_rejects_modified_summary_page(files, folder, old, new):
     assert old in files["summary.html"]
     page = files["summary.html"].replace(old, new)
-    own = signed({**files, "summary.html": page}, document_of(files))
-    reason = check_bundle(placed(folder, own)).reasons[0]
+    signed_files = signed({**files, "summary.html": page}, document_of(files))
+    reason = check_bundle(placed(folder, signed_files)).reasons[0]
     assert reason.startswith(("summary.html: is not", "gains.json: this version cannot export it")), reason
 
 
-def test_a_bundle_of_another_version_names_it(files, folder):
-    for stated, said in [("jaxhil 0.0.9", "'jaxhil 0.0.9' wrote it"), (None, "does not say"), ([1], "[1]")]:
+def test_bundle_check_names_version_that_wrote_bundle(files, folder):
+    for stated, words in [("jaxhil 0.0.9", "'jaxhil 0.0.9' wrote it"), (None, "does not say"), ([1], "[1]")]:
         other = plain_manifest(files)
         other.update(version=stated)
         if stated is None:
             del other["version"]
         placed(folder, {**files, "manifest.json": resealed(other)})
         first, last = check_bundle(folder).reasons
-        assert first == "manifest.json: is not what this version writes of these files" and said in last
-    assert run_selftest(folder)[0]  # with what a rig has, it is consistent
+        assert first == "manifest.json: is not what this version writes of these files" and words in last
+    assert run_selftest(folder)[0]  # the self-test on a rig sees a consistent bundle
 
 
-def test_a_gain_file_written_in_another_way_is_not_of_this_version(files, folder):
+def test_bundle_check_rejects_gain_file_with_other_formatting(files, folder):
     for text in (
         files["gains.json"].replace(b": ", b":  ", 1),
         files["gains.json"].replace(b"{\n", b'{\n  "seed": 7,\n', 1),
@@ -146,12 +148,12 @@ def test_a_gain_file_written_in_another_way_is_not_of_this_version(files, folder
         b"[" * 100_000,
         b"\xff",
     ):
-        own = signed({**files, "gains.json": text}, document_of(files))
-        reasons = check_bundle(placed(folder, own)).reasons
+        signed_files = signed({**files, "gains.json": text}, document_of(files))
+        reasons = check_bundle(placed(folder, signed_files)).reasons
         assert reasons[0].startswith("gains.json: "), reasons
 
 
-def test_what_is_run_is_what_was_checked(files, folder, tmp_path):
+def test_selftest_runs_the_checked_content_not_files_changed_later(files, folder, tmp_path):
     checked = check_bundle(placed(folder, files))
     for name in ("selftest.py", "jaxhil_runtime.py"):
         (folder / name).write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
@@ -160,7 +162,7 @@ def test_what_is_run_is_what_was_checked(files, folder, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_compiled_code_beside_the_sources_is_not_passed_over(files, folder):
+def test_bundle_check_reports_pycache_beside_sources(files, folder):
     placed(folder, files)
     (folder / "__pycache__").mkdir()
     (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"who knows")
@@ -178,11 +180,11 @@ HOSTILE_PATHS = [
 
 
 @pytest.mark.parametrize("path", HOSTILE_PATHS)
-def test_paths_of_a_manifest_stay_within_the_folder(files, folder, path):
+def test_manifest_paths_outside_bundle_are_rejected(files, folder, path):
     (folder.parent / "secret").write_bytes(b"secret")
-    own = {**files, "manifest.json": resealed(plain_manifest(files, **{path: entry(b"secret")}))}
+    hostile_files = {**files, "manifest.json": resealed(plain_manifest(files, **{path: entry(b"secret")}))}
     begun = time.monotonic()
-    checked = check_bundle(placed(folder, own))
+    checked = check_bundle(placed(folder, hostile_files))
     good, out = run_selftest(folder)
     assert time.monotonic() - begun < SHORT
     assert not good and f"FAIL  {'c99' if path == 'c99' else 'manifest.json'}: cannot be read: " in out
@@ -192,7 +194,7 @@ def test_paths_of_a_manifest_stay_within_the_folder(files, folder, path):
 
 @pytest.mark.parametrize("name", ["gains.json", "manifest.json", "manifest.sig", "selftest.py", "c99"])
 @pytest.mark.parametrize("kind", ["pipe", "link", "link to a device", "loop", "folder", "socket", "vast"])
-def test_what_is_no_plain_file_is_refused_at_once(files, folder, monkeypatch, name, kind):
+def test_bundle_check_rejects_links_pipes_and_folders_without_waiting(files, folder, monkeypatch, name, kind):
     placed(folder, files)
     path = folder / name
     elsewhere = folder.parent / "elsewhere"
@@ -213,24 +215,24 @@ def test_what_is_no_plain_file_is_refused_at_once(files, folder, monkeypatch, na
         with path.open("wb") as file:
             file.truncate(1 << 40)
     begun = time.monotonic()
-    found = tuning.verify(folder)
+    verdict = tuning.verify(folder)
     program = str(elsewhere if name == "selftest.py" else folder / "selftest.py")
     command = [sys.executable, "-I", "-S", "-B", program]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=SHORT, check=False)
     assert time.monotonic() - begun < SHORT
-    assert not found.good and found.document["self_test"] == []
-    assert any(reason.startswith(name) for reason in found.reasons), found.reasons
+    assert not verdict.good and verdict.document["self_test"] == []
+    assert any(reason.startswith(name) for reason in verdict.reasons), verdict.reasons
     assert ran.returncode == 1 and "Traceback" not in ran.stderr
     assert name == "selftest.py" or f"FAIL  {name}" in ran.stdout
 
 
-def test_more_than_a_bundle_ever_has_is_refused(files, folder):
+def test_bundle_check_rejects_oversized_manifest_entries(files, folder):
     many = {f"f{number}": entry(b"") for number in range(selftest.MOST_FILES + 1)}
     for others in (many, {"vast": entry(b"", bytes=1 << 60)}, {"odd": entry(b"", bytes=True)}):
         placed(folder, {**files, "manifest.json": resealed(plain_manifest(files, **others))})
         [reason] = check_bundle(folder).reasons
         assert reason.startswith("manifest.json: cannot be read: ValueError: ")
-    # A file that has another size than is stated, with the stated digest.
+    # The file's size differs from the stated one; its digest is as stated.
     wrong = plain_manifest(files, **{"ros2.yaml": entry(files["ros2.yaml"], bytes=3)})
     placed(folder, {**files, "manifest.json": resealed(wrong)})
     [reason] = check_bundle(folder).reasons
@@ -238,12 +240,12 @@ def test_more_than_a_bundle_ever_has_is_refused(files, folder):
 
 
 def flipped(source, content):
-    place, bit = source.randrange(len(content)), source.randrange(8)
-    return content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+    index, bit = source.randrange(len(content)), source.randrange(8)
+    return content[:index] + bytes([content[index] ^ 1 << bit]) + content[index + 1 :]
 
 
 @pytest.mark.parametrize("flips", [100, pytest.param(1000, marks=pytest.mark.slow)])
-def test_no_flipped_bit_passes(files, folder, flips):
+def test_bundle_check_detects_every_flipped_bit(files, folder, flips):
     source, names = random.Random(flips), sorted(files)
     placed(folder, files)
     for turn in range(flips):
@@ -255,7 +257,7 @@ def test_no_flipped_bit_passes(files, folder, flips):
     assert check_bundle(folder).reasons == []
 
 
-def test_a_bundle_is_replaced_as_a_whole_and_nothing_else_is_touched(files, folder, tmp_path):
+def test_write_bundle_replaces_only_an_unmodified_bundle(files, folder, tmp_path):
     placed(folder, files)
     secret = tmp_path / "secret"
     secret.mkdir()
@@ -287,7 +289,7 @@ def test_a_bundle_is_replaced_as_a_whole_and_nothing_else_is_touched(files, fold
     assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]
 
 
-def test_what_comes_into_an_old_bundle_at_the_last_moment_stays(files, folder, monkeypatch):
+def test_write_bundle_keeps_file_added_during_replacement(files, folder, monkeypatch):
     placed(folder, files)
 
     def late(new, target):

@@ -1,4 +1,4 @@
-"""The controller in C99 is the runtime in Python, bit for bit: gains, limits, commands, faults."""
+"""The C99 controller agrees with the Python runtime bit for bit: gains, limits, commands, faults."""
 
 import ctypes
 import math
@@ -38,19 +38,19 @@ from tuning.bundle.c99_tables import UNUSABLE, decimal
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
-# Most of the C code between them.
+# Together these cover most of the C code.
 LONG_CODE = ("response_error", "virtual_contact", "impulse_ledger")
 KINDS = ("contact", "random", "hostile")
 
 
 @pytest.fixture(scope="module")
 def batch():
-    """`batch(law)`: the law, compiled and loaded."""
+    """Return `batch(law)`: the compiled and loaded compensator."""
     return c99_cases.loaded
 
 
 def sanitized(tmp_path: Path, law: str) -> Path:
-    """The driver as a program that stops where C leaves its behaviour open; skips where it cannot be made."""
+    """Compile the driver as a program that stops at undefined behaviour; skip if that is impossible."""
     probe = tmp_path / "probe.c"
     probe.write_text("int main(void) { return 0; }\n")
     command = [str(c99_cases.COMPILER), *SANITIZED, str(probe), "-o", str(tmp_path / "probe")]
@@ -60,7 +60,7 @@ def sanitized(tmp_path: Path, law: str) -> Path:
     return compiled(folder, "c99_driver.c", "sanitized", "-O1", "-DDRIVER_MAIN", *SANITIZED)
 
 
-def test_faults_are_those_of_the_runtime(batch):
+def test_c99_faults_match_runtime(batch):
     header = c99_texts(gain_document("none"))["jaxhil_controller.h"]
     bits = {
         name: int(bit, 16) for name, bit in re.findall(r"^    JAXHIL_(\w+) = (0x[0-9A-F]+)", header, re.M)
@@ -71,7 +71,7 @@ def test_faults_are_those_of_the_runtime(batch):
     assert made.fault_name(UNUSABLE) == "unusable" and made.fault_name(3) == made.fault_name(0) == ""
 
 
-def test_statuses_are_those_of_the_runtime(batch):
+def test_c99_statuses_match_runtime(batch):
     header = c99_texts(gain_document("none"))["jaxhil_controller.h"]
     (listed,) = re.findall(r"enum \{\n([^}]*JAXHIL_UNSTATED[^}]*)\}", header)
     numbers = {name: int(number) for name, number in re.findall(r"^    JAXHIL_(\w+) = (\d+)", listed, re.M)}
@@ -85,7 +85,7 @@ def test_statuses_are_those_of_the_runtime(batch):
 
 
 @pytest.mark.parametrize("delay", [101_000.0 * PERIOD, 1e306])
-def test_delay_that_the_runtime_refuses_is_refused(delay):
+def test_c99_export_rejects_delay_that_runtime_rejects(delay):
     document = gain_document()
     document["gains"]["identification_delay"] |= {"value": delay, "upper": delay}
     with pytest.raises(GainFileError, match="delay"):
@@ -93,8 +93,8 @@ def test_delay_that_the_runtime_refuses_is_refused(delay):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_compiler_reads_the_gains_back_exactly(law, tmp_path):
-    """Gains of every size, each of them where its law is defined."""
+def test_c99_gains_are_compiled_to_the_same_bits(law, tmp_path):
+    """Take gains of every size, each within the domain of its compensator."""
     rng = np.random.default_rng(1)
     document = gain_document(law)
     wide = drawn_gains(law, rng, hostile=True)
@@ -107,7 +107,7 @@ def test_compiler_reads_the_gains_back_exactly(law, tmp_path):
     assert made.exported().tobytes() == packed(law, gain_file).tobytes()
 
 
-def test_compiler_reads_any_double_back(tmp_path):
+def test_c99_decimal_constants_are_compiled_to_the_same_bits(tmp_path):
     rng = np.random.default_rng(2)
     values = rng.integers(0, 2**64, 5000, dtype=np.uint64).view(np.float64)
     values = np.concatenate([values[np.isfinite(values)], c99_cases.HOSTILE[:-1], np.arange(5.0)])
@@ -116,20 +116,20 @@ def test_compiler_reads_any_double_back(tmp_path):
         f"#include <math.h>\nextern const double numbers[];\nconst double numbers[] = {{\n{numbers}}};\n"
     )
     library = ctypes.CDLL(str(compiled(tmp_path, "numbers.c", "numbers.so", "-shared", "-fPIC")))
-    found = np.array((ctypes.c_double * len(values)).in_dll(library, "numbers"))
-    assert found.tobytes() == values.tobytes()
+    result = np.array((ctypes.c_double * len(values)).in_dll(library, "numbers"))
+    assert result.tobytes() == values.tobytes()
 
 
 @given(value=st.floats(allow_nan=False))
-def test_decimal_is_a_floating_constant_that_is_the_value(value):
+def test_decimal_writes_exact_floating_constant(value):
     text = decimal(value)
     assert math.isinf(value) or (re.fullmatch(r"-?\d+(\.\d+)?(e[-+]\d+)?", text) and set(text) & set(".e"))
     assert struct.pack("d", float(text.replace("INFINITY", "inf"))) == struct.pack("d", value)
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_gains_are_admitted_where_python_admits_them(law, batch):
-    """A loaded struct is checked as a gain file is."""
+def test_c99_admits_the_same_gains_as_python(law, batch):
+    """Check a loaded struct as a gain file is checked."""
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(3), hostile=False)
     assert made.begin(packed(law, sane))
@@ -147,7 +147,7 @@ def test_gains_are_admitted_where_python_admits_them(law, batch):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("delay", [1.01 * (LINES + 1), 1e6, 1e300, math.nan, math.inf])
-def test_delay_longer_than_its_line_is_refused_and_stays_so(law, delay, batch):
+def test_c99_rejects_delay_longer_than_delay_line_until_next_begin(law, delay, batch):
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(4), hostile=False, period=CONTROL_PERIODS[0])
     rows = drawn_rows("random", 1000, np.random.default_rng(5), PERIOD)
@@ -164,12 +164,12 @@ def test_delay_longer_than_its_line_is_refused_and_stays_so(law, delay, batch):
         assert np.all(results[:, 0] == 0.0) and np.all(
             results[:, c99_cases.RESULT.index("cause")] == UNUSABLE
         )
-        # The drives are held where they, or else the numerical model, were read first.
+        # The drives hold the first position read, or else that of the numerical model.
         commanded = rows[:, 0] != c99_cases.STEP_ONLY
         assert len(np.unique(results[commanded, 1])) == 1
 
 
-def test_limits_are_admitted_where_python_admits_them(batch):
+def test_c99_admits_the_same_limits_as_python(batch):
     made = batch("none")
     plain = check_gain_document(gain_document("none"))
     assert made.begin(packed("none", plain))
@@ -191,7 +191,7 @@ def test_limits_are_admitted_where_python_admits_them(batch):
 
 @pytest.mark.parametrize("low", [-1.0, 0.0, 1.0, 2.0])
 @pytest.mark.parametrize("high", [-1.0, 1.0, 2.0])
-def test_limits_that_clash_are_refused_as_in_python(low, high, batch):
+def test_c99_rejects_the_same_conflicting_limits_as_python(low, high, batch):
     made = batch("none")
     plain = check_gain_document(gain_document("none"))
     for names_of in (
@@ -213,7 +213,7 @@ def test_limits_that_clash_are_refused_as_in_python(low, high, batch):
 
 
 def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
-    """The law alone and the whole controller, C beside Python."""
+    """Compare C and Python bit for bit: the compensator alone, then the whole controller."""
     gains = packed(made.law, gain_file)
     assert made.begin(gains)
     assert_same(made.run(rows, False), c99_cases.law_in_python(gain_file, rows), rows)
@@ -223,7 +223,7 @@ def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
     assert np.all(np.isfinite(results[:, :2]))
 
 
-def test_retreat_of_a_command_from_one_end_of_the_range_to_the_other_is_finite(batch):
+def test_c99_retreat_across_the_whole_command_range_is_finite(batch):
     gain_file = GainFile("none", {}, PERIOD, math.inf, complete({"deceleration": 1.0}))
     rows = np.zeros((6, len(c99_cases.ROW)))
     rows[:2, 7] = 10.0, -10.0
@@ -233,15 +233,15 @@ def test_retreat_of_a_command_from_one_end_of_the_range_to_the_other_is_finite(b
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("law", LAWS)
-def test_same_bits(law, kind, batch):
+def test_c99_commands_equal_python_to_the_bit(law, kind, batch):
     rng = np.random.default_rng([LAWS.index(law), KINDS.index(kind)])
     for n in range(12):
         gain_file = drawn_gains(law, rng, hostile=n % 2 == 1)
         compare(batch(law), gain_file, drawn_rows(kind, 1000, rng, gain_file.control_period))
 
 
-def test_same_bits_in_contacts_that_the_impulse_ledger_follows(batch):
-    """Contacts after an approach, of every status that the law states of a tick."""
+def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
+    """Take contacts after an approach that reach every status of the compensator."""
     law, statuses = "impulse_ledger", set()
     for n in range(12):
         rng = np.random.default_rng([11, n])
@@ -253,9 +253,9 @@ def test_same_bits_in_contacts_that_the_impulse_ledger_follows(batch):
         gain_file = gain_file._replace(gains=gains, limits=limits, clearance=clearance)
         motion = rng.uniform(0, 6), rng.uniform(8, 60), 10 ** rng.uniform(-4.5, -2.7)
         rows = c99_cases.contact_rows(2000, rng, PERIOD, *motion)
-        if n % 4 == 0:  # a sensor that is neither late nor noisy
+        if n % 4 == 0:  # a sensor without delay and noise
             rows[:, 1] = 1.2e5 * np.maximum(rows[:, 4], 0.0) + 0.1 * rng.standard_normal(len(rows))
-        if n % 4 == 2:  # contact that is over soon
+        if n % 4 == 2:  # a contact that ends soon
             rows[:, 1] *= 300.0
         compare(batch(law), gain_file, rows)
         assert batch(law).begin(packed(law, gain_file))
@@ -267,14 +267,16 @@ def test_same_bits_in_contacts_that_the_impulse_ledger_follows(batch):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_same_bits_where_what_is_compared_is_equal(law, batch):
+def test_c99_commands_equal_python_where_comparisons_are_ties(law, batch):
     rng = np.random.default_rng([10, LAWS.index(law)])
     for _ in range(25):
         compare(batch(law), *drawn_exactly(law, 300, rng))
 
 
-def test_the_rows_reach_everything(batch):
-    """Every fault but that of laws with a status, audits that pass, an identified stiffness that moves."""
+def test_c99_drawn_rows_reach_every_fault(batch):
+    """Reach every fault except that of compensators with a status, passed audits, and a changing identified
+    stiffness.
+    """
     made = batch("response_error")
     rng = np.random.default_rng(6)
     seen, audited, identified = 0, set(), set()
@@ -306,9 +308,9 @@ def cases(draw):
         *[any_float] * 3,
     )
     rows = draw(st.lists(number, min_size=1, max_size=20))
-    some = draw(st.sets(st.sampled_from(list(LIMITS)), max_size=10))
+    chosen = draw(st.sets(st.sampled_from(list(LIMITS)), max_size=10))
     try:
-        limits = complete({name: draw(limit_values(law, name)) for name in sorted(some)})
+        limits = complete({name: draw(limit_values(law, name)) for name in sorted(chosen)})
     except ValueError:
         reject()
     return GainFile(law, gains, PERIOD, clearance, limits), np.array(rows)
@@ -318,13 +320,13 @@ def limit_values(law, name):
     if name in c99_cases.delays(law):
         return st.floats(0.0, CAPACITY * PERIOD)
     lowest, highest = LIMITS[name].lowest, LIMITS[name].highest
-    # Half of the drawn limits are of a size that binds.
+    # Draw half of the limits from values that become active.
     return st.one_of(st.floats(max(lowest, -1e3), min(highest, 1e3)), st.floats(lowest, highest))
 
 
 @settings(max_examples=150)
 @given(case=cases())
-def test_same_bits_whatever_comes(case, batch):
+def test_c99_commands_equal_python_on_hypothesis_rows(case, batch):
     gain_file, rows = case
     compare(batch(gain_file.compensator), gain_file, rows)
 
@@ -332,8 +334,8 @@ def test_same_bits_whatever_comes(case, batch):
 @pytest.mark.parametrize(
     "law", [pytest.param(law, marks=() if law in LONG_CODE else pytest.mark.slow) for law in LAWS]
 )
-def test_no_undefined_behaviour(law, tmp_path):
-    """Address and undefined-behaviour sanitizers, float conversions included, on hostile rows."""
+def test_c99_has_no_undefined_behaviour_under_sanitizers(law, tmp_path):
+    """Run hostile rows under the address and undefined-behaviour sanitizers, float conversions included."""
     program = sanitized(tmp_path, law)
     rng = np.random.default_rng(7)
     for guarded in (True, False):
@@ -355,8 +357,8 @@ def test_no_undefined_behaviour(law, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
-def test_same_bits_over_ten_million_ticks(law, batch):
-    """1e7 ticks in all over the laws, law alone and controller each."""
+def test_c99_commands_equal_python_over_ten_million_ticks(law, batch):
+    """Run 1e7 ticks in all, each through the compensator alone and through the whole controller."""
     rng = np.random.default_rng([8, LAWS.index(law)])
     chunk = 20_000
     for n in range(math.ceil(1e7 / len(LAWS) / chunk)):

@@ -1,4 +1,4 @@
-"""The C99 controller as sources: no warning, no memory of its own, no more exported than needed."""
+"""Sources of the C99 controller: no warnings, no static memory, nothing exported that is not needed."""
 
 import functools
 import inspect
@@ -28,7 +28,7 @@ LAWS = tuple(COMPENSATORS)
 
 @pytest.fixture(scope="module")
 def controller_object(tmp_path_factory):
-    """`controller_object(law)`: the folder with the law's sources and its controller.o."""
+    """Return `controller_object(law)`: the folder with the compensator's sources and its controller.o."""
 
     @functools.cache
     def made(law):
@@ -41,19 +41,18 @@ def controller_object(tmp_path_factory):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_every_law_compiles_without_a_warning(law, controller_object):
+def test_c99_compensators_compile_without_warnings(law, controller_object):
     compiled(controller_object(law), "test_vectors.c", "test.o", "-c", "-O0")
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, controller_object):
+def test_c99_controller_has_no_static_data_and_calls_only_math(law, controller_object):
     if shutil.which("nm") is None:
         pytest.skip("no nm on this machine")
     folder = controller_object(law)
     listed = subprocess.run(["nm", "-P", "controller.o"], cwd=folder, capture_output=True, text=True).stdout
     symbols = [line.split()[:2] for line in listed.splitlines()]
-    # memset, memcpy and memmove are what compilers make of loops and assignments, also for a free-standing
-    # program.
+    # Compilers turn loops and assignments into memset, memcpy and memmove, also in a free-standing program.
     wanted = {name for name, kind in symbols if kind == "U"}
     assert wanted <= {
         "ceil",
@@ -75,7 +74,7 @@ def test_controller_keeps_no_memory_of_its_own_and_calls_nothing_but_math(law, c
 
 
 def compilers(*names: str):
-    """The test once for each of these compilers; skipped where there is none of the name."""
+    """Parametrise a test over these compilers; skip those that are not installed."""
     cases = [
         pytest.param(name, marks=pytest.mark.skipif(shutil.which(name) is None, reason=f"no {name} here"))
         for name in names
@@ -95,8 +94,8 @@ int main(void) {
 
 @compilers("g++", "clang++")
 @pytest.mark.parametrize("standard", ["c++11", "c++17"])
-def test_headers_can_be_used_from_cpp(compiler, standard, tmp_path):
-    """As ROS 2 builds: the controller in C, what calls it in C++17."""
+def test_c99_headers_compile_in_cpp(compiler, standard, tmp_path):
+    """Build as ROS 2 does: the controller in C, its caller in C++."""
     folder = c99_cases.write_sources(tmp_path, gain_document())
     (folder / "use.cpp").write_text(USE)
     controller = compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2")
@@ -109,7 +108,7 @@ def test_headers_can_be_used_from_cpp(compiler, standard, tmp_path):
 
 @compilers("gcc", "clang")
 @pytest.mark.parametrize("standard", ["c99", "gnu99", "c11", "gnu17"])
-def test_sources_compile_without_a_warning(compiler, standard, tmp_path):
+def test_c99_sources_compile_without_warnings(compiler, standard, tmp_path):
     folder = c99_cases.write_sources(tmp_path, gain_document())
     for source in ("jaxhil_controller.c", "test_vectors.c"):
         command = [compiler, f"-std={standard}", "-O2", "-Wall", "-Wextra", "-pedantic", "-c", source]
@@ -130,12 +129,12 @@ def test_sources_compile_without_a_warning(compiler, standard, tmp_path):
     ],
     ids=lambda flags: flags[0],
 )
-def test_unsafe_arithmetic_is_refused_by_the_header(compiler, flags, tmp_path):
+def test_c99_header_rejects_unsafe_math_flags(compiler, flags, tmp_path):
     folder = c99_cases.write_sources(tmp_path, gain_document())
-    told = subprocess.run(
+    macros = subprocess.run(
         [compiler, *flags, "-dM", "-E", "-"], input="", capture_output=True, text=True
     ).stdout
-    if not re.search(r"FAST_MATH__|FINITE_MATH_ONLY__ 1|_M_FP_FAST|ASSOCIATIVE|RECIPROCAL", told):
+    if not re.search(r"FAST_MATH__|FINITE_MATH_ONLY__ 1|_M_FP_FAST|ASSOCIATIVE|RECIPROCAL", macros):
         pytest.skip("this compiler does not tell the code")
     command = [compiler, "-std=c99", *flags, "-fsyntax-only", "test_vectors.c"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
@@ -143,8 +142,8 @@ def test_unsafe_arithmetic_is_refused_by_the_header(compiler, flags, tmp_path):
 
 
 @compilers("gcc", "clang")
-def test_multiplication_and_addition_are_never_fused(compiler, tmp_path):
-    """Neither where the rig's own flags allow it, for a processor that can."""
+def test_c99_multiplication_and_addition_are_never_fused(compiler, tmp_path):
+    """Allow fused multiply-add by the flags; the sources must prevent it."""
     if platform.machine() != "x86_64":
         pytest.skip("the names of the instructions are those of x86")
     folder = c99_cases.write_sources(tmp_path, gain_document())
@@ -156,11 +155,11 @@ def test_multiplication_and_addition_are_never_fused(compiler, tmp_path):
         [compiler, *fusing, "jaxhil_controller.c"], cwd=folder, capture_output=True, text=True
     )
     assert (ran.returncode, ran.stderr) == (0, "")
-    # The vectoriser of GCC 12 makes a vfmaddsub of 2 a + b and 2 a - b, whatever it is told: 2 a is exact.
+    # GCC 12 vectorises 2 a + b and 2 a - b to vfmaddsub despite the flags; that is harmless: 2 a is exact.
     assert "mulsd" in ran.stdout and not re.search(r"vfn?m(add|sub)\d", ran.stdout)
 
 
-def test_only_what_the_law_needs_is_exported():
+def test_c99_sources_contain_only_code_the_compensator_needs():
     texts = c99_texts(gain_document("phase_lead"))
     assert "jaxhil_lead_filter_step" in texts["jaxhil_controller.c"]
     assert "identification" not in texts["jaxhil_controller.c"]
@@ -171,7 +170,7 @@ def test_only_what_the_law_needs_is_exported():
 
 
 class ToyLaw(Compensator):
-    """F_c = F + share (F - F of the tick before); é in a comment."""
+    """Compensator F_c = F + share (F - F of the tick before); é in a comment."""
 
     gains: ClassVar = {"toy_share": GainSpecification("1")}
 
@@ -190,20 +189,20 @@ class ToyLaw(Compensator):
 
 
 class ToyLawWithText(ToyLaw):
-    """A law outside the subset."""
+    """Compensator outside the subset."""
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured):
         return force_measured + sum([position_desired, velocity_desired])
 
 
 def toy_document(monkeypatch, law):
-    """A document of a user-registered law `toy`."""
+    """Return a gain document of the user-registered compensator `toy`."""
     monkeypatch.setitem(COMPENSATORS, "toy", law)
     gains = {"toy_share": {"value": 0.5, "unit": "1", "lower": 0.0, "upper": 1.0}}
     return sign(gain_document("none") | {"compensator": "toy", "gains": gains})
 
 
-def test_user_registered_law_is_exported_to_c_and_gives_the_same_bits(monkeypatch, tmp_path):
+def test_c99_user_registered_compensator_equals_python_to_the_bit(monkeypatch, tmp_path):
     document = toy_document(monkeypatch, ToyLaw)
     folder = c99_cases.write_sources(tmp_path, document)
     made = c99_cases.Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), "toy")
@@ -216,14 +215,14 @@ def test_user_registered_law_is_exported_to_c_and_gives_the_same_bits(monkeypatc
             c99_cases.assert_same(made.run(rows, guarded), python(gain_file, rows), rows)
 
 
-def test_user_registered_law_outside_the_subset_is_refused_with_file_and_line(monkeypatch):
+def test_c99_user_registered_compensator_outside_subset_is_rejected(monkeypatch):
     line = inspect.getsourcelines(ToyLawWithText)[1] + 4
     expected = rf"^c99: toy: \S*test_c99_sources\.py:{line}: found sum\(\.\.\.\), expected [^\n]*$"
     with pytest.raises(InputError, match=expected):
         c99_texts(toy_document(monkeypatch, ToyLawWithText))
 
 
-def test_document_that_the_runtime_refuses_is_refused():
+def test_c99_export_rejects_document_that_runtime_rejects():
     document = gain_document()
     document["gains"]["forgetting"]["value"] = 0.99
     with pytest.raises(GainFileError, match="sha256"):

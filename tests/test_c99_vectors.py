@@ -1,4 +1,4 @@
-"""The C program of a bundle replays recorded vectors, and finds one bit that is wrong."""
+"""Replay of recorded vectors by the C program of a bundle, which must detect a single wrong bit."""
 
 import math
 import subprocess
@@ -25,7 +25,7 @@ VECTORS_LIMITS = {"held_readings": 4.0, "late_fraction": 0.25, "force_slew": 1e5
 
 
 def vectors_document():
-    """A gain document whose limits bind now and then, without a trip at once."""
+    """Return a gain document whose limits are active now and then, without an immediate trip."""
     document = gain_document()
     document["limits"] = {
         name: {"value": value, "unit": LIMITS[name].unit} for name, value in VECTORS_LIMITS.items()
@@ -34,7 +34,7 @@ def vectors_document():
 
 
 def vectors(*kinds: str) -> list[str]:
-    """A vectors.csv of the Python controller's own ticks, one run per kind of rows, as lines."""
+    """Return the lines of a vectors.csv from the Python controller, one run per kind of rows."""
     gain_file = check_gain_document(vectors_document())
     lines = [
         "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
@@ -57,7 +57,7 @@ def vectors(*kinds: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def replay(tmp_path_factory):
-    """`replay(lines)`: exit code and output of the exported test program."""
+    """Return `replay(lines)`: exit code and output of the exported test program."""
     folder = c99_cases.write_sources(tmp_path_factory.mktemp("vectors"), vectors_document())
     program = compiled(folder, "test_vectors.c", "test_vectors", "-O2", "jaxhil_controller.c")
 
@@ -69,14 +69,14 @@ def replay(tmp_path_factory):
     return run
 
 
-def test_recorded_vectors_are_replayed(replay):
-    """Of contacts, and of what is not finite, late, or without a time."""
+def test_c99_test_program_replays_recorded_vectors(replay):
+    """Replay contacts and readings that are not finite, late, or without a time."""
     lines = vectors("contact", "contact", "random", "hostile", "hostile")
     assert len({line.split(",")[12] for line in lines[1:]}) > 3
     assert replay(lines) == (0, "vectors.csv: 1000 ticks, the same bit for bit\n")
 
 
-def test_one_expected_fault_that_did_not_happen_is_found(replay):
+def test_c99_test_program_detects_one_missing_fault(replay):
     lines = vectors("contact")
     fields = lines[20].split(",")
     fields[12] = str(int(fields[12]) ^ 8)
@@ -86,12 +86,12 @@ def test_one_expected_fault_that_did_not_happen_is_found(replay):
 
 
 @pytest.mark.parametrize("column", ["force_command", "position_command"])
-def test_one_bit_of_an_expected_command_is_found(column, replay):
+def test_c99_test_program_detects_one_wrong_bit_of_a_command(column, replay):
     lines = vectors("contact", "contact")
-    place = lines[0].split(",").index(column)
+    index = lines[0].split(",").index(column)
     fields = lines[150].split(",")
-    value = float(fields[place])
-    fields[place] = repr(math.nextafter(value, math.inf))
+    value = float(fields[index])
+    fields[index] = repr(math.nextafter(value, math.inf))
     lines[150] = ",".join(fields)
     expected = f"found {value:.17g}, expected {math.nextafter(value, math.inf):.17g}\n"
     assert replay(lines) == (1, f"vectors.csv:151: {column}: {expected}")
@@ -107,6 +107,6 @@ def test_one_bit_of_an_expected_command_is_found(column, replay):
         (lambda lines: [lines[0], *lines[2:]], "an unknown event, or a tick before a run"),
     ],
 )
-def test_vectors_that_cannot_be_read_are_named(change, message, replay):
+def test_c99_test_program_names_unreadable_vectors(change, message, replay):
     code, output = replay(change(vectors("contact")))
     assert code == 2 and message in output

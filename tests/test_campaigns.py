@@ -1,4 +1,4 @@
-"""The generator of campaigns agrees with the oracle, touch by touch."""
+"""The campaign generator agrees with the oracle, touch by touch."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.parametrize("name", ("third_order", "lagging", "hertz", "resonance", "stiffnesses", "dead_zone"))
-def test_a_lane_is_the_run_that_the_oracle_computes(name):
+def test_campaign_lane_matches_oracle_run(name):
     kind = campaigns.KINDS[name]
     sensors = {
         sensor: {key: value for key, value in kind.rig[sensor].items() if key != "noise_std"}
@@ -28,7 +28,7 @@ def test_a_lane_is_the_run_that_the_oracle_computes(name):
         kind, [0.006], [0], [0.4], np.random.default_rng(0), seconds, lead=0.02, damping=0, noise=False
     )
     assert signals["force_measured"].max() > 40.0
-    # The oracle's lag is exact, the generator's a quadrature over a force that begins with a jump.
+    # The oracle's lag is exact; the generator integrates numerically over a force that begins with a jump.
     force, position = (0.02, 1e-8) if name == "lagging" else (1e-11, 1e-16)
     for theirs, ours, error in (
         ("x_desired", "position_desired", position),

@@ -1,4 +1,4 @@
-"""The command line: exit codes, one JSON document, one line for what a user got wrong, files kept."""
+"""The command line: exit codes, JSON output, one-line error messages, files that are kept."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ CONTACT_KEYS = {
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """A tiny tuning, end to end: its folder, its exit code, and what it printed."""
+    """Run a tiny tuning end to end; return its folder, exit code, output and error output."""
     folder, out, err = tmp_path_factory.mktemp("tuned"), io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(["tune", "rig-300kg", "--compensator", "phase_lead", "-o", str(folder), *TINY])
@@ -28,12 +28,12 @@ def table(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tuned(table):
-    """The folder of a tiny tuning."""
+    """Return the folder of a tiny tuning."""
     return table[0]
 
 
 def refused(ran, *words):
-    """Exit code 2, nothing on standard output, one line on standard error with all `words`."""
+    """Check exit code 2, empty standard output, and one line on standard error with all `words`."""
     assert ran.code == 2
     assert ran.out == ""
     assert ran.err.startswith("jaxhil: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n")
@@ -41,7 +41,7 @@ def refused(ran, *words):
         assert word in ran.err
 
 
-def test_simulate_says_what_it_did_in_json(jaxhil):
+def test_simulate_command_reports_results_in_json(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--json")
     assert ran.code == 1 and ran.err == ""
     document = ran.document
@@ -55,7 +55,7 @@ def test_simulate_says_what_it_did_in_json(jaxhil):
     assert contact["approach_velocity"] == pytest.approx(0.005)
 
 
-def test_limit_decides_the_exit_code(jaxhil, tmp_path):
+def test_simulate_limit_decides_exit_code(jaxhil, tmp_path):
     assert jaxhil("simulate", "rig-300kg", "--limit", "10", "--log", tmp_path / "run.csv").code == 0
     assert (tmp_path / "run.csv").read_text().startswith("time,force_measured,force_command,")
     ran = jaxhil("simulate", "rig-300kg", "--limit", "0.1")
@@ -63,7 +63,7 @@ def test_limit_decides_the_exit_code(jaxhil, tmp_path):
     assert "divergence" in ran.out and "0.1" in ran.out
 
 
-def test_set_reaches_the_mechanism(jaxhil):
+def test_simulate_set_option_changes_mechanism(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--json", "--set", "approach.velocity=0.01", "--set", "name=other")
     document = ran.document
     assert document["mechanism"] == "other"
@@ -71,8 +71,8 @@ def test_set_reaches_the_mechanism(jaxhil):
     assert document["contacts"][0]["position_shortfall"] == 0
 
 
-def test_a_run_that_fails_is_reported(jaxhil):
-    # Only 1 N is ever measured: the bodies are not stopped within any time.
+def test_simulate_reports_failed_run(jaxhil):
+    # The sensor measures at most 1 N: the bodies are never stopped.
     weak = ["--set", "rig.force_sensor.range=1e-6"]
     ran = jaxhil("simulate", "rig-300kg", "--json", *weak)
     assert ran.code == 1
@@ -83,18 +83,18 @@ def test_a_run_that_fails_is_reported(jaxhil):
     assert "timeout" in jaxhil("simulate", "rig-300kg", *weak).out
 
 
-def test_default_mechanism_and_mechanism_files_are_the_same_thing(jaxhil):
-    one = jaxhil("simulate", builtin_path("rig-300kg"), "--json").document
-    assert one == jaxhil("simulate", "rig-300kg", "--json").document
+def test_simulate_gives_equal_results_for_name_and_file(jaxhil):
+    document = jaxhil("simulate", builtin_path("rig-300kg"), "--json").document
+    assert document == jaxhil("simulate", "rig-300kg", "--json").document
 
 
-def test_tune_writes_gains_and_plots(jaxhil, tuned):
+def test_tune_command_writes_gains_and_plots(jaxhil, tuned):
     assert {path.name for path in tuned.iterdir()} == {"gains.json", "errors.png", "loss.png", "contact.png"}
     document = json.loads((tuned / "gains.json").read_text())
     assert document["compensator"] == "phase_lead"
     figures = document["figures"]
-    judged = {"nominal", "robust", "tuned_intervals"}
-    assert figures.keys() == judged | {"without_noise", "command", "warnings"}
+    evaluated = {"nominal", "robust", "tuned_intervals"}
+    assert figures.keys() == evaluated | {"without_noise", "command", "warnings"}
     assert figures["without_noise"] is None and figures["command"]["noise_amplification"] > 1
     for name in ("nominal", "robust"):
         assert figures[name].keys() == {"before", "literature", "tuned"}
@@ -108,7 +108,7 @@ def test_tune_writes_gains_and_plots(jaxhil, tuned):
     )
 
 
-def test_tune_reports_tables_or_json(jaxhil, table, tmp_path):
+def test_tune_command_reports_tables_or_json(jaxhil, table, tmp_path):
     tuned, code, out, err = table
     assert code == 1 and out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
@@ -127,27 +127,27 @@ def test_tune_reports_tables_or_json(jaxhil, table, tmp_path):
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
-def test_tune_says_in_json_that_there_is_sensor_noise(jaxhil, tmp_path):
+def test_tune_json_states_sensor_noise(jaxhil, tmp_path):
     ran = jaxhil("tune", "suite-noisy", "--compensator", "none", "-o", tmp_path, "--json", *TINY)
     (entry,) = ran.document["mechanisms"]
     assert entry["sensor_noise"] is True
 
 
-def test_bad_files_do_not_stop_the_others(jaxhil, tmp_path):
+def test_tune_continues_after_unusable_files(jaxhil, tmp_path):
     files = ["nowhere.toml", "rig-300kg", builtin_path("rig-300kg")]
     arguments = ["--compensator", "none", "-o", tmp_path, "--json", "--limit", "inf", *TINY]
     ran = jaxhil("tune", *files, *arguments)
     assert ran.code == 2
     missing, twice = ran.document["problems"]
     assert "nowhere.toml" in missing and "name" in twice
-    # When they are met, and again at the end.
+    # Problems are reported when they occur, and again at the end.
     assert ran.err.count(missing) == ran.err.count(twice) == 2
     assert ran.err.endswith(f"jaxhil: 2 could not be done:\njaxhil: {missing}\njaxhil: {twice}\n")
     assert [entry["mechanism"] for entry in ran.document["mechanisms"]] == ["rig-300kg"]
     assert (tmp_path / "rig-300kg" / "gains.json").exists()
 
 
-def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatch):
+def test_tune_keeps_finished_mechanisms_after_interrupt(jaxhil, tuned, tmp_path, monkeypatch):
     from tuning.gains.tune_all import tune_all
 
     def stopped_after_the_first(*arguments, **named):
@@ -163,7 +163,7 @@ def test_interrupted_keeps_what_was_finished(jaxhil, tuned, tmp_path, monkeypatc
     assert (tmp_path / "rig-300kg" / "gains.json").exists()
 
 
-def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
+def test_tune_accepts_folder_of_mechanism_files(jaxhil, tmp_path):
     (tmp_path / "files").mkdir()
     text = builtin_path("rig-300kg").read_text()
     for number in range(5):
@@ -175,16 +175,16 @@ def test_a_folder_stands_for_its_files(jaxhil, tmp_path):
     ran = jaxhil("tune", tmp_path / "files", *arguments)
     assert ran.code == 0
     assert all(f"like-{number}" in ran.out for number in range(5))
-    # Many mechanisms share one picture.
+    # Many mechanisms share one plot.
     made = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
     written = sorted(str(path) for path in made if not str(path).startswith("."))
     assert written == [*(f"like-{number}/gains.json" for number in range(5)), "overview.png"]
     gains = [json.loads(path.read_text())["gains"] for path in (tmp_path / "out").rglob("gains.json")]
-    assert all(one == gains[0] for one in gains)
+    assert all(values == gains[0] for values in gains)
 
 
 @pytest.mark.slow
-def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path):
+def test_tune_start_from_earlier_gains_never_ends_worse(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     cold = jaxhil(*arguments, "--json").document["mechanisms"][0]
     assert cold["carried_over"] == []
@@ -199,12 +199,12 @@ def test_a_start_at_gains_tuned_before_never_ends_worse(jaxhil, tuned, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_front_is_a_gain_file_for_each_point(jaxhil, tmp_path):
+def test_tune_pareto_writes_gain_file_for_each_point(jaxhil, tmp_path):
     folder = tmp_path / "rig-300kg"
-    # Of a longer front that was here before.
+    # A point of an earlier, longer front.
     (folder / "pareto" / "07").mkdir(parents=True)
     write_gain_file(folder / "pareto" / "07" / "gains.json", case())
-    # Of somebody else.
+    # A file that this program did not write.
     (folder / "pareto" / "08").mkdir(parents=True)
     (folder / "pareto" / "08" / "gains.json").write_text("{}")
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
@@ -227,7 +227,7 @@ def test_a_front_is_a_gain_file_for_each_point(jaxhil, tmp_path):
         assert word in table.out
 
 
-def test_a_front_that_there_is_not_is_refused(jaxhil, tmp_path):
+def test_tune_rejects_impossible_pareto_option(jaxhil, tmp_path):
     arguments = ["tune", "rig-300kg", "-o", tmp_path / "out"]
     refused(jaxhil(*arguments, "--pareto", "8", "--compensator", "none"), "--pareto", "none", "no trade-off")
     refused(jaxhil(*arguments, "--pareto", "1"), "--pareto", "0 or an integer >= 2")
@@ -235,7 +235,7 @@ def test_a_front_that_there_is_not_is_refused(jaxhil, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_gains_to_start_at_that_cannot_be_used_are_refused(jaxhil, tuned, tmp_path):
+def test_tune_rejects_unusable_start_gains(jaxhil, tuned, tmp_path):
     (tmp_path / "broken.json").write_text("{")
     start = ["tune", "rig-300kg", "-o", tmp_path / "out", "--start"]
     refused(jaxhil(*start, tuned), "--start", str(tuned)[:20], "phase_lead", "response_error")
@@ -245,20 +245,20 @@ def test_gains_to_start_at_that_cannot_be_used_are_refused(jaxhil, tuned, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_objective_or_a_bad_weight_is_refused(jaxhil, tmp_path):
+def test_tune_rejects_unknown_objective_and_bad_weight(jaxhil, tmp_path):
     weights = ["--divergence-weight", "0"], ["--noise-weight", "-1"], ["--chatter-weight", "nan"]
     for wrong in (["--objective", "mean"], *weights):
         ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)
         assert ran.code == 2 and ran.err.count("\n") == 1 and "allowed" in ran.err
 
 
-def test_a_folder_without_mechanisms_is_refused(jaxhil, tmp_path):
+def test_tune_rejects_folder_without_mechanism_files(jaxhil, tmp_path):
     ran = jaxhil("tune", tmp_path, "-o", tmp_path / "out")
     assert ran.code == 2 and ran.err.count("\n") == 1
     assert "found no mechanism file" in ran.err
 
 
-def test_verify_accepts_what_tune_wrote(jaxhil, tuned):
+def test_verify_command_accepts_tuned_gains(jaxhil, tuned):
     ran = jaxhil("verify", tuned, "--json", "--scenarios", "2")
     assert ran.code == 0
     assert ran.document["verdict"] is True
@@ -266,7 +266,7 @@ def test_verify_accepts_what_tune_wrote(jaxhil, tuned):
     assert "Good" in jaxhil("verify", tuned / "gains.json", "--scenarios", "2").out
 
 
-def test_verify_finds_tampering(jaxhil, tuned, tmp_path):
+def test_verify_command_detects_modified_gain_file(jaxhil, tuned, tmp_path):
     document = json.loads((tuned / "gains.json").read_text())
     document["gains"]["phase_lead"]["value"] *= 1.001
     path = tmp_path / "gains.json"
@@ -279,7 +279,7 @@ def test_verify_finds_tampering(jaxhil, tuned, tmp_path):
     assert jaxhil("verify", path).code == 1
 
 
-def test_simulate_with_a_gain_file(jaxhil, tuned):
+def test_simulate_command_uses_gain_file(jaxhil, tuned):
     path = tuned / "gains.json"
     ran = jaxhil("simulate", "--gains", path, "--json")
     document = ran.document
@@ -292,7 +292,7 @@ def test_simulate_with_a_gain_file(jaxhil, tuned):
     assert other["mechanism"] == "rod-100n-mm"
 
 
-def test_gains_that_do_not_fit_are_refused(jaxhil, tuned):
+def test_simulate_rejects_gain_file_that_does_not_fit(jaxhil, tuned):
     path = tuned / "gains.json"
     refused(jaxhil("simulate", "--gains", path, "--compensator", "none"), "--compensator", "phase_lead")
     slower = ["--set", "rig.control_period=0.002"]

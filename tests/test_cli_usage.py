@@ -1,4 +1,4 @@
-"""The command line before and around its work: usage, refusals, help, interrupts, names of folders."""
+"""Usage of the command line: error messages, help, interrupts, names of folders."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ from tuning.gains.tune import ErrorFigures
 
 
 def refused(ran, *words):
-    """Exit code 2, nothing on standard output, one line on standard error with all `words`."""
+    """Check exit code 2, empty standard output, and one line on standard error with all `words`."""
     assert ran.code == 2
     assert ran.out == ""
     assert ran.err.startswith("jaxhil: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n")
@@ -31,7 +31,7 @@ def refused(ran, *words):
         assert word in ran.err
 
 
-def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
+def test_cli_exits_with_130_on_interrupt(jaxhil, monkeypatch):
     def interrupted(arguments):
         raise KeyboardInterrupt
 
@@ -65,22 +65,22 @@ def test_interrupt_anywhere_is_130(jaxhil, monkeypatch):
         (["init", "a.toml", "-o", "b.toml"], ["--output", "'b.toml' beside a file", "one of them"]),
     ],
 )
-def test_unusable_input_is_reported_in_one_line(jaxhil, arguments, words):
+def test_cli_reports_unusable_input_in_one_line(jaxhil, arguments, words):
     refused(jaxhil(*arguments), *words)
 
 
-def test_a_plot_that_cannot_be_written_is_reported(jaxhil, tmp_path):
+def test_simulate_reports_plot_that_cannot_be_written(jaxhil, tmp_path):
     (tmp_path / "taken").touch()
     ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "taken" / "plot.png")
     refused(ran, "taken")
 
 
-def test_an_output_folder_that_cannot_be_made_is_reported(jaxhil, tmp_path):
+def test_tune_reports_output_folder_that_cannot_be_created(jaxhil, tmp_path):
     (tmp_path / "taken").touch()
     refused(jaxhil("tune", "rig-300kg", "-o", tmp_path / "taken"), "taken")
 
 
-def test_what_goes_wrong_inside_is_one_line(jaxhil, monkeypatch):
+def test_cli_reports_internal_error_in_one_line(jaxhil, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("inside")
 
@@ -89,20 +89,20 @@ def test_what_goes_wrong_inside_is_one_line(jaxhil, monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [["--no-such"], ["fly"], [], ["tune", "--starts", "x"], ["verify"]])
-def test_wrong_usage_is_2(jaxhil, arguments):
+def test_cli_exits_with_2_on_wrong_usage(jaxhil, arguments):
     ran = jaxhil(*arguments)
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
 
 @pytest.mark.parametrize("command", ["init", "simulate", "tune", "export", "verify", "rig", "mechanisms"])
-def test_help_has_an_example(jaxhil, command):
+def test_cli_help_shows_an_example(jaxhil, command):
     ran = jaxhil(command, "--help")
     assert ran.code == 0
     assert f"Example: jaxhil {command}" in " ".join(ran.out.split())
     assert "--json" in ran.out
 
 
-def test_help_and_refusals_do_not_import_jax():
+def test_cli_help_and_usage_errors_do_not_import_jax():
     program = (
         "import sys\nfrom tuning.__main__ import main\n"
         "for words in (['tune', '--help'], ['mechanisms'], ['tune', '--compensator', 'x'], ['tune', 'x'],\n"
@@ -115,7 +115,7 @@ def test_help_and_refusals_do_not_import_jax():
     assert done.returncode == 0, done.stderr
 
 
-def test_module_runs_like_the_command_and_a_closed_pipe_is_quiet():
+def test_module_runs_as_command_and_ignores_closed_pipe():
     command = [sys.executable, "-m", "tuning", "mechanisms"]
     read, write = os.pipe()
     os.close(read)
@@ -124,7 +124,7 @@ def test_module_runs_like_the_command_and_a_closed_pipe_is_quiet():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_mechanisms_lists_the_built_in_files(jaxhil):
+def test_mechanisms_command_lists_builtin_files(jaxhil):
     document = jaxhil("mechanisms", "--json").document
     entries = document["mechanisms"]
     assert [entry["name"] for entry in entries] == builtin_names()
@@ -146,7 +146,7 @@ def test_mechanisms_lists_the_built_in_files(jaxhil):
         (["suite-hertz", "-o", "study/my rig.toml"], "study/my rig.toml", "suite-hertz"),
     ],
 )
-def test_init_writes_a_mechanism_file(jaxhil, monkeypatch, tmp_path, arguments, written, source):
+def test_init_command_writes_mechanism_file(jaxhil, monkeypatch, tmp_path, arguments, written, source):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil("init", *arguments, "--json")
     assert ran.code == 0
@@ -157,7 +157,7 @@ def test_init_writes_a_mechanism_file(jaxhil, monkeypatch, tmp_path, arguments, 
 
 
 @pytest.mark.parametrize("taken", [Path.touch, Path.mkdir, lambda path: path.symlink_to("nowhere")])
-def test_init_overwrites_nothing(jaxhil, tmp_path, taken):
+def test_init_command_overwrites_nothing(jaxhil, tmp_path, taken):
     path = tmp_path / "rig.toml"
     taken(path)
     before = os.lstat(path)
@@ -165,32 +165,32 @@ def test_init_overwrites_nothing(jaxhil, tmp_path, taken):
     assert os.lstat(path) == before and list(tmp_path.iterdir()) == [path]
 
 
-def test_init_lists_names(jaxhil):
+def test_init_command_lists_names(jaxhil):
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     assert (
         jaxhil("init", "--list").out.split() == jaxhil("init", "--list", "--json").document["names"] == names
     )
 
 
-def test_version_and_completion(jaxhil):
+def test_cli_prints_version_and_shell_completion(jaxhil):
     assert jaxhil("--version") == Ran(0, f"jaxhil {metadata.version('jaxhil')}\n", "")
     assert "--tyro-write-completion bash" in " ".join(jaxhil("--help").out.split())
     assert "jaxhil" in jaxhil("--tyro-print-completion", "bash").out
 
 
-def test_plot_without_a_name_gets_one():
+def test_plot_option_without_value_gets_default_name():
     assert complete_bare(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
     assert complete_bare(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
     assert complete_bare(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
 
 
-def test_studies_without_a_number_get_one():
+def test_study_options_without_value_get_default_number():
     assert complete_bare(["--drivers", "64", "--rare", "0.02"]) == ["--drivers", "64", "--rare", "0.02"]
     assert complete_bare(["--rare", "gains.json"]) == ["--rare", "0", "gains.json"]
     assert complete_bare(["--drivers", "--rare"]) == ["--drivers", str(DEFAULT_DRIVERS), "--rare", "0"]
 
 
-def test_names_become_folders():
+def test_folder_name_keeps_unicode_and_replaces_unsafe_names():
     assert folder_name("rig-300kg") == "rig-300kg"
     assert folder_name("../a b/c") == "a_b_c"
     assert folder_name("..") == "mechanism"
@@ -203,13 +203,13 @@ def test_names_become_folders():
 
 
 @hypothesis.given(hypothesis.strategies.text(min_size=1, max_size=100).filter(str.isprintable))
-def test_folders_of_mechanisms_lie_where_they_should(name):
+def test_folder_name_is_a_single_safe_path_component(name):
     folder = folder_name(name)
     assert folder not in ("", ".", "..") and "/" not in folder and folder.isprintable()
     assert len(folder.encode()) <= 120 and not folder.startswith(".")
 
 
-def test_better_means_fewer_failures_then_smaller_errors():
+def test_is_better_compares_failures_before_errors():
     def made(rms, failed):
         return ErrorFigures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
@@ -217,19 +217,19 @@ def test_better_means_fewer_failures_then_smaller_errors():
     assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))
 
 
-def test_flags_leave_the_user_s_alone(monkeypatch):
+def test_xla_flags_of_user_take_precedence(monkeypatch):
     names = [flag.split("=")[0] for flag in environment.flags("").split()]
     assert names == [
         "--xla_force_host_platform_device_count",
         "--xla_backend_optimization_level",
         "--xla_backend_extra_options",
     ]
-    given = "--xla_backend_optimization_level=3 --xla_dump_to=x"
-    assert environment.flags(given).startswith(given)
-    assert environment.flags(given).count("optimization_level") == 1
+    user_flags = "--xla_backend_optimization_level=3 --xla_dump_to=x"
+    assert environment.flags(user_flags).startswith(user_flags)
+    assert environment.flags(user_flags).count("optimization_level") == 1
 
 
-def test_cache_folder_is_made_or_done_without(monkeypatch, tmp_path):
+def test_cache_folder_is_created_or_none_if_impossible(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "below"))
     assert environment.cache_folder() is None

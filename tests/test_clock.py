@@ -1,4 +1,4 @@
-"""The guard of the ticks' times: early, late and missed ticks, and a clock that parts from the ticks."""
+"""Clock check of the runtime: early, late and missed ticks, and drift of the clock."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ BRIDGED = {"missed_in_a_row": 3.0}
 
 
 def faults(times, period: float = 1e-3, events=None, **limits: float) -> list[int]:
-    """The faults of ticks at these times [s], the same in C; after a trip, none."""
+    """Return the faults of ticks at these times [s], the same in C; after a trip, none."""
     gain_file = GainFile("none", {}, period, math.inf, complete(limits) if limits else NO_LIMITS)
     rows = np.zeros((len(times), len(ROW)))
     rows[:, ROW.index("time")] = times
@@ -31,12 +31,13 @@ def faults(times, period: float = 1e-3, events=None, **limits: float) -> list[in
         made = c99_cases.loaded("none")
         assert made.begin(packed("none", gain_file))
         assert_same(made.run(rows, True), results, rows)
-    found = results[:, RESULT.index("faults")].astype(int).tolist()
+    fault_bits = results[:, RESULT.index("faults")].astype(int).tolist()
     tripped = results[:, RESULT.index("tripped")].tolist()
     assert all(
-        not stopped or fault in (0, CLOCK, MISSED_TICK) for fault, stopped in zip(found, tripped, strict=True)
+        not stopped or fault in (0, CLOCK, MISSED_TICK)
+        for fault, stopped in zip(fault_bits, tripped, strict=True)
     )
-    return found
+    return fault_bits
 
 
 def periods(*gaps: float, period: float = 1e-3, start: float = 7.0) -> list[float]:
@@ -60,27 +61,27 @@ def periods(*gaps: float, period: float = 1e-3, start: float = 7.0) -> list[floa
         (-1.0, [OK, CLOCK]),
     ],
 )
-def test_ticks_at_a_wrong_rate_are_raised_at_the_default_limits(gap, expected, period):
+def test_clock_raises_faults_for_wrong_tick_rate_at_default_limits(gap, expected, period):
     assert faults(periods(*[gap] * (len(expected) - 1), period=period), period) == expected
 
 
 @pytest.mark.parametrize("time", [math.nan, math.inf, -math.inf])
-def test_time_that_is_not_finite_trips(time):
+def test_clock_trips_on_non_finite_time(time):
     assert faults([0.0, 1e-3, time]) == [OK, OK, CLOCK]
     assert faults([time]) == [CLOCK]
 
 
 @pytest.mark.parametrize("rate", [0.98, 0.984, 1.016, 1.02, 1.1])
-def test_clock_that_runs_wrong_by_more_than_15_in_a_thousand_trips(rate):
-    """The drift is r (1 - 0.99^n)/0.01 periods after n ticks: it exceeds 1.5 in the end if r > 0.015."""
+def test_clock_trips_on_rate_error_above_1_5_percent(rate):
+    """The drift after n ticks is r (1 - 0.99^n)/0.01 periods; it finally exceeds 1.5 if r > 0.015."""
     wrong = abs(rate - 1.0)
     ticks = math.ceil(math.log(1.0 - 0.015 / wrong) / math.log(0.99))
-    found = faults(periods(*[rate] * 300))
-    assert found.index(CLOCK) == ticks and not any(found[:ticks])
+    result = faults(periods(*[rate] * 300))
+    assert result.index(CLOCK) == ticks and not any(result[:ticks])
 
 
 @pytest.mark.parametrize("rate", [0.986, 0.9999, 1.0001, 1.014])
-def test_clock_that_runs_wrong_by_less_than_15_in_a_thousand_is_no_fault(rate):
+def test_clock_accepts_rate_error_below_1_5_percent(rate):
     assert not any(faults(periods(*[rate] * 5000)))
 
 
@@ -89,55 +90,55 @@ def test_clock_that_runs_wrong_by_less_than_15_in_a_thousand_is_no_fault(rate):
     period=st.sampled_from([1e-4, 1e-3, 0.1]),
     start=st.floats(0.0, 1e5),
 )
-def test_jitter_of_an_eighth_of_the_period_is_no_fault(jitter, period, start):
+def test_clock_accepts_jitter_below_an_eighth_of_the_period(jitter, period, start):
     assert not any(faults([start + period * (n + late) for n, late in enumerate(jitter)], period))
 
 
-def test_ordinary_jitter_never_trips():
-    """Jitter of 5 % of the period, normally distributed: one tick in some thousand is flagged, none trips."""
+def test_clock_never_trips_on_ordinary_jitter():
+    """Draw normal jitter of 5 % of the period: about one tick in a thousand is flagged, none trips."""
     late = 0.05 * np.random.default_rng(3).standard_normal(100_000)
-    found = np.array(faults((1e-3 * (np.arange(100_000) + late)).tolist()))
-    assert set(found) <= {OK, EARLY_TICK, LATE_TICK}
-    assert 0 < np.count_nonzero(found) < 100
+    result = np.array(faults((1e-3 * (np.arange(100_000) + late)).tolist()))
+    assert set(result) <= {OK, EARLY_TICK, LATE_TICK}
+    assert 0 < np.count_nonzero(result) < 100
 
 
-def test_late_tick_may_be_made_up_for():
+def test_clock_accepts_early_tick_that_compensates_late_tick():
     assert faults(periods(1.0, 1.4, 0.6, 1.0)) == [OK, OK, LATE_TICK, EARLY_TICK, OK]
 
 
-def test_one_repeated_tick_is_flagged_and_two_within_69_ticks_trip():
+def test_clock_flags_one_repeated_tick_and_trips_on_two_within_69_ticks():
     """The drift of one repeated tick is 0.99^n periods after n ticks: half a period after 69."""
     assert faults(periods(1.0, 0.001, *[1.0] * 20)) == [OK, OK, EARLY_TICK, *[OK] * 20]
     assert faults(periods(0.001, *[1.0] * 67, 0.001))[-1] == CLOCK
     assert faults(periods(0.001, *[1.0] * 69, 0.001))[-1] == EARLY_TICK
 
 
-def test_stall_whose_ticks_come_in_a_burst_is_no_drift():
-    """Three ticks that are late by 2.9, 1.9 and 0.9 periods have been counted as missed before they come."""
+def test_clock_counts_no_drift_after_stall_followed_by_burst():
+    """Three ticks late by 2.9, 1.9 and 0.9 periods count as missed before they arrive."""
     stall = (1.0, 3.9, 0.02, 0.02, 0.06, 1.0)
     expected = [OK, MISSED_TICK, *[EARLY_TICK] * 3, OK]
     assert faults(periods(*stall * 5), **BRIDGED) == [OK, *expected * 5]
-    # One more than were missed is a repeated tick, and a second one trips.
+    # One tick more than were missed is a repeated tick; a second one trips.
     assert faults(periods(3.9, *[0.02] * 5), **BRIDGED)[-2:] == [EARLY_TICK, CLOCK]
 
 
-def test_missed_ticks_trip_in_a_row():
+def test_clock_trips_on_consecutive_missed_ticks():
     assert faults(periods(4.0, 1.0, 4.0), **BRIDGED) == [OK, MISSED_TICK, OK, MISSED_TICK]
-    # Of a loop at half the rate every second tick is missing.
+    # A loop at half the rate misses every second tick.
     half = faults(periods(*[2.0] * 6), **BRIDGED)
     assert half == [OK, *[MISSED_TICK] * 4, OK, OK]
     assert faults(periods(5.0, 1.0), **BRIDGED) == [OK, MISSED_TICK, OK]
 
 
-def test_next_contact_forgets_the_clock_of_the_run_before():
+def test_next_contact_resets_clock():
     times = [*periods(0.5, 0.5), *periods(0.5, 0.5, start=-3.0)]
     events = [0.0] * 3 + [NEXT_CONTACT] + [0.0] * 2
     assert faults(times, events=events) == [OK, EARLY_TICK, EARLY_TICK] * 2
 
 
-def test_late_fraction_says_what_is_flagged():
+def test_late_fraction_sets_threshold_of_late_and_early_ticks():
     gaps = periods(1.1, 0.9, 1.3, 0.7)
     assert faults(gaps, late_fraction=0.05) == [OK, LATE_TICK, EARLY_TICK, LATE_TICK, EARLY_TICK]
     assert faults(gaps, late_fraction=0.25) == [OK, OK, OK, LATE_TICK, EARLY_TICK]
-    # From 0.5 on a late tick is one that is missing.
+    # From 0.5 on, a late tick counts as missed.
     assert faults(periods(1.49, 0.51, 1.51), late_fraction=0.5) == [OK, OK, OK, MISSED_TICK]

@@ -1,4 +1,4 @@
-"""Commands on a cluster that go wrong: one line, exit code 2 or 130, and `--resume` ends with the same."""
+"""Commands on a cluster under failures: one line, exit code 2 or 130; `--resume` gives the same result."""
 
 import json
 import os
@@ -23,7 +23,7 @@ MANY, STUDY = ("--scenarios", "20000", "--chunk", "512", "--limit", "1.5"), ("--
 
 
 def begin(*arguments, folder):
-    """A command as a user starts it."""
+    """Start a command as a user would."""
     command = [sys.executable, "-m", "tuning", *map(str, arguments), "--json"]
     ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
     return subprocess.Popen(
@@ -33,10 +33,10 @@ def begin(*arguments, folder):
 
 
 def ended(process):
-    """Exit code, standard output, and what standard error says but for progress."""
+    """Return exit code, standard output, and the lines of standard error except progress."""
     out, err = process.communicate(timeout=600)
-    said = [line for line in err.splitlines() if not line.startswith(tuple("0123456789"))]
-    return process.returncode, out, said
+    messages = [line for line in err.splitlines() if not line.startswith(tuple("0123456789"))]
+    return process.returncode, out, messages
 
 
 def wait(process, folder, pattern, number):
@@ -45,11 +45,11 @@ def wait(process, folder, pattern, number):
         time.sleep(0.02)
 
 
-def same(one, other):
-    return all(one[name] == other[name] for name in ("failure_probability", "worst", "drivers"))
+def same(first, second):
+    return all(first[name] == second[name] for name in ("failure_probability", "worst", "drivers"))
 
 
-def test_a_scheduler_that_dies_and_ctrl_c_lose_nothing_that_was_finished(tmp_path):
+def test_sweep_resumes_after_interrupt_and_lost_scheduler(tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     asked = "sweep", "gains.json", *MANY, *STUDY
     code, out, _ = ended(begin(*asked, "-o", "here", folder=tmp_path))
@@ -61,26 +61,26 @@ def test_a_scheduler_that_dies_and_ctrl_c_lose_nothing_that_was_finished(tmp_pat
         process = begin(*on, folder=tmp_path)
         wait(process, store, "parts/*.parquet", 3)
         os.kill(process.pid, signal.SIGINT)
-        code, out, said = ended(process)
-        assert (code, out, said) == (130, "", ["jaxhil: interrupted"])
-        kept = {path: path.stat().st_mtime_ns for path in store.glob("parts/*.parquet")}
+        code, out, messages = ended(process)
+        assert (code, out, messages) == (130, "", ["jaxhil: interrupted"])
+        finished = {path: path.stat().st_mtime_ns for path in store.glob("parts/*.parquet")}
         process = begin(*on, "--resume", folder=tmp_path)
         wait(process, store, ".pieces/*.piece", 2)
         cluster.kill(cluster.processes[0])
-        code, out, said = ended(process)
-        assert code == 2 and out == "" and len(said) == 1
-        assert said[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
-        assert said[0].endswith("; what is finished is kept, --resume goes on")
+        code, out, messages = ended(process)
+        assert code == 2 and out == "" and len(messages) == 1
+        assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
+        assert messages[0].endswith("; what is finished is kept, --resume goes on")
     (tmp_path / "later").mkdir()
     with started(tmp_path / "later") as cluster:
         cluster.worker()
         on = *asked, "-o", "store", "--scheduler", cluster.address, "--resume"
-        code, out, said = ended(begin(*on, folder=tmp_path))
-    assert code == 1 and said == [] and same(json.loads(out), whole)
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+        code, out, messages = ended(begin(*on, folder=tmp_path))
+    assert code == 1 and messages == [] and same(json.loads(out), whole)
+    assert {path: path.stat().st_mtime_ns for path in finished} == finished
 
 
-def test_a_bootstrap_whose_scheduler_dies_goes_on(jaxhil, tmp_path):
+def test_bootstrap_resumes_after_lost_scheduler(jaxhil, tmp_path):
     write(tmp_path, campaigns.campaign("clean", 0, speeds=(0.006, 0.012) * 4, seconds=10.0))
     asked = "identify", *logs(tmp_path), "--map", "map.toml", "--law", "kelvin_voigt", "--bootstrap", 40
     guess = jaxhil("identify", "--guess", *logs(tmp_path)).out
@@ -91,19 +91,19 @@ def test_a_bootstrap_whose_scheduler_dies_goes_on(jaxhil, tmp_path):
         process = begin(*asked, "-o", "there", "--scheduler", cluster.address, folder=tmp_path)
         wait(process, tmp_path / "there", ".pieces/*.piece", 2)
         cluster.kill(cluster.processes[0])
-        code, out, said = ended(process)
-    assert code == 2 and out == "" and len(said) == 1
-    assert said[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
-    kept = len([*tmp_path.glob("there/.pieces/*.piece")])
-    assert 2 <= kept < 8 and not (tmp_path / "there" / "mechanism.toml").exists()
+        code, out, messages = ended(process)
+    assert code == 2 and out == "" and len(messages) == 1
+    assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
+    number_finished = len([*tmp_path.glob("there/.pieces/*.piece")])
+    assert 2 <= number_finished < 8 and not (tmp_path / "there" / "mechanism.toml").exists()
     process = begin(*asked, "-o", "there", "--resume", folder=tmp_path)
-    wait(process, tmp_path / "there", ".pieces/*.piece", kept + 1)
+    wait(process, tmp_path / "there", ".pieces/*.piece", number_finished + 1)
     assert ended(process)[0] == 0 and not (tmp_path / "there" / ".pieces").exists()
     for name in ("mechanism.toml", "identification.json"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_a_worker_of_another_version_is_refused(tmp_path):
+def test_cluster_worker_with_other_sources_is_rejected(tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     for package in ("jaxhil", "tuning"):
         shutil.copytree(ROOT / package, tmp_path / "other" / package)

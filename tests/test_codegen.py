@@ -1,4 +1,4 @@
-"""The C99 generator on small programs: the same bits as Python's, or a refusal with file and line."""
+"""The C99 generator on small programs: the same bits as Python, or an error with file and line."""
 
 import ctypes
 import inspect
@@ -59,12 +59,12 @@ def remainders_of_ints(a: float, b: float) -> float:
 def early_return(a: float, b: float) -> float:
     """Return from within loops and branches."""
     total = 0.0
-    for place, weight in enumerate(WEIGHTS):
+    for index, weight in enumerate(WEIGHTS):
         if weight * a > 10.0:
             return total
         elif not a <= b:
             continue
-        total += weight * (a + place)
+        total += weight * (a + index)
     passes = 0
     while total > 1.0:
         total = 0.5 * total - b
@@ -89,7 +89,7 @@ class Pair(NamedTuple):
 
 
 class Inner:
-    """A sum of numbers and their last values."""
+    """Sum of numbers and their last values."""
 
     __slots__ = ("_last", "_sum", "calls")
 
@@ -111,7 +111,7 @@ class Inner:
 
 
 class Outer:
-    """Objects, lists of lists, a line of run-time length."""
+    """Objects, lists of lists, and a line of run-time length."""
 
     inner: Inner
     matrix: Annotated[list[list[float]], 3, 2]
@@ -139,13 +139,13 @@ class Outer:
 
 def dot(left: list[float], right: list[float]) -> float:
     total = 0.0
-    for one, other in zip(left, right, strict=True):
-        total += one * other
+    for first, second in zip(left, right, strict=True):
+        total += first * second
     return total
 
 
 def caught(function):
-    """A function that returns `FAILED` where `function` raises."""
+    """Return a function that returns `FAILED` where `function` raises."""
 
     def guarded(a: float, b: float) -> float:
         try:
@@ -173,20 +173,22 @@ OF_INTS = (whole, product_of_ints, remainders_of_ints)
 
 
 def compiled(tmp_path, program: Program, more: str = "") -> ctypes.CDLL:
-    """The program as a shared library, compiled as strictly as the controller."""
+    """Return the program as a shared library, compiled as strictly as the controller."""
     output = program.output()
     text = f"{HEADER}#define T_LAG_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
     (tmp_path / "program.c").write_text(text)
     return ctypes.CDLL(str(c99_cases.compiled(tmp_path, "program.c", "program.so", *STRICT)))
 
 
-def same(found: float, expected: float) -> bool:
-    return struct.pack("d", found) == struct.pack("d", expected) or (found != found and expected != expected)
+def same(actual: float, expected: float) -> bool:
+    return struct.pack("d", actual) == struct.pack("d", expected) or (
+        actual != actual and expected != expected
+    )
 
 
 @needs_compiler
-@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda one: one.__name__)
-def test_function_gives_the_same_bits_or_fails_where_python_raises(function, tmp_path):
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
+def test_c99_function_equals_python_to_the_bit_or_fails_where_python_raises(function, tmp_path):
     guarded = caught(function)
     program = Program("t_", public={guarded: "t_guarded"})
     program.add(guarded)
@@ -195,7 +197,7 @@ def test_function_gives_the_same_bits_or_fails_where_python_raises(function, tmp
     results = set()
     for a, b in itertools.product(NUMBERS, repeat=2):
         expected = guarded(a, b)
-        # An int of C ends at 2^63, and no power is complex.
+        # An int in C ends at 2^63, and no power is complex.
         is_beyond = function in OF_INTS and max(abs(a), abs(b)) > 2.0**63
         assert same(in_c(a, b), FAILED if is_beyond or isinstance(expected, complex) else expected), (a, b)
         results.add(str(expected))
@@ -218,8 +220,8 @@ double step(double a, double b) {{
 
 
 @needs_compiler
-def test_classes_records_and_lists_give_the_same_bits(tmp_path):
-    """State that a failed tick leaves half done, too."""
+def test_c99_classes_records_and_lists_equal_python_to_the_bit(tmp_path):
+    """Include state that a failed tick leaves half done."""
     program = Program("t_")
     program.add(Outer.__init__, Outer)
     program.add(Outer.step, Outer)
@@ -277,7 +279,7 @@ def hides_a_branch(a: float, b: float) -> float:
 
 
 class Sharing:
-    """Two attributes with one list, which changes in place."""
+    """Two attributes that share one list, which changes in place."""
 
     def __init__(self, start: float) -> None:
         self.first = [start] * 2
@@ -286,7 +288,7 @@ class Sharing:
 
 
 @pytest.mark.parametrize(
-    ("function", "line", "found"),
+    ("function", "line", "message"),
     [
         (uses_sum, 1, "found sum(...), expected a loop"),
         (has_two_types, 2, "found a float for a int, expected one type for each name"),
@@ -298,25 +300,25 @@ class Sharing:
         (hides_a_branch, 1, "found With, expected assignments, if, for"),
         (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
     ],
-    ids=lambda one: getattr(one, "__name__", ""),
+    ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_construct_outside_the_subset_is_refused_with_file_and_line(function, line, found):
+def test_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
     program = Program("t_")
     with pytest.raises(SubsetError) as error:
         program.add(function, Sharing if function is Sharing.__init__ else None)
         program.output()
-    place = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
-    assert str(error.value).startswith(place + found), error.value
+    location = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
+    assert str(error.value).startswith(location + message), error.value
 
 
-def test_public_function_that_may_raise_is_refused():
+def test_c99_public_function_that_may_raise_is_rejected():
     program = Program("t_", public={divide: "t_divide"})
     program.add(divide)
     with pytest.raises(SubsetError, match=r"found a division whose divisor may be 0 within t_divide"):
         program.output()
 
 
-def test_divisors_that_cannot_be_zero_are_not_tested():
+def test_c99_divisors_that_cannot_be_zero_are_not_checked():
     def safe(a: float, b: float) -> float:
         if not b > 0.0:
             return a / 3.0
@@ -327,7 +329,7 @@ def test_divisors_that_cannot_be_zero_are_not_tested():
     assert "error" not in program.output().definitions
 
 
-def test_output_is_the_same_every_time():
+def test_c99_output_is_deterministic():
     def text() -> tuple[str, str]:
         program = Program("t_")
         program.add(Outer.__init__, Outer)

@@ -1,4 +1,4 @@
-"""Forms: a mechanism does the same in a common form as alone."""
+"""Common forms: a mechanism gives the same results in a shared program as alone."""
 
 import jax
 import jax.numpy as jnp
@@ -34,13 +34,13 @@ CONTACTS = {
 
 
 def members():
-    found = {}
+    result = {}
     for name, contact in CONTACTS.items():
         several = 3 if "depth" not in str(contact) and name != "hardening" else 1
         raw = mechanism(contact, contacts=several)
-        found[name] = validated({**raw, "uncertainty": SPREAD})
+        result[name] = validated({**raw, "uncertainty": SPREAD})
     noisy = mechanism({}, force_sensor={"noise_std": 0.1, "dead_zone": 0.3, "time_constant": 0.001})
-    return {**found, "noisy": validated({**noisy, "name": "noisy", "uncertainty": SPREAD})}
+    return {**result, "noisy": validated({**noisy, "name": "noisy", "uncertainty": SPREAD})}
 
 
 MEMBERS = members()
@@ -48,13 +48,13 @@ ALONE = ("piecewise_linear", "hardening", "noisy")
 GAINS, LANES = {"phase_lead": 0.005, "lead_filter": 0.001}, 4
 
 
-def test_one_form_has_every_contact_law():
+def test_common_program_includes_every_contact_law():
     groups = common_programs(list(MEMBERS.values()))
     assert [len(group) for group, _ in groups] == [len(MEMBERS)]
     assert set(groups[0][1].laws) == set(LAWS)
 
 
-def test_two_surfaces_and_other_orders_stay_apart():
+def test_common_program_keeps_two_surfaces_and_other_orders_separate():
     others = [
         mechanism({}),
         mechanism({"clearance": 0.02}),
@@ -67,44 +67,44 @@ def test_two_surfaces_and_other_orders_stay_apart():
 
 
 @pytest.mark.slow
-def test_the_same_as_alone():
-    some = [MEMBERS[name] for name in ALONE]
-    [(_, common)] = common_programs(some)
-    scenarios = [build_scenarios(one, draw(one, LANES, 1), 1) for one in some]
-    in_form = [common.scenarios(one, batch) for one, batch in zip(some, scenarios, strict=True)]
+def test_common_program_gives_the_same_results_as_separate_programs():
+    chosen = [MEMBERS[name] for name in ALONE]
+    [(_, common)] = common_programs(chosen)
+    scenarios = [build_scenarios(member, draw(member, LANES, 1), 1) for member in chosen]
+    in_form = [common.scenarios(member, batch) for member, batch in zip(chosen, scenarios, strict=True)]
     joined = join(in_form)
     together = evaluate(common.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
-    for place, (name, one, batch) in enumerate(zip(ALONE, some, scenarios, strict=True)):
-        loop = build_loop(one, "phase_lead", batch)
+    for index, (name, member, batch) in enumerate(zip(ALONE, chosen, scenarios, strict=True)):
+        loop = build_loop(member, "phase_lead", batch)
         batch = jax.tree.map(jnp.asarray, batch)
         metrics = run_rollout(loop, as_arrays(GAINS), batch)
         expected = compare_with_reference(loop, batch, metrics)
-        own = slice(place * LANES, (place + 1) * LANES)
+        lanes = slice(index * LANES, (index + 1) * LANES)
         good = np.asarray(expected.good)
         assert np.all(good == expected.wanted) and np.any(good)
-        np.testing.assert_array_equal(together.good[:, own], good, err_msg=name)
+        np.testing.assert_array_equal(together.good[:, lanes], good, err_msg=name)
         for figure in ("error", "reference_restitution", "peak_ratio"):
-            found, wanted = getattr(together, figure)[:, own], np.asarray(getattr(expected, figure))
+            joint, alone = getattr(together, figure)[:, lanes], np.asarray(getattr(expected, figure))
             np.testing.assert_allclose(
-                found[good], wanted[good], rtol=0, atol=1e-9, err_msg=f"{name}: {figure}"
+                joint[good], alone[good], rtol=0, atol=1e-9, err_msg=f"{name}: {figure}"
             )
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_lags_beside_none_in_cells(exact):
-    """Contact along the exact motion, because it is asked for or because one of the mechanisms is stiff."""
+def test_common_program_with_cells_mixes_sensors_with_and_without_lag(exact):
+    """Follow the exact motion, because it is requested or because one mechanism is stiff."""
     lagging = mechanism(
         {"law": "kelvin_voigt"}, SECOND_ORDER, period=1e-3, force_sensor={"time_constant": 2e-4}
     )
     yielding = mechanism({"law": "elastoplastic", "unloading_ratio": 1.5}, SECOND_ORDER, period=1e-3)
     stiff = mechanism({"law": "kelvin_voigt", "stiffness": [5e6]}, SECOND_ORDER, period=1e-3)
-    parsed = [validated(one) for one in (lagging, yielding, *([] if exact else [stiff]))]
+    parsed = [validated(member) for member in (lagging, yielding, *([] if exact else [stiff]))]
     ((_, common),) = common_programs(parsed)
     assert "has_lag" in common.parts
-    for one in parsed[:2]:
-        scenarios = build_scenarios(one, {"approach.phase": np.arange(4) / 4}, 0)
-        alone = run_rollout(build_loop(one, "none", scenarios, exact=True), {}, scenarios)
-        loop = common.loop(build_loop(one, "none", scenarios, exact=exact))
-        shared = run_rollout(loop, {}, common.scenarios(one, scenarios))
+    for member in parsed[:2]:
+        scenarios = build_scenarios(member, {"approach.phase": np.arange(4) / 4}, 0)
+        alone = run_rollout(build_loop(member, "none", scenarios, exact=True), {}, scenarios)
+        loop = common.loop(build_loop(member, "none", scenarios, exact=exact))
+        shared = run_rollout(loop, {}, common.scenarios(member, scenarios))
         assert loop.has_cells
         np.testing.assert_allclose(shared.restitution, alone.restitution, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""`jaxhil compare` as a user calls it; what runs the comparison itself is slow."""
+"""`jaxhil compare` as a user calls it; tests that run the comparison itself are slow."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from tuning.benchmark.tables import HEADINGS, leaderboard, least, mechanism_tabl
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
-# A job in the background of a shell that is not interactive is started deaf to interrupts.
+# A non-interactive shell starts background jobs with SIGINT ignored.
 HEEDING = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "from tuning.__main__ import main; sys.exit(main())"
@@ -35,10 +35,10 @@ def run(arguments, folder, **options):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_document(tmp_path):
+def test_compare_command_is_reproducible_from_seed(tmp_path):
     first, second = (run([*SMALL, "--json", "-o", name], tmp_path) for name in ("a", "b"))
     assert (first.returncode, second.returncode) == (0, 0), first.stderr
-    documents = [json.loads(one.stdout) for one in (first, second)]
+    documents = [json.loads(run_result.stdout) for run_result in (first, second)]
     for name, document in zip("ab", documents, strict=True):
         assert json.loads((tmp_path / name / "compare.json").read_text()) == document
         assert (tmp_path / name / "errors.png").exists() and (tmp_path / name / "honesty.png").exists()
@@ -51,7 +51,7 @@ def test_the_same_seed_gives_the_same_document(tmp_path):
     assert none["knows"] == [] and set(none["figures"]) == {"literature"}
     rms = none["figures"]["literature"]["rms"]
     assert rms["low"] <= rms["value"] <= rms["high"]
-    # A law that gives back what was taken: a small error, and blind.
+    # The passivity law returns the energy taken: a small error, but no transparency.
     assert passivity["figures"]["literature"]["rms"]["high"] < 0.2 * rms["low"]
     assert abs(passivity["figures"]["literature"]["late"]["value"]) < 0.1
     assert mechanism["winners"]["rms"] == "passivity"
@@ -60,8 +60,8 @@ def test_the_same_seed_gives_the_same_document(tmp_path):
 
 
 def figures(rms, **others):
-    own = dict.fromkeys(HEADINGS, Estimate(1.0, 0.9, 1.1))
-    return {**own, "rms": Estimate(rms, 0.9 * rms, 1.1 * rms), **others}
+    estimates = dict.fromkeys(HEADINGS, Estimate(1.0, 0.9, 1.1))
+    return {**estimates, "rms": Estimate(rms, 0.9 * rms, 1.1 * rms), **others}
 
 
 FOUND = [
@@ -75,19 +75,19 @@ FOUND = [
 ]
 
 
-def test_tables_mark_what_wins(capsys):
+def test_compare_tables_mark_the_best_compensator(capsys):
     terminal.emit(mechanism_table("m", FOUND), leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]}))
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if line.strip()]
     assert ["none", "50"] in [row[:2] for row in rows] and ["phase_lead", "40"] in [row[:2] for row in rows]
-    # Tuned, by more than the intervals; what there is not is a dash.
+    # Tuned gains win by more than the intervals; a missing value is a dash.
     assert ["tuned", "10*", "100", "-"] in [row[:4] for row in rows]
     assert ["m", "50", "10*"] in rows and ["n", "50", "-"] in rows
     assert winners(FOUND)["rms"] == "phase_lead" and winners(FOUND)["late"] is None
 
 
-def test_one_table_has_all_laws_and_their_settings(capsys):
-    """Wider than a page, in whole lines; a law's settings do not compete with it."""
+def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
+    """Print whole lines wider than a page; the settings of a compensator do not compete with it."""
     ours = LawFigures("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
     many = [*FOUND, ours, *(LawFigures(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
     better = [*FOUND, LawFigures("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
@@ -100,23 +100,23 @@ def test_one_table_has_all_laws_and_their_settings(capsys):
     assert least(["m"], {"m": FOUND[:1]}) == ""
 
 
-def test_tables_of_what_is_not_tuned_do_not_say_so(capsys):
+def test_compare_tables_omit_tuned_rows_without_tuning(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
-    found = [FOUND[0], LawFigures("impulse_ledger", "m", {}, both)]
-    terminal.emit(mechanism_table("m", found), leaderboard(["m"], {"m": found}))
+    result = [FOUND[0], LawFigures("impulse_ledger", "m", {}, both)]
+    terminal.emit(mechanism_table("m", result), leaderboard(["m"], {"m": result}))
     out = capsys.readouterr().out
     assert "tuned" not in out and "  gentle  " in out
     assert out.count("with the literature's gains") == 2
 
 
-def test_pictures_are_drawn(tmp_path):
+def test_compare_plots_are_written(tmp_path):
     both = {"m": FOUND, "n": FOUND}
     save(errors_plot(["m", "n"], both, 0.01), tmp_path / "errors.png")
     save(transparency_plot(["m", "n"], both), tmp_path / "honesty.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
 
 
-def test_cost_is_a_time():
+def test_compare_cost_per_tick_is_a_positive_time():
     assert 0 < microseconds_per_tick("phase_lead", literature("phase_lead"), 1e-3, inf, 0.005) < 1e3
 
 
@@ -128,7 +128,7 @@ def literature(law):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--compensators", "magic"], "--compensators: found 'magic', allowed none, dead_zone_observer"),
         (["no-such-file"], "no-such-file"),
@@ -138,15 +138,15 @@ def literature(law):
         (["--limit", "nan"], "--limit: found nan, allowed a number >= 0"),
     ],
 )
-def test_unusable_input_is_one_line(jaxhil, arguments, said, tmp_path, monkeypatch):
+def test_compare_reports_unusable_input_in_one_line(jaxhil, arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil("compare", *arguments)
-    assert ran.code == 2 and said in ran.err and ran.err.count("\n") == 1
+    assert ran.code == 2 and message in ran.err and ran.err.count("\n") == 1
     assert not ran.out and not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_interrupted_it_keeps_what_is_finished(tmp_path):
+def test_compare_keeps_finished_results_after_interrupt(tmp_path):
     environment = {**os.environ, "JAXHIL_CACHE": str(tmp_path / "cache"), "XLA_FLAGS": ""}
     process = subprocess.Popen(
         [sys.executable, "-c", HEEDING, "compare", *SMALL, "--json", "-o", "out"],
@@ -163,7 +163,7 @@ def test_interrupted_it_keeps_what_is_finished(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_killed_it_leaves_no_workers(tmp_path, number):
+def test_compare_leaves_no_workers_after_kill(tmp_path, number):
     environment = {**os.environ, "JAXHIL_CACHE": str(tmp_path / "cache"), "XLA_FLAGS": ""}
     process = subprocess.Popen(
         [*COMMAND, *SMALL, "--json", "-o", "out"], env=environment, cwd=tmp_path,
@@ -171,6 +171,6 @@ def test_killed_it_leaves_no_workers(tmp_path, number):
     )  # fmt: skip
     time.sleep(6)
     process.send_signal(number)
-    # Every worker has a copy of the pipe: it ends when all of them have ended.
+    # Every worker holds a copy of the pipe: it closes when all of them have ended.
     out, _ = process.communicate(timeout=20)
     assert process.returncode == -number and out == b""

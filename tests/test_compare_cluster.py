@@ -1,4 +1,4 @@
-"""A comparison on a dask.distributed cluster: the same figures to the bit, whoever dies."""
+"""Comparison on a dask.distributed cluster: the same bits, even if a worker is killed."""
 
 from typing import Any
 
@@ -15,17 +15,20 @@ FEW: dict[str, Any] = {"untuned": True, "judged": 16}
 
 
 def figures(board):
-    return {law: {which: vars(own) for which, own in each.items()} for law, each in board.figures.items()}
+    return {
+        law: {which: vars(metrics) for which, metrics in by_gains.items()}
+        for law, by_gains in board.figures.items()
+    }
 
 
-def test_a_scheduler_that_is_not_there_is_one_line():
+def test_compare_reports_missing_scheduler_in_one_line():
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.compare("varying", LAWS, scheduler="nowhere://x", **FEW)
 
 
 @pytest.mark.slow
-def test_the_same_figures_though_a_worker_is_killed(tmp_path, monkeypatch):
+def test_compare_gives_the_same_results_if_a_worker_is_killed(tmp_path, monkeypatch):
     mechanisms = [jaxhil.load("varying"), jaxhil.load("suite-rattling")]
     here = tuning.compare(mechanisms, LAWS, **FEW)
     with started(tmp_path) as cluster:
@@ -35,4 +38,4 @@ def test_the_same_figures_though_a_worker_is_killed(tmp_path, monkeypatch):
         killed_meanwhile(monkeypatch, study, cluster, first)
         there = tuning.compare(mechanisms, LAWS, scheduler=cluster.address, **FEW)
         assert first.poll() is not None
-    assert [figures(one) for one in there] == [figures(one) for one in here]
+    assert [figures(board) for board in there] == [figures(board) for board in here]

@@ -1,4 +1,4 @@
-"""The figures of a comparison, tested themselves: laws whose honesty is known beforehand."""
+"""Metrics of a comparison, tested on compensators whose transparency is known beforehand."""
 
 from typing import ClassVar, NamedTuple
 
@@ -43,8 +43,8 @@ def judged(raw, law, gains=None, number=LANES):
     return judge_gains(scene, law, gains or {}, LIMIT, SEED)
 
 
-def test_an_ideal_rig_is_honest():
-    """No delay, T -> 0: error 0, transparency 1, slope 1, peak ratio 1."""
+def test_ideal_rig_has_zero_error_and_full_transparency():
+    """Without delay and for T -> 0: error 0, transparency 1, slope 1, peak ratio 1."""
     figures = judged(mechanism({}, IDEAL, 0.0, period=5e-5), "none")
     assert figures["rms"].value < 1e-3 and figures["worst"].value < 1e-3
     for name in ("early", "late", "slope", "peak"):
@@ -54,7 +54,7 @@ def test_an_ideal_rig_is_honest():
 
 
 class PlayedBack(Compensator):
-    """Blind to the hardware: the force of the contact as it should be, at the model's own depth."""
+    """Ignore the hardware: return the force of the undelayed contact at the model's own penetration."""
 
     name: ClassVar[str] = "played_back"
     knows: ClassVar[tuple[str, ...]] = ()
@@ -73,31 +73,31 @@ class PlayedBack(Compensator):
 
 
 class Known(NamedTuple):
-    """The plant of every lane, which no law on a rig knows."""
+    """Plant of every lane, which no compensator on a rig knows."""
 
     stiffness: Array
     damping: Array
 
 
-def test_a_law_that_plays_back_the_reference_is_blind(monkeypatch):
-    """Error 0 and slope 1, although the simulator is slow and the force late; transparency 0."""
+def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatch):
+    """Error 0 and slope 1 although simulator and force are late; transparency 0."""
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 
-    def known(loop, gains, scenarios):
+    def evaluate_with_plant(loop, gains, scenarios):
         contact = scenarios.contact
         stiffness = contact.stiffness[0].reshape(-1, contact.damping.shape[-1])[0]
         plant_values = Known(stiffness, contact.damping[0])
         return evaluate(loop, plant_values._asdict(), scenarios)
 
-    monkeypatch.setattr("tuning.benchmark.runs.evaluate", known)
+    monkeypatch.setattr("tuning.benchmark.runs.evaluate", evaluate_with_plant)
     figures = judged(mechanism({}, period=2.5e-4), "played_back")
     assert figures["rms"].value < 1e-3
     assert figures["slope"].value == pytest.approx(1, abs=1e-3)
     assert abs(figures["early"].value) < 1e-6 and abs(figures["late"].value) < 1e-6
 
 
-def test_without_compensation_the_error_is_the_closed_form():
-    """A pure force delay before an ideal simulator: e = |S'(t_s + tau)| (model.md, section 6, item 1)."""
+def test_uncompensated_delay_error_matches_closed_form():
+    """Take a pure force delay before an ideal simulator: e = |S'(t_s + tau)| (model.md, section 6)."""
     tau = 0.004
     raw = mechanism({}, IDEAL, tau, period=2.5e-4)
     parsed = validated({**raw, "uncertainty": SPREAD})
@@ -107,7 +107,7 @@ def test_without_compensation_the_error_is_the_closed_form():
     figures = judged(raw, "none")
     assert figures["rms"].value == pytest.approx(np.sqrt(np.mean(expected**2)), abs=2e-3)
     assert figures["worst"].value == pytest.approx(np.max(expected), abs=2e-3)
-    # Delay makes the loop livelier than the contact: whatever disturbs it disturbs it more.
+    # Delay makes the loop more sensitive to disturbances than the contact itself.
     assert figures["early"].value > 1 and figures["late"].value > 1
 
 
@@ -123,14 +123,14 @@ def test_damping_perturbations_span_a_third_of_the_speed(name):
     draws = draw(parsed, 24, 0)
     twin, twin_draws = perturb_damping(parsed, draws)
     lossy = []
-    for one, values in ((parsed, draws), (twin, twin_draws)):
-        batch = build_scenarios(one, values)
-        assert build_loop(one, "none", batch).law == LAWS[one.contact.law]
+    for member, values in ((parsed, draws), (twin, twin_draws)):
+        batch = build_scenarios(member, values)
+        assert build_loop(member, "none", batch).law == LAWS[member.contact.law]
         contact = type(batch.contact)(
             *(jnp.asarray(leaf)[0] if leaf is not None else None for leaf in batch.contact)
         )
         mass, velocity = jnp.asarray(batch.equivalent_mass), jnp.asarray(batch.velocity)
-        of_law = jax.jit(LAWS[one.contact.law].reference, compiler_options=QUICK)
+        of_law = jax.jit(LAWS[member.contact.law].reference, compiler_options=QUICK)
         lossy.append(np.asarray(of_law(contact, mass, velocity).restitution))
     before, after = lossy
     lost = 1 - after / before
@@ -138,44 +138,44 @@ def test_damping_perturbations_span_a_third_of_the_speed(name):
     assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * LARGEST_RATIO))
 
 
-def test_transparency_and_slope_are_least_squares():
+def test_transparency_and_slope_are_least_squares_estimates():
     true = np.array([0.01, -0.02, 0.03])
     assert transmitted(0.4 * true, true) == pytest.approx(0.4)
     reference = np.array([0.5, 0.7, 0.9])
     assert slope(0.2 + 0.8 * reference, reference) == pytest.approx(0.8)
 
 
-def test_intervals_cover_as_often_as_they_say():
+def test_comparison_intervals_have_stated_coverage():
     rng = np.random.default_rng(0)
     hits, every = 0, np.ones((1, 60), bool)
     for seed in range(200):
         sample = rng.normal(1.0, 1.0, 60)
-        found = resampled(lambda values: np.mean(values, axis=-1), seed, every, sample[None])
-        hits += found.low <= 1.0 <= found.high
+        result = resampled(lambda values: np.mean(values, axis=-1), seed, every, sample[None])
+        hits += result.low <= 1.0 <= result.high
     # Binomial(200, 0.95) is below 181 with probability 0.3 %.
     assert 181 <= hits <= 200
     none = share(np.zeros(100, bool))
     assert none.value == 0 and none.low == 0 and none.high == pytest.approx(1 - 0.025 ** (1 / 100))
 
 
-def test_a_winner_is_better_by_more_than_the_intervals():
+def test_winner_requires_separated_intervals():
     figures = {"a": Estimate(0.1, 0.09, 0.11), "b": Estimate(0.2, 0.12, 0.3), "c": Estimate(0.15, 0.105, 0.2)}
     assert winner("rms", figures) is None
     assert winner("rms", {name: figures[name] for name in "ab"}) == "a"
     assert winner("rms", {"a": figures["a"]}) is None
-    # A law of which contacts did not end has no interval, and neither wins nor stands in the way.
+    # A compensator with unfinished contacts has no interval; it does not win and does not block a winner.
     assert winner("rms", {"a": figures["a"], "b": figures["b"], "d": Estimate(0.01, np.nan, np.nan)}) == "a"
 
 
-def test_honesty_is_measured_from_1():
+def test_transparency_distance_is_measured_from_1():
     assert set(CLOSER_TO_1) == {"early", "late", "slope"}
     assert distance("early", Estimate(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
     assert distance("slope", Estimate(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
     assert distance("rms", Estimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
 
 
-def test_scenarios_are_resampled_with_all_their_contacts():
-    """Four equal contacts say no more than one, and one that is not good says nothing."""
+def test_comparison_resamples_scenarios_with_all_their_contacts():
+    """Four equal contacts say no more than one; a contact that is not good is ignored."""
     sample = np.random.default_rng(0).normal(1.0, 1.0, 40)
     good = np.ones((4, 40), bool)
 

@@ -1,4 +1,4 @@
-"""The compensators against the closed forms of model.md, section 6, items 4, 5, 6 and 8."""
+"""Compensators compared with the closed forms of model.md, section 6, items 4, 5, 6 and 8."""
 
 import dataclasses
 import functools
@@ -36,15 +36,15 @@ FINE = 2.5e-4
 
 
 def fixed_gains(parsed, **values):
-    """Response-error gains that know the stiffness and identify nothing."""
-    known = {"initial_stiffness": STIFFNESS, "stiffness_covariance": 0.0, "damping_covariance": 0.0}
-    off = {
+    """Return response-error gains that know the stiffness and identify nothing."""
+    identification = {"initial_stiffness": STIFFNESS, "stiffness_covariance": 0.0, "damping_covariance": 0.0}
+    inactive = {
         "contact_threshold": 0.0,
         "forgetting": 1.0,
         "response_error_damping": 0.0,
         "lead_filter": FINE / 2,
     }
-    return nominal_gains(parsed, "response_error", **(known | off | values))
+    return nominal_gains(parsed, "response_error", **(identification | inactive | values))
 
 
 # (kappa, T_lead / tau_f, whether the position is late)
@@ -52,7 +52,7 @@ COMPENSATIONS = [(0, 0, 0), (0, 1, 0), (0.5, 0, 0), (0.5, 1, 0), (1, 1, 0), (1, 
 
 
 @pytest.mark.parametrize("model", ["first_order", "second_order"])
-def test_net_delay_with_response_error_compensation(model):
+def test_response_error_net_delay_matches_closed_form(model):
     simulator = {"first_order": {"time_constant": 0.006}, "second_order": SECOND_ORDER}[model]
     parsed = validated(
         mechanism({"stiffness": [STIFFNESS]}, simulator | {"model": model}, 0.006, period=FINE)
@@ -65,11 +65,11 @@ def test_net_delay_with_response_error_compensation(model):
         0.006 * scale,
         0.004 * scale * late,
     )
-    one, zero = np.ones_like(lag), np.zeros_like(lag)
+    ones, zeros = np.ones_like(lag), np.zeros_like(lag)
     if model == "first_order":
-        numerator, denominator = one[None], np.stack([lag, one])
+        numerator, denominator = ones[None], np.stack([lag, ones])
     else:
-        numerator, denominator = np.stack([zero, one]), np.stack([(lag / 1.6) ** 2, lag, one])
+        numerator, denominator = np.stack([zeros, ones]), np.stack([(lag / 1.6) ** 2, lag, ones])
     scenario = spread(
         parsed,
         len(index),
@@ -88,13 +88,13 @@ def test_net_delay_with_response_error_compensation(model):
     restitution = first_contact(parsed, scenario, "response_error", gains)["restitution"].reshape(
         -1, len(PHASES)
     )
-    found = 2 * np.log(restitution.mean(axis=1)) / (pi * OMEGA)
+    net_delay = 2 * np.log(restitution.mean(axis=1)) / (pi * OMEGA)
     expected = (1 - lead) * force_delay + (1 - kappa) * (lag + transport) - kappa * position_delay
     expected = expected.reshape(-1, len(PHASES))[:, 0]
-    # What the formula leaves out is of third order in the lags, and so is the bound; 1e-7 s is left by T.
+    # The formula neglects terms of third order in the lags, and so does the bound; T contributes 1e-7 s.
     lags = (lag + transport + force_delay + position_delay).reshape(-1, len(PHASES))[:, 0]
-    assert np.all(np.abs(found - expected) < 0.5 * OMEGA**2 * lags**3 + 5e-7)
-    # Largest, the bound is 8 % of the lags; smallest, 0.2 %.
+    assert np.all(np.abs(net_delay - expected) < 0.5 * OMEGA**2 * lags**3 + 5e-7)
+    # The bound is between 0.2 % and 8 % of the lags.
     assert np.ptp(expected) > 0.007
 
 
@@ -105,15 +105,15 @@ MARGIN = np.array([0.8, 0.95, 1.0, 1.05, 1.2])
 
 
 def critical(damping):
-    """(omega_c, tau_c) of M x'' + b x'(t - tau) + k x(t - tau) = 0."""
+    """Return (omega_c, tau_c) of M x'' + b x'(t - tau) + k x(t - tau) = 0."""
     squared = damping**2 + np.sqrt(damping**4 + 4 * MASS**2 * STIFFNESS**2)
     omega = np.sqrt(squared / (2 * MASS**2))
     return omega, np.arctan(damping * omega / STIFFNESS) / omega
 
 
-def test_stable_or_divergent_by_the_critical_delay():
+def test_contact_stability_changes_at_critical_delay():
     delay = MARGIN * critical(DAMPING)[1]
-    found = growth(
+    result = growth(
         persistent(spring(), "none", 2.5, {}, contact__damping=np.full(5, DAMPING), force_sensor__delay=delay)
     )
     root = np.full(5, 1j * OMEGA)
@@ -121,20 +121,20 @@ def test_stable_or_divergent_by_the_critical_delay():
         shift = np.exp(-root * delay)
         value = MASS * root**2 + (DAMPING * root + STIFFNESS) * shift
         root -= value / (2 * MASS * root + (DAMPING - delay * (DAMPING * root + STIFFNESS)) * shift)
-    np.testing.assert_allclose(found, pi * root.real / root.imag, rtol=0, atol=1.5e-4)
-    assert np.all(found[:2] < -0.007) and np.all(found[3:] > 0.007)
+    np.testing.assert_allclose(result, pi * root.real / root.imag, rtol=0, atol=1.5e-4)
+    assert np.all(result[:2] < -0.007) and np.all(result[3:] > 0.007)
 
 
-def test_stable_or_divergent_by_the_critical_lag():
+def test_contact_stability_changes_at_critical_lag():
     lag = MARGIN * DAMPING / STIFFNESS
     leaves = {"simulator__denominator": np.stack([lag, np.ones(5)]), "contact__damping": np.full(5, DAMPING)}
-    found = growth(
+    result = growth(
         persistent(spring({"model": "first_order", "time_constant": 1.0}), "none", 2.5, {}, **leaves)
     )
     roots = [np.roots([MASS * T, MASS, DAMPING, STIFFNESS]) for T in lag]
     roots = np.array([r[np.argmax(r.imag)] for r in roots])
-    np.testing.assert_allclose(found, pi * roots.real / roots.imag, rtol=0, atol=2e-6)
-    assert np.all(found[:2] < -0.007) and abs(found[2]) < 1e-6 and np.all(found[3:] > 0.007)
+    np.testing.assert_allclose(result, pi * roots.real / roots.imag, rtol=0, atol=2e-6)
+    assert np.all(result[:2] < -0.007) and abs(result[2]) < 1e-6 and np.all(result[3:] > 0.007)
 
 
 # First-order lead: omega tau, and the damping as a multiple of the critical one.
@@ -143,7 +143,7 @@ LEADS = np.array([[0.1, 0], [0.2, 0], [0.3, 0], *([a, m] for a in (0.4, 0.6) for
 
 @functools.cache
 def first_order_leads():
-    """Growth in the limit T -> 0 of endless contacts under phase lead, and their dominant roots."""
+    """Return the growth for T -> 0 of endless contacts under phase lead, and their dominant roots."""
     angle, multiple = LEADS
     # At the threshold (k + j omega b)(1 + j theta) e^(-j theta) is real and M omega^2, theta = omega tau:
     # b omega/k = tan(theta - atan theta), about theta^3/3, twice the damping ratio.
@@ -152,36 +152,36 @@ def first_order_leads():
     omega = np.where(multiple > 0, there, OMEGA)
     damping, delay = multiple * STIFFNESS * np.tan(short) / omega, angle / omega
     leaves = {"contact__damping": damping, "force_sensor__delay": delay}
-    found = without_period("phase_lead", 2.5, {"phase_lead": delay}, **leaves)
+    result = without_period("phase_lead", 2.5, {"phase_lead": delay}, **leaves)
 
     def root(b, tau):
         return characteristic_root(
             lambda s: MASS * s**2 + (b * s + STIFFNESS) * (1 + tau * s) * np.exp(-s * tau)
         )
 
-    return found, np.array([decay(root(b, tau)) for b, tau in zip(damping, delay, strict=True)])
+    return result, np.array([decay(root(b, tau)) for b, tau in zip(damping, delay, strict=True)])
 
 
-def test_first_order_lead_grows_as_its_root():
-    found, expected = first_order_leads()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+def test_first_order_lead_growth_matches_characteristic_root():
+    result, expected = first_order_leads()
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-4)
 
 
-def test_first_order_lead_stays_divergent():
+def test_first_order_lead_stays_divergent_without_damping():
     angle = LEADS[0, :3]
     ratio = first_order_leads()[0][:3] / (pi / 6 * angle**3)
     assert np.all(np.abs(ratio - 1) < 0.01 + 0.7 * angle**2)
 
 
-def test_first_order_lead_is_stable_or_divergent_by_the_critical_damping():
-    found = first_order_leads()[0][3:].reshape(2, 3)
-    assert np.all(np.abs(found[:, 1]) < 1e-4)
-    assert np.all(found[:, 0] > 4e-3) and np.all(found[:, 2] < -4e-3)
+def test_first_order_lead_stability_changes_at_critical_damping():
+    result = first_order_leads()[0][3:].reshape(2, 3)
+    assert np.all(np.abs(result[:, 1]) < 1e-4)
+    assert np.all(result[:, 0] > 4e-3) and np.all(result[:, 2] < -4e-3)
 
 
-def test_identification_of_delayed_force_on_undelayed_motion_is_biased():
+def test_identification_with_misaligned_force_is_biased_as_predicted():
     damping = 2 * np.tile([0.02, 0.05, 0.1], 2) * MASS * OMEGA
-    # At the critical delay the motion is a pure oscillation: what the formulas are about.
+    # At the critical delay the motion is a pure oscillation, as the formulas assume.
     omega, delay = critical(damping)
     aligned = np.repeat([0.0, 1.0], 3) * delay
     parsed = spring(period=FINE)
@@ -189,21 +189,23 @@ def test_identification_of_delayed_force_on_undelayed_motion_is_biased():
     gains = fixed_gains(parsed, stiffness_covariance=1e12, damping_covariance=1e8, **off)
     gains |= {"initial_stiffness": 0.0, "identification_delay": aligned}
     leaves = {"contact__damping": damping, "force_sensor__delay": delay}
-    stiffness, found = persistent(parsed, "response_error", 1.5, gains, **leaves).identified
+    stiffness, result = persistent(parsed, "response_error", 1.5, gains, **leaves).identified
     left = omega * (delay - aligned)
     biased = STIFFNESS * np.cos(left) + damping * omega * np.sin(left)
     assert np.ptp(biased) > 0.02 * STIFFNESS
     np.testing.assert_allclose(stiffness[-1], biased, rtol=0, atol=2e-3 * STIFFNESS)
     biased = damping * np.cos(left) - STIFFNESS / omega * np.sin(left)
     assert np.all(np.abs(biased[:3]) < 1e-9) and np.all(biased[3:] == damping[3:])
-    np.testing.assert_allclose(found[-1] / damping, biased / damping, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(result[-1] / damping, biased / damping, rtol=0, atol=2e-3)
 
 
-# Item 8: what a clamp of F_c at zero does.
+# Item 8: effect of a clamp of F_c at zero.
 
 
 class Clamped(Compensator):
-    """max(0, F_c) of another law; the measured force alone for the first `blind` ticks of contact."""
+    """Another compensator clamped to max(0, F_c); the measured force alone for the first `blind` contact
+    ticks.
+    """
 
     name: ClassVar[str] = "clamped"
     knows: ClassVar[tuple] = ()
@@ -231,7 +233,7 @@ CLAMP_PHASES = np.array([0.05, 0.1, 0.2])
 
 
 def clamped_and_not(name, law, blind, gains, **leaves):
-    """Mean restitution over the contact phases without and with the clamp, for every CLAMP_PHASES."""
+    """Return the mean restitution over the contact phases without and with the clamp, per CLAMP_PHASES."""
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=FINE))
     leaves = {key: np.repeat(value, len(PHASES)) for key, value in leaves.items()}
     gains = {key: np.repeat(value, len(PHASES)) if np.ndim(value) else value for key, value in gains.items()}
@@ -251,10 +253,10 @@ def test_clamped_response_error_diverges_as_predicted(blind):
     gains = fixed_gains(validated(mechanism({}, IDEAL, 0.0, period=FINE)), phase_lead=0.0)
     lag = CLAMP_PHASES / OMEGA
     free, clamped = clamped_and_not("response_error", ResponseError(), blind, gains, simulator__delay=lag)
-    # The gate opens with a mean delay of one period, unless it is open by the time that the law may act.
+    # The gate opens with a mean delay of one period, unless it is open before the compensator may act.
     squared = 1 + CLAMP_PHASES**2 + 2 * CLAMP_PHASES * OMEGA * max(blind, 1) * FINE
     assert clamped == pytest.approx(np.sqrt(squared), abs=4e-4)
-    # Without the clamp, the pull while x_a is still in contact makes up for the late onset.
+    # Without the clamp, the pulling force while x_a is still in contact compensates for the late onset.
     assert np.all(np.abs(free - 1) < 0.1 * CLAMP_PHASES**2)
 
 
@@ -262,6 +264,6 @@ def test_clamped_phase_lead_diverges_more():
     delay = CLAMP_PHASES / OMEGA
     gains = {"phase_lead": delay, "lead_filter": FINE / 2}
     free, clamped = clamped_and_not("phase_lead", PhaseLead(), 0, gains, force_sensor__delay=delay)
-    # The figures of model.md, to what the filter's first-order error leaves.
+    # The numbers of model.md, up to the filter's first-order error.
     assert (free[-1], clamped[-1]) == pytest.approx((1.0041, 1.0244), abs=8e-4)
     assert np.all(clamped - 1 > 3 * (free - 1))

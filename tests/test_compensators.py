@@ -1,7 +1,8 @@
-"""What holds for every compensation law of the registry.
+"""Properties of every registered compensator.
 
-Agreement with the runtime on many random and recorded readings is in `test_agreement`, that of C with Python
-in `test_c99`, the bundle and its self-test in `test_export`: all of them go by the registry, too.
+Other tests also take every registered compensator: agreement with the runtime on many random and recorded
+readings (`test_agreement`), agreement of C with Python (`test_c99`), and the bundle with its self-test
+(`test_export`).
 """
 
 import functools
@@ -23,7 +24,7 @@ from jaxhil.rig import Controller, GainFileError
 
 LAWS = tuple(COMPENSATORS)
 WITH_GAINS = tuple(name for name, law in COMPENSATORS.items() if law.gains)
-# Of the others, position_lead, the gains act on the position command: see its own test.
+# The gains of position_lead act on the position command: see its own test.
 ON_THE_FORCE = tuple(
     name for name in WITH_GAINS if type(COMPENSATORS[name]).position_command is Compensator.position_command
 )
@@ -45,7 +46,7 @@ WORDS = {value for name, value in vars(known).items() if name.isupper()}
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def commands(name, signals, gains, constants):
-    """Force commands, (ticks, *batch); runs begin where `age` is 0."""
+    """Return the force commands, (ticks, *batch); runs begin where `age` is 0."""
     law = COMPENSATORS[name]
     prepared = law.prepare(gains, constants)
 
@@ -62,7 +63,7 @@ def commands(name, signals, gains, constants):
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def derivative(name, signals, gains, constants, along_signals, along_gains):
-    """Of the commands, along a direction of the four readings and of the gains."""
+    """Return the derivative of the commands along a direction of the four readings and of the gains."""
 
     def of(moved, gains):
         return commands.__wrapped__(name, Signals(*moved, signals.age), gains, constants)
@@ -71,7 +72,7 @@ def derivative(name, signals, gains, constants, along_signals, along_gains):
 
 
 def readings(shape=(), clearance=math.inf):
-    """Contacts at either surface, force and measured position late, (ticks, *shape), two runs of them."""
+    """Return two runs at either surface with late force and measured position, (ticks, *shape)."""
     size = 1 + 0.1 * np.arange(math.prod(shape)).reshape(shape)
     time = PERIOD * np.arange(TICKS).reshape(-1, *(1 for _ in shape))
 
@@ -89,32 +90,34 @@ def readings(shape=(), clearance=math.inf):
 
 
 def some_gains(name, shape=()):
-    """Gains with none of them 0, the same in every lane."""
+    """Return gains that are all nonzero, the same in every lane."""
     return {gain: jnp.full(shape, entry["value"]) for gain, entry in GAINS[name].items()}
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_what_a_law_reads(name):
-    """The measured position, or nothing of it."""
+def test_compensator_reads_position_only_if_declared(name):
+    """Replace the measured position by NaN."""
     signals, constants = readings()
     blind = signals._replace(position_measured=jnp.full_like(signals.position_measured, jnp.nan))
-    seeing, unseeing = (commands(name, each, some_gains(name), constants) for each in (signals, blind))
+    seeing, unseeing = (
+        commands(name, given_signals, some_gains(name), constants) for given_signals in (signals, blind)
+    )
     assert np.array_equal(seeing, unseeing) == (not COMPENSATORS[name].reads_position)
 
 
 def on_the_rig(name, signals):
-    """The runtime's commands on readings of one lane."""
+    """Return the runtime's commands on readings of one lane."""
     gains = {gain: entry["value"] for gain, entry in GAINS[name].items()}
     controller = ON_THE_RIG[name](gains, PERIOD, GAP)
-    found = []
+    result = []
     for *row, age in zip(*(np.asarray(leaf).tolist() for leaf in signals), strict=True):
         if age == 0:
             controller.next_contact()
-        found.append(controller.step(*row))
-    return np.array(found)
+        result.append(controller.step(*row))
+    return np.array(result)
 
 
-def test_every_law_is_there_in_jax_and_on_the_rig():
+def test_every_compensator_exists_in_jax_and_runtime():
     assert set(ON_THE_RIG) == set(LAWS)
     for name, law in COMPENSATORS.items():
         assert law.name == name
@@ -124,7 +127,7 @@ def test_every_law_is_there_in_jax_and_on_the_rig():
 
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("hostile", HOSTILE)
-def test_nominal_gains_are_within_bounds_that_the_runtime_admits(name, hostile):
+def test_nominal_gains_lie_within_bounds_that_runtime_admits(name, hostile):
     mechanism = load("rig-300kg", HOSTILE[hostile]).mechanism
     for gain in COMPENSATORS[name].gains:
         lower, nominal, upper = (bound(mechanism) for bound in (gain.lower, gain.nominal, gain.upper))
@@ -139,14 +142,14 @@ def test_jax_and_runtime_agree_on_contacts_and_on_noise(name):
     signals, constants = readings((), GAP)
     rng = np.random.default_rng(1)
     noise = Signals(*(leaf * rng.standard_normal(TICKS) for leaf in signals[:4]), signals.age)
-    for given in (signals, noise):
-        found = on_the_rig(name, given)
-        expected = commands(name, given, some_gains(name), constants)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.ptp(found))
+    for case_signals in (signals, noise):
+        runtime_commands = on_the_rig(name, case_signals)
+        expected = commands(name, case_signals, some_gains(name), constants)
+        np.testing.assert_allclose(runtime_commands, expected, rtol=0, atol=1e-11 * np.ptp(runtime_commands))
 
 
 @pytest.mark.parametrize("name", WITH_GAINS)
-def test_bad_gains_are_refused_with_one_line(name):
+def test_runtime_rejects_bad_gains_in_one_line(name):
     for gain, specification in ON_THE_RIG[name].gains.items():
         below = math.nextafter(specification.lowest, -math.inf)
         above = math.nextafter(specification.highest, math.inf)
@@ -163,15 +166,15 @@ def test_bad_gains_are_refused_with_one_line(name):
 
 
 @pytest.mark.parametrize("name", ON_THE_FORCE)
-def test_derivatives_by_every_gain_are_those_of_differences(name):
+def test_compensator_gain_derivatives_match_finite_differences(name):
     signals, constants = readings((), GAP)
-    # A sensor with a bias: there are laws that look for one.
+    # Add a sensor bias: some compensators estimate it.
     signals = signals._replace(force_measured=signals.force_measured + 0.3)
     gains = some_gains(name)
     still = tuple(jnp.zeros_like(leaf) for leaf in signals[:4])
     for gain, value in gains.items():
         along = {other: jnp.asarray(float(other == gain)) for other in gains}
-        found = derivative(name, signals, gains, constants, still, along)
+        result = derivative(name, signals, gains, constants, still, along)
         step = 1e-4 * value
         moved = [
             commands(name, signals, {**gains, gain: value + times * step}, constants)
@@ -180,22 +183,22 @@ def test_derivatives_by_every_gain_are_those_of_differences(name):
         expected = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * step)
         scale = float(jnp.max(jnp.abs(expected)))
         assert scale > 0, f"{gain} does nothing"
-        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * scale, err_msg=gain)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=2e-6 * scale, err_msg=gain)
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_derivatives_are_finite_at_rest_at_the_surface_and_without_force(name):
+def test_compensator_derivatives_are_finite_at_rest_and_without_force(name):
     signals, constants = readings((), GAP)
     gains = some_gains(name)
     nothing = signals._replace(**{leaf: jnp.zeros(TICKS) for leaf in signals._fields[:4]})
-    for given in (signals, nothing, nothing._replace(force_measured=signals.force_measured)):
-        ones = jax.tree.map(jnp.ones_like, (given[:4], gains))
-        assert jnp.all(jnp.isfinite(derivative(name, given, gains, constants, *ones)))
+    for case_signals in (signals, nothing, nothing._replace(force_measured=signals.force_measured)):
+        ones = jax.tree.map(jnp.ones_like, (case_signals[:4], gains))
+        assert jnp.all(jnp.isfinite(derivative(name, case_signals, gains, constants, *ones)))
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_lanes_of_any_batch_shape_are_alone(name):
-    """Shapes (), (n,) and (m, n)."""
+def test_compensator_lanes_are_independent_for_any_batch_shape(name):
+    """Compare the shapes (), (n,) and (m, n)."""
     signals, constants = readings((2, 3), GAP)
     together = commands(name, signals, some_gains(name, (2, 3)), constants)
     row = jax.tree.map(lambda leaf: leaf[..., 1, :], (signals, constants))
@@ -209,7 +212,7 @@ def test_lanes_of_any_batch_shape_are_alone(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_law_takes_its_type_from_its_arrays(name):
+def test_compensator_output_type_follows_its_input_arrays(name):
     lowered = jax.tree.map(
         lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
         (*readings((), GAP), some_gains(name)),
@@ -220,7 +223,7 @@ def test_a_law_takes_its_type_from_its_arrays(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_either_surface_is_the_other_s_mirror_image(name):
+def test_compensator_is_mirror_symmetric_between_surfaces(name):
     signals, _ = readings((), GAP)
     mirrored = Signals(
         -signals.force_measured,
@@ -229,15 +232,16 @@ def test_either_surface_is_the_other_s_mirror_image(name):
         -GAP - signals.position_measured,
         signals.age,
     )
-    found, expected = on_the_rig(name, mirrored), -on_the_rig(name, signals)
+    result, expected = on_the_rig(name, mirrored), -on_the_rig(name, signals)
     assert np.min(expected) < 0 < np.max(expected)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_runs_begin_anew(name):
-    """Where none begins nothing changes; the next contact knows nothing but what was identified; after a
-    reset nothing is left."""
+def test_compensator_restart_clears_state(name):
+    """Without a start of a run nothing changes; the next contact keeps only what was identified; a reset
+    clears all.
+    """
     law, gains = COMPENSATORS[name], some_gains(name)
     signals, constants = readings((), GAP)
     first = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[60]), signals)
@@ -269,21 +273,21 @@ def test_runs_begin_anew(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_noise_is_passed_on_as_predicted(name):
-    """White noise on the force readings in a contact held still."""
+def test_compensator_noise_amplification_matches_prediction(name):
+    """Add white noise to the force readings of a contact held still."""
     ticks, gains = 40_000, {gain: entry["value"] for gain, entry in GAINS[name].items()}
     law = COMPENSATORS[name]
     constants = Constants(jnp.asarray(PERIOD), jnp.asarray(math.inf))
     predicted = float(law.noise_amplification(some_gains(name), constants))
     controller = ON_THE_RIG[name](gains, PERIOD, math.inf)
     noise = np.random.default_rng(5).standard_normal(ticks)
-    found = [controller.step(120.0 + one, 1e-3, 0.0, 1e-3) for one in noise.tolist()]
-    assert np.std(found[1000:]) == pytest.approx(predicted * np.std(noise[1000:]), rel=0.02)
+    result = [controller.step(120.0 + value, 1e-3, 0.0, 1e-3) for value in noise.tolist()]
+    assert np.std(result[1000:]) == pytest.approx(predicted * np.std(noise[1000:]), rel=0.02)
 
 
 @pytest.mark.parametrize("depth", [1.0, 1e4, 1e9])
-def test_hardening_over_a_great_depth_is_a_linear_contact(depth):
-    """The peak force came out as 0, by cancellation."""
+def test_peak_force_of_weak_hardening_equals_linear_contact(depth):
+    """Cancellation must not make the peak force 0."""
     linear = load("claw-350kg", ["contact.damping=[0.0]"]).mechanism
     hardening = load(
         "claw-350kg", ['contact.law="hardening"', "contact.damping=[0.0]", f"contact.reference_depth={depth}"]

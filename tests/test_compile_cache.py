@@ -1,4 +1,4 @@
-"""Compiled programs that are kept: sealed, read as written or compiled anew, without a word."""
+"""Cache of compiled programs: checksummed, read unchanged or compiled again, without a message."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ VALUE = 1.75
 
 @pytest.fixture
 def folder(tmp_path):
-    """What jax compiles is kept there, and nowhere else."""
+    """Let jax cache compiled programs in this folder only."""
     before = jax.config.jax_compilation_cache_dir
     assert keep_sealed(tmp_path)
     compilation_cache.reset_cache()
@@ -33,7 +33,7 @@ def kept_sum(x):
 
 
 def compute():
-    """As a new process would."""
+    """Compute the value as a new process would."""
     jax.clear_caches()
     return float(jax.jit(kept_sum)(VALUE))
 
@@ -45,7 +45,7 @@ def flipped(content, bit):
 
 
 def check_flips(folder, number, seed):
-    """Flip a bit, compute, again and again: the same number, and the file is good again."""
+    """Flip a bit and compute, repeatedly: the value is the same, and the file is repaired."""
     expected = compute()
     (file,) = (path for path in folder.iterdir() if "kept_sum" in path.name)
     whole = file.read_bytes()
@@ -56,26 +56,26 @@ def check_flips(folder, number, seed):
         assert read_sealed(file) is not None
 
 
-def test_a_program_is_kept_sealed_and_found_again(folder):
+def test_compile_cache_stores_and_reuses_checksummed_programs(folder):
     expected = compute()
     files = {path: path.stat().st_ino for path in folder.iterdir()}
     assert files and all(path.name.endswith(ENDING) and read_sealed(path) for path in files)
     made = programs_of("kept_sum")
     assert compute() == expected and programs_of("kept_sum") == made + 1
-    # Read, not compiled and written.
+    # The program was read, not compiled and written again.
     assert {path: path.stat().st_ino for path in folder.iterdir()} == files
 
 
-def test_a_flipped_bit_costs_only_the_time_to_compile(folder):
+def test_compile_cache_recompiles_after_a_flipped_bit(folder):
     check_flips(folder, 10, seed=0)
 
 
 @pytest.mark.slow
-def test_a_thousand_flipped_bits_cost_only_the_time_to_compile(folder):
+def test_compile_cache_recompiles_after_each_of_1000_flipped_bits(folder):
     check_flips(folder, 1000, seed=1)
 
 
-def test_no_flipped_bit_of_a_kept_program_is_read(folder):
+def test_compile_cache_rejects_every_flipped_bit(folder):
     compute()
     file = next(folder.iterdir())
     whole = file.read_bytes()
@@ -85,7 +85,7 @@ def test_no_flipped_bit_of_a_kept_program_is_read(folder):
 
 
 @pytest.mark.parametrize("there", ["link", "pipe", "cut"])
-def test_what_is_no_program_is_done_without(folder, tmp_path_factory, there):
+def test_compile_cache_ignores_links_pipes_and_truncated_files(folder, tmp_path_factory, there):
     expected = compute()
     (file,) = (path for path in folder.iterdir() if "kept_sum" in path.name)
     whole = file.read_bytes()
@@ -103,6 +103,6 @@ def test_what_is_no_program_is_done_without(folder, tmp_path_factory, there):
         assert file.is_symlink() and elsewhere.read_bytes() == b"years"
 
 
-def test_without_a_place_for_it_nothing_is_kept(monkeypatch, tmp_path):
+def test_compile_cache_is_disabled_without_jax_interface(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "jax._src.compilation_cache_interface", None)
     assert not keep_sealed(tmp_path)

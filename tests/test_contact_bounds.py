@@ -1,4 +1,4 @@
-"""Verdicts count the real contact's peak force and duration beside the ideal one's, not the error alone."""
+"""Verdicts also bound the peak force and duration of the real contact relative to the ideal contact."""
 
 import json
 import math
@@ -18,7 +18,7 @@ FREQUENCY = "rig.simulator.natural_frequency"
 
 
 @pytest.mark.parametrize("array", [float, np.array])
-def test_bounds_are_twice_the_force_and_half_to_twice_the_duration(array):
+def test_contact_bounds_are_twice_the_force_and_half_to_twice_the_duration(array):
     assert not too_hard(array(2.0), array(1.0)) and too_hard(array(2.001), array(1.0))
     for duration, off in ((0.497, True), (0.499, False), (2.001, False), (2.003, True)):
         assert duration_off(array(duration), array(1.0), PERIOD) == off
@@ -27,22 +27,22 @@ def test_bounds_are_twice_the_force_and_half_to_twice_the_duration(array):
     assert not unlike_ideal(array(1.0), array(1.0), array(1.0), array(1.0), PERIOD)
 
 
-def test_what_is_not_known_is_no_finding():
+def test_contact_bounds_ignore_unknown_values():
     assert not too_hard(math.nan, 1.0) and not too_hard(1.0, math.nan)
     assert not duration_off(math.nan, 1.0, PERIOD) and not duration_off(1.0, math.nan, PERIOD)
     # Bodies that stick to each other never separate.
     assert not duration_off(0.1, math.inf, PERIOD)
 
 
-def test_short_contacts_are_counted_in_whole_periods():
-    # One tick of an ideal contact of 2.4 periods, or five of them, is how sampling shows it.
+def test_duration_bound_of_short_contact_allows_whole_periods():
+    # Sampling shows an ideal contact of 2.4 periods as one to five ticks.
     assert not duration_off(1 * PERIOD, 2.4 * PERIOD, PERIOD)
     assert not duration_off(6 * PERIOD, 2.4 * PERIOD, PERIOD)
     assert duration_off(7 * PERIOD, 2.4 * PERIOD, PERIOD)
 
 
-def test_run_without_delay_is_the_ideal_contact():
-    # Ideal simulator, no delay: what is left is of the order of (omega T)^2 and of one control period.
+def test_undelayed_run_equals_ideal_contact():
+    # With an ideal simulator and no delay, the rest is of the order of (omega T)^2 and of one control period.
     rig = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "contact.damping": [0.0]}
     mechanism = jaxhil.load("claw-350kg", {**rig, "uncertainty": None})
     (contact,) = jaxhil.simulate(mechanism).contacts
@@ -56,11 +56,13 @@ def test_run_without_delay_is_the_ideal_contact():
 
 @pytest.fixture(scope="module")
 def slow_simulator():
-    """Run behind a motion simulator of 0.2 Hz: e is right, the contact is 15 times too hard and too long."""
+    """Simulate behind a motion simulator of 0.2 Hz: the error is right, the contact 15 times too hard and too
+    long.
+    """
     return jaxhil.simulate(jaxhil.load("claw-350kg", {FREQUENCY: 0.2}), LAW)
 
 
-def test_right_restitution_of_a_wrong_contact_is_bad(slow_simulator):
+def test_verdict_is_bad_for_correct_restitution_with_wrong_force(slow_simulator):
     (contact,) = slow_simulator.contacts
     assert contact.status == "ok" and abs(contact.error) < 0.01
     assert contact.peak_force_ratio > 10 and contact.duration_ratio > 10
@@ -69,16 +71,16 @@ def test_right_restitution_of_a_wrong_contact_is_bad(slow_simulator):
     assert long.startswith("contact 1: real contact of ") and long.endswith("allowed 0.5 to 2 times")
 
 
-def test_bad_run_names_status_or_error_first(slow_simulator):
+def test_verdict_reasons_name_status_or_error_first(slow_simulator):
     plain = jaxhil.simulate("claw-350kg")
     (diverges,) = plain.reasons()
     assert diverges.startswith("the largest error is +") and "divergence" in diverges
     assert plain.reasons(limit=10.0) == []
-    # What is beyond the limit is said beside what is unlike the ideal contact.
+    # The error beyond the limit is reported together with the deviations from the ideal contact.
     assert len(slow_simulator.reasons(limit=1e-6)) == 3
 
 
-def test_verify_counts_the_real_contact_of_the_closed_loop(slow_simulator):
+def test_verify_checks_real_contact_of_closed_loop(slow_simulator):
     gains, mechanism = slow_simulator.gains, slow_simulator.mechanism
     report = verify(check_document(build_document(LAW, gains, mechanism, "0" * 64, {}, {}, 0, {})), 1)
     (contact,) = report.closed_loop
@@ -92,19 +94,19 @@ def test_verify_counts_the_real_contact_of_the_closed_loop(slow_simulator):
 
 
 @pytest.mark.parametrize("frequency", [0.2, 30.0])
-def test_simulate_command_counts_peak_force_and_duration(jaxhil, frequency):
+def test_simulate_command_checks_peak_force_and_duration(jaxhil, frequency):
     asked = ("simulate", "claw-350kg", "--compensator", LAW, "--set", f"{FREQUENCY}={frequency}")
-    found = jaxhil(*asked, "--json")
-    document = json.loads(found.out)
+    json_run = jaxhil(*asked, "--json")
+    document = json.loads(json_run.out)
     (contact,) = document["contacts"]
     wrong = contact["peak_force_ratio"] > 2 or not 0.5 < contact["duration_ratio"] < 2
     assert wrong == (frequency < 1), contact
     assert contact["peak_force_ratio"] == contact["peak_force"] / contact["reference_peak_force"]
     assert document["bounds"]["peak_force_ratio"] == 2.0
     bad = wrong or abs(contact["error"]) > 0.01 or contact["status"] != "ok"
-    assert document["verdict"] == ("bad" if bad else "good") and found.code == bad
+    assert document["verdict"] == ("bad" if bad else "good") and json_run.code == bad
     assert bool(document["reasons"]) == bad
-    said = jaxhil(*asked)
-    assert said.code == bad and ("Bad: contact 1: real " in said.out) == wrong
+    text_run = jaxhil(*asked)
+    assert text_run.code == bad and ("Bad: contact 1: real " in text_run.out) == wrong
     if not bad:
-        assert "every peak force at most 2 times and every duration 0.5 to 2 times" in said.out
+        assert "every peak force at most 2 times and every duration 0.5 to 2 times" in text_run.out

@@ -1,8 +1,8 @@
-"""Noise does not move the mean restitution: no threshold of a contact's end depends on it.
+"""Noise does not change the mean restitution: no threshold of a contact's end depends on it.
 
-A contact is over when its command has died out, which a noisy command is given 0.1 s for. The mean over many
+A contact is over when its command has died out; a noisy command is given 0.1 s for this. The mean over many
 seeds is compared with the contact without noise: in the simulation, around the exported controller in Python,
-and around the one in C on a rig that has a plant of its own and a rule of its own for the end.
+and around the one in C on a rig with its own plant and its own rule for the end.
 """
 
 import math
@@ -42,12 +42,12 @@ from tuning.watchdog.calibration import calibrate
 
 BIAS = 0.002  # of the mean restitution, beside three standard errors
 LOUDEST = 5.0  # amplification of noise by the loudest gains
-TICKS = 4000  # of noise a run, as in noisy_plant.c
+TICKS = 4000  # ticks of noise per run, as in noisy_plant.c
 PLANT = Path(__file__).with_name("noisy_plant.c")
 
 
 def heavy(**sensor: float) -> Mechanism:
-    """420 and 6500 kg on a soft, damped mechanism: after a contact its command falls slowly to 0."""
+    """Return 420 and 6500 kg on a soft, damped mechanism, whose command decays slowly after a contact."""
     raw = mechanism(
         {"stiffness": [18e3], "damping": [320.0]},
         {"model": "second_order", "natural_frequency": 9.0, "damping_ratio": 0.7, "delay": 0.002},
@@ -63,7 +63,7 @@ def heavy(**sensor: float) -> Mechanism:
 
 # Gains with which the command is far from 0 when the force ends.
 SLOW_END = {"phase_lead": 0.0034, "response_error": 1.35}
-# What `jaxhil tune` finds: an error of 0.004 rms with noise, below 0.001 without.
+# Gains found by `jaxhil tune`: an error of 0.004 rms with noise, below 0.001 without.
 TUNED = {
     "phase_lead": 3.385e-5,
     "response_error": 1.21745,
@@ -94,7 +94,7 @@ def loud_gains(parsed: Mechanism, name: str) -> dict[str, float]:
 
 
 def restitutions(parsed: Mechanism, name: str, gains: dict[str, float], seeds: int, run=run_rollout):
-    """Restitution (contacts, seeds) of the contacts, NaN where one did not end."""
+    """Return the restitution (contacts, seeds), NaN for a contact that did not end."""
     lanes = np.arange(seeds)
     key = np.stack([np.full(seeds, 20), lanes]).astype(np.uint32)
     scenario = spread(parsed, seeds)._replace(key=key)
@@ -105,14 +105,14 @@ def restitutions(parsed: Mechanism, name: str, gains: dict[str, float], seeds: i
 
 
 def with_noise(parsed: Mechanism, std: float) -> Mechanism:
-    """The mechanism with other noise of the force sensor [N]."""
+    """Return the mechanism with this force sensor noise [N]."""
     raw = to_builtins(parsed)
     raw["rig"]["force_sensor"]["noise_std"] = std
     return validated(raw)
 
 
 def peak_force(parsed: Mechanism) -> float:
-    """Largest force [N] of the first contact without delays."""
+    """Return the largest force [N] of the first contact without delays."""
     return float(jaxhil.simulate(parsed, "none").contacts[0].reference_peak_force)
 
 
@@ -136,22 +136,22 @@ def check_means(parsed: Mechanism, name: str, shares: tuple[float, ...], seeds: 
         assert abs(np.mean(later - over)) <= BIAS + 3 * np.std(later - over) / math.sqrt(seeds), (name, share)
 
 
-def test_mean_restitution_does_not_depend_on_the_noise():
+def test_mean_restitution_does_not_depend_on_noise():
     check_means(jaxhil.load("suite-noisy"), "response_error", (0.003, 0.03, 0.1), 1000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPENSATORS)
 @pytest.mark.parametrize("built_in", builtin_names())
-def test_mean_restitution_of_every_mechanism_and_compensator(built_in, name):
+def test_mean_restitution_does_not_depend_on_noise_for_any_mechanism(built_in, name):
     parsed = jaxhil.load(built_in)
     if hasattr(parsed, "contact"):
         check_means(parsed, name, (0.003, 0.03, 0.1), 1000)
 
 
 @pytest.mark.parametrize("name", ["phase_lead", "response_error", "smith_predictor"])
-def test_nothing_of_the_impulse_is_left_when_a_contact_is_over(name):
-    """Without noise, the speed of the numerical model ten times as long after the contact."""
+def test_contact_end_is_declared_after_the_whole_impulse(name):
+    """Without noise, continue ten times as long after the contact: the model's velocity stays the same."""
     parsed = heavy()
     gains = nominal_gains(parsed, name)
     over, later = continued(parsed, name, gains, 10.0)
@@ -178,24 +178,24 @@ def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: flo
     return result.restitution, abs(model.velocity) / velocity
 
 
-def test_exported_controller_in_python_has_the_mean_of_the_simulation():
+def test_exported_python_controller_has_mean_restitution_of_simulation():
     parsed, seeds = heavy(noise_std=1.0), 200
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
-    found = [closed_loop(parsed, "response_error", gains, seed)[0][0].restitution for seed in range(40)]
-    standard_error = math.hypot(np.std(simulated) / math.sqrt(seeds), np.std(found) / math.sqrt(len(found)))
-    assert abs(np.mean(found) - np.mean(simulated)) < 1e-3 + 3 * standard_error
-    assert np.std(found) == pytest.approx(np.std(simulated), rel=0.5)
+    result = [closed_loop(parsed, "response_error", gains, seed)[0][0].restitution for seed in range(40)]
+    standard_error = math.hypot(np.std(simulated) / math.sqrt(seeds), np.std(result) / math.sqrt(len(result)))
+    assert abs(np.mean(result) - np.mean(simulated)) < 1e-3 + 3 * standard_error
+    assert np.std(result) == pytest.approx(np.std(simulated), rel=0.5)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
-def test_exported_controller_in_c_has_the_restitution_of_the_simulation(tmp_path):
-    """Run by run under the same noise; in the mean, 60 ticks later, that of the contact without noise."""
+def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
+    """Compare each run under the same noise, and the mean, 60 ticks later, with the contact without noise."""
     parsed, seeds = heavy(noise_std=1.0), 16
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
     runs = run_in_c(tmp_path, parsed, exported(parsed, gains), seeds)
-    # Where the C rig sees the force end a tick earlier or later, one command more or less is in.
+    # If the C rig detects the end of force a tick earlier or later, one command more or less is included.
     assert np.median(np.abs(runs[:, 0] - simulated)) < 1e-6
     np.testing.assert_allclose(runs[:, 0], simulated, atol=1e-3)
     longer = run_in_c(tmp_path, parsed, exported(parsed, gains), 400, 60)[:, 0]
@@ -205,20 +205,20 @@ def test_exported_controller_in_c_has_the_restitution_of_the_simulation(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
-def test_exported_watchdog_alarms_as_rarely_as_stated(tmp_path):
-    """On a rig that waits 60 ticks longer than the simulation."""
+def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
+    """Run a rig that waits 60 ticks longer than the simulation."""
     parsed = heavy(noise_std=1.0)
     document = exported(parsed, nominal_gains(parsed, "response_error", **TUNED))
-    found = calibrate(check_document(document), scenarios=1024, limit=0.02)
-    document["limits"] = limits_section(found.limits)
+    result = calibrate(check_document(document), scenarios=1024, limit=0.02)
+    document["limits"] = limits_section(result.limits)
     runs = run_in_c(tmp_path, parsed, sign(document), 1000, 60)
     alarms = int(np.count_nonzero(runs[:, 2]))
-    stated = found.rates["false_alarms"]
+    stated = result.rates["false_alarms"]
     assert stated["runs"] > 200
     assert binomial_interval(alarms, len(runs), 0.99)[0] <= stated["high"], (alarms, stated)
 
 
-def test_training_gives_noisy_contacts_time_for_their_end():
+def test_tuning_time_limit_includes_wait_for_noisy_contact_end():
     """A contact may last as long as without noise before it counts as failed."""
     noisy, free = (
         build_task(heavy(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit for std in (1.0, 0.0)
@@ -232,12 +232,12 @@ def exported(parsed: Mechanism, gains: dict[str, float]) -> dict[str, Any]:
 
 
 def run_in_c(folder, parsed: Mechanism, document: dict[str, Any], seeds: int, more: int = 0) -> np.ndarray:
-    """Restitution, last tick and faults of every seed's run, `more` ticks waited for at the end."""
+    """Return restitution, last tick and faults of every seed's run; wait `more` ticks at the end."""
     scenario = build_scenarios(parsed)
     rig, contact, sensor = parsed.rig, parsed.contact, parsed.rig.force_sensor
     key = np.stack([np.full(seeds, 20), np.arange(seeds)]).astype(np.uint32)
     counts = np.broadcast_to(2 * np.arange(TICKS)[:, None], (TICKS, seeds)).astype(np.int32)
-    arrays = [jnp.asarray(each) for each in (key, np.zeros(seeds, np.int32), counts)]
+    arrays = [jnp.asarray(values) for values in (key, np.zeros(seeds, np.int32), counts)]
     noise = sensor.noise_std * np.asarray(white_noise(*arrays, np.float64))
     (folder / "noise").write_bytes(np.ascontiguousarray(noise.T).tobytes())
     write_sources(folder, document)

@@ -1,4 +1,4 @@
-"""The contact between samples: lags behind fast motion simulators, derivatives, how many cells there are."""
+"""Contact between samples: lags behind fast motion simulators, derivatives, number of cells."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ PERIOD = 4e-3
 
 
 def fast(simulator, time_constant=2e-3, **contact):
-    """350 kg at 4 ms, command held, behind a fast motion simulator."""
+    """Return 350 kg at 4 ms with a held command, behind a fast motion simulator."""
     sensor = {"time_constant": time_constant}
     return mechanism(
         {"law": "linear", "stiffness": [124e3], **contact},
@@ -34,11 +34,11 @@ def second_order(frequency):
     return {"model": "second_order", "natural_frequency": frequency, "damping_ratio": 0.8}
 
 
-def test_lagging_sensor_tends_to_the_ideal_simulator():
-    """As the simulator gets faster, the restitution tends to that of the program's own ideal one."""
+def test_lagging_sensor_restitution_converges_to_ideal_simulator():
+    """As the simulator gets faster, the restitution converges to that of the ideal simulator."""
     cases = [fast(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
     parsed = [validated(case) for case in cases]
-    scenarios = join(build_scenarios(one) for one in parsed)
+    scenarios = join(build_scenarios(member) for member in parsed)
     metrics = run_rollout(build_loop(parsed[0], "none", scenarios), {}, scenarios)
     ideal = validated(fast({"model": "ideal"}))
     scenario = join([build_scenarios(ideal)])
@@ -51,8 +51,8 @@ def test_lagging_sensor_tends_to_the_ideal_simulator():
     )
 
 
-def test_derivatives_of_a_lagging_contact_are_its_differences():
-    """Along a change of stiffness and lag together."""
+def test_lagging_contact_derivatives_match_finite_differences():
+    """Change stiffness and lag together."""
     parsed = validated(fast(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
     loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)
     scenario = jax.tree.map(jax.numpy.asarray, join([build_scenarios(parsed)]))
@@ -61,8 +61,8 @@ def test_derivatives_of_a_lagging_contact_are_its_differences():
         contact = scenario.contact._replace(stiffness=scenario.contact.stiffness * (1 + change))
         lag = scenario.force_sensor.time_constant * (1 - change / 2)
         sensor = scenario.force_sensor._replace(time_constant=lag)
-        found = rollout(loop, {}, scenario._replace(contact=contact, force_sensor=sensor))
-        figures = found.restitution, found.peak_force, found.work_in, found.duration
+        result = rollout(loop, {}, scenario._replace(contact=contact, force_sensor=sensor))
+        figures = result.restitution, result.peak_force, result.work_in, result.duration
         return jax.numpy.stack([figure[0, 0] for figure in figures])
 
     point, step = np.array(0.0), 1e-5
@@ -72,7 +72,7 @@ def test_derivatives_of_a_lagging_contact_are_its_differences():
 
 
 def loops_of(raw):
-    """Scenarios at eight phases of a tick, the loop of tuning and sweeps, and the exact one."""
+    """Return scenarios at eight phases of a tick, the loop of tuning and sweeps, and the exact loop."""
     parsed = validated(raw)
     scenarios = spread(parsed, 8, phase=np.arange(8) / 8)
     return scenarios, *(build_loop(parsed, "none", scenarios, exact=exact) for exact in (False, True))
@@ -96,7 +96,7 @@ RIGID = {"law": "piecewise_linear", "stiffness": [[8e4, 1e7, 7e4]], "depths": [1
         ({"law": "preloaded", "preload": 3.0, "friction": 2.0}, 20.0, 1e-4, True),
     ],
 )
-def test_slow_mechanisms_are_read_off_their_samples(contact, frequency, lag, cells):
+def test_slow_mechanisms_use_samples_without_cells(contact, frequency, lag, cells):
     sensor = {"time_constant": lag}
     raw = mechanism(contact, second_order(frequency), period=1e-3, force_sensor=sensor)
     _, sampled, exact = loops_of(raw)
@@ -124,8 +124,8 @@ RUBBING = {"law": "preloaded", "stiffness": [8e5], "preload": 3.0, "friction": 2
         ),
     ],
 )
-def test_samples_of_a_slow_mechanism_say_the_same(contact, frequency, lag, hold):
-    """To the bounds that the guide states, near the fastest numbers that it states."""
+def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, frequency, lag, hold):
+    """Use the error bounds that the guide states, near the fastest values that it allows."""
     sensor = {"time_constant": lag}
     raw = mechanism(contact, second_order(frequency), period=1e-3, command_hold=hold, force_sensor=sensor)
     scenarios, *loops = loops_of(raw)
@@ -134,13 +134,13 @@ def test_samples_of_a_slow_mechanism_say_the_same(contact, frequency, lag, hold)
     bound = 1e-5 if lag else 1e-12
     np.testing.assert_allclose(sampled.restitution[0], exact.restitution[0], rtol=0, atol=bound)
     np.testing.assert_allclose(sampled.peak_force[0], exact.peak_force[0], rtol=2e-3)
-    # Either end lies between two samples, and a damper lets go between steps of a held command.
+    # Either end lies between two samples, and a damper releases between steps of a held command.
     np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=4e-3)
 
 
 @pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, FASTEST_POLE])
 @pytest.mark.parametrize("lag", [0.0, 1e-9, 0.01, 0.3, 5.0])
-def test_cells_are_a_radian_and_a_time_constant_long_at_most(fastest, lag):
+def test_cells_are_at_most_one_radian_and_one_time_constant_long(fastest, lag):
     counts = count_cells(fastest, np.array([lag]))
     window = min(1.0, 40 * lag) if counts.plain else 1.0
     if counts.plain:
@@ -150,7 +150,7 @@ def test_cells_are_a_radian_and_a_time_constant_long_at_most(fastest, lag):
     assert counts.degree == (1 if fastest == 0 else 8 if fastest <= 0.12 else 16)
 
 
-def test_joined_counts_serve_each_of_them():
+def test_joined_cell_counts_cover_every_member():
     whole, windowed, plain = CellCounts(0, 16, 16), CellCounts(2, 64, 8), CellCounts(4, 0, 8)
     assert join_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
     assert join_counts([NO_CELLS, plain]) == plain
@@ -159,7 +159,7 @@ def test_joined_counts_serve_each_of_them():
     assert join_counts([windowed, plain]) == CellCounts(4, 64, 8)
 
 
-def test_fastest_pole_of_every_order():
+def test_fastest_pole_is_found_for_every_order():
     rng = np.random.default_rng(1)
     for order in range(1, 7):
         roots = -rng.uniform(1.0, 300.0, order)
@@ -169,7 +169,7 @@ def test_fastest_pole_of_every_order():
     np.testing.assert_allclose(fastest_pole(pair), 50.0, rtol=1e-12)
 
 
-def test_loops_with_cells_and_without_differ_by_them_alone():
+def test_exact_loop_differs_from_sampled_loop_only_in_cells():
     parsed = validated(mechanism({}, second_order(12.0), period=1e-3))
     scenarios = join([build_scenarios(parsed)])
     plain = build_loop(parsed, "none", scenarios)

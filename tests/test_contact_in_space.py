@@ -1,6 +1,6 @@
-"""Contact in space, six degrees of freedom: closed forms of impacts, and what does not depend on axes.
+"""Six-axis contact: closed forms of impacts, and independence of the choice of axes.
 
-One program a friction law, two candidates a lane; the lanes are the cases.
+Each friction law is one program with two candidates a lane; the lanes are the cases.
 """
 
 import jax
@@ -33,7 +33,7 @@ EYE, Z = np.eye(3), np.array([0.0, 0.0, 1.0])
 
 
 def case(**changes):
-    """A lane; lengths in m, speeds in m/s. The contact lasts half a period of sqrt(mass/k)."""
+    """Return a lane; lengths in m, speeds in m/s. The contact lasts half a period of sqrt(mass/k)."""
     values = {
         "masses": (1800.0, 420.0),
         "inertias": (np.diag([1400.0, 1100.0, 800.0]), np.diag([150.0, 180.0, 110.0])),
@@ -91,18 +91,18 @@ HERE = LANES.index("elsewhere")
 
 
 def gathered(key, index=None):
-    """Of every lane one value, lanes last."""
+    """Return one value of every lane, lanes last."""
     every = [CASES[name][key] if index is None else CASES[name][key][index] for name in LANES]
     return np.moveaxis(np.array(every, float), 0, -1)
 
 
 def both(key):
-    """Of both candidates, (components, candidates, lanes)."""
+    """Return a value of both candidates, (components, candidates, lanes)."""
     return vector(jnp.asarray(np.moveaxis(gathered(key), 0, 1)))
 
 
 def world():
-    """Start of every lane: the target at rest at the origin; the last lane's world is turned and boosted."""
+    """Return the start of every lane: the target rests at the origin; the last lane is turned and boosted."""
     zero = np.zeros((3, len(LANES)))
     target_offset, chaser_offset = gathered("interfaces", 0), gathered("interfaces", 1)
     position = target_offset + gathered("pose") - chaser_offset
@@ -111,8 +111,8 @@ def world():
     turns = np.tile([[1.0], [0.0], [0.0], [0.0]], len(LANES))
     x, y, z, w = TURNED.as_quat()
     turns[:, HERE] = w, x, y, z
-    for place, speed in zip(places, speeds, strict=True):
-        place[:, HERE] = TURNED.apply(place[:, HERE]) + MOVED
+    for start, speed in zip(places, speeds, strict=True):
+        start[:, HERE] = TURNED.apply(start[:, HERE]) + MOVED
         speed[:, HERE] = TURNED.apply(speed[:, HERE]) + BOOST
     attitude = Quaternion(jnp.asarray(turns[0]), vector(jnp.asarray(turns[1:])))
     return places, speeds, attitude, (zero, gathered("angular"))
@@ -180,7 +180,7 @@ def simulate(pair, states, contact, step):
 
 
 def prepared(law="regularised"):
-    """Bodies, states, contact and step of every lane."""
+    """Return bodies, states, contact and step of every lane."""
     keys = ("masses", "inertias", "interfaces")
     arguments = [[gathered(key, index) for index in range(2)] for key in keys]
     places, speeds, attitude, angular = world()
@@ -201,31 +201,31 @@ def run(request):
     return seen, dict(zip(LANES, mass, strict=True)), dict(zip(LANES, np.asarray(step), strict=True))
 
 
-def test_central_impact_is_that_of_one_axis(run):
+def test_six_axis_central_impact_equals_one_axis_impact(run):
     seen, mass, _ = run
-    found, given = seen["central"], CASES["central"]
+    result, parameters = seen["central"], CASES["central"]
     np.testing.assert_allclose(mass["central"], 1800 * 420 / 2220, rtol=1e-12)
-    restitution = found["twist"][-1, 2] / 0.02
-    # Of Hunt and Crossley's law: a (1 + e) = log((1 + a)/(1 - a e)), a = (3/2) chi v.
-    a = 1.5 * given["damping"] * 0.02
+    restitution = result["twist"][-1, 2] / 0.02
+    # Hunt and Crossley: a (1 + e) = log((1 + a)/(1 - a e)), a = (3/2) chi v.
+    a = 1.5 * parameters["damping"] * 0.02
     np.testing.assert_allclose(a * (1 + restitution), np.log((1 + a) / (1 - a * restitution)), rtol=1e-9)
-    assert found["force"][-1, 2] == 0 and 0.5 < restitution < 0.95
+    assert result["force"][-1, 2] == 0 and 0.5 < restitution < 0.95
 
 
-def test_off_centre_the_effective_mass_rebounds(run):
-    """To first order in the rotation: the impulse is 2 m_n v_n, and no energy is lost."""
+def test_six_axis_off_centre_impulse_follows_effective_mass(run):
+    """To first order in the rotation, the impulse is 2 m_n v_n, and no energy is lost."""
     seen, mass, step = run
-    found = seen["off_centre"]
-    impulse = np.sum(found["force"][:, 2]) * step["off_centre"]
-    assert mass["off_centre"] < 0.8 * mass["central"] and found["force"][-1, 2] == 0
+    result = seen["off_centre"]
+    impulse = np.sum(result["force"][:, 2]) * step["off_centre"]
+    assert mass["off_centre"] < 0.8 * mass["central"] and result["force"][-1, 2] == 0
     np.testing.assert_allclose(impulse, 2 * mass["off_centre"] * 0.002, rtol=1e-4)
-    np.testing.assert_allclose(found["energy"][-1], found["energy"][0], rtol=2e-6)
+    np.testing.assert_allclose(result["energy"][-1], result["energy"][0], rtol=2e-6)
     arm = np.array([0.5, -0.3, 0.0])
-    after = found["twist"][-1, 2] + np.cross(found["angular"][-1], arm)[2]
+    after = result["twist"][-1, 2] + np.cross(result["angular"][-1], arm)[2]
     np.testing.assert_allclose(after, 0.002, rtol=1e-3)
 
 
-def test_a_pure_couple_swings_the_reduced_inertia(run):
+def test_six_axis_couple_oscillates_with_reduced_inertia(run):
     seen, _, step = run
     inertia = 1100.0 * 180 / (1100 + 180)
     frequency = np.sqrt(2 * 1e6 * 0.6**2 / inertia)
@@ -236,60 +236,59 @@ def test_a_pure_couple_swings_the_reduced_inertia(run):
     assert frequency * time[-1] > 3.2 and np.max(np.abs(seen["couple"]["force"])) < 1e-3
 
 
-def test_a_ball_slides_or_rolls_off_a_plane(run, request):
-    """Coulomb: v_t - mu (1 + e) v_n while it slides; 5/7 v_t where it ends up rolling (Walton)."""
+def test_six_axis_ball_slides_or_rolls_as_in_closed_form(run, request):
+    """Coulomb: v_t - mu (1 + e) v_n while the ball slides; 5/7 v_t if it ends up rolling (Walton)."""
     seen, *_ = run
     bristle = request.node.callspec.params["run"] == "bristle"
     sliding, rolling = seen["sliding"]["twist"][-1], seen["rolling"]["twist"][-1]
     np.testing.assert_allclose(sliding[2], 0.1, rtol=1e-6)
     np.testing.assert_allclose(sliding[0], 0.5 - 0.2 * 2 * 0.1, rtol=1e-4)
-    # The lever is shorter by the depth, of at most v_n sqrt(m/k): 10/49 v_t of its share in the radius.
+    # The penetration, at most v_n sqrt(m/k), shortens the lever: 10/49 v_t times its share of the radius.
     shorter = 10 / 49 * 0.3 * 1e-3 / 0.1
-    # Its spin, about y, is that of rolling; a slip that is left keeps 2/7 of itself.
+    # Its spin about y is that of rolling; remaining slip contributes 2/7 of itself.
     slip = rolling[0] - 0.1 * seen["rolling"]["angular"][-1, 1]
     assert 0.5 * shorter < 5 / 7 * 0.3 + 2 / 7 * slip - rolling[0] < shorter
     if not bristle:
         assert 0 < abs(slip) < 1e-3
         return
-    # A bristle that bends while F grows lacks F'/(k_t t) of the force: (mu F)^2/(2 m k_t t) of the speed,
-    # of slips t of 0.5 to 0.43 m/s until the deepest point.
+    # A bristle that bends while F grows reduces the force by F'/(k_t t), the speed by (mu F)^2/(2 m k_t t),
+    # for slips t of 0.5 to 0.43 m/s until the deepest point.
     lacks = (0.2 * 10) ** 2 / (2 * 1e6 * np.array([0.5, 0.43]))
     assert lacks[0] < sliding[0] - 0.46 < lacks[1]
-    # Damped, it holds until mu F no longer makes the slip follow the lever, at w v_n: m_t = 2/7 m has
-    # the rest.
+    # A damped bristle holds until mu F can no longer make the slip follow the lever, at w v_n;
+    # m_t = 2/7 m keeps the remaining slip.
     changing = 5 / 7 * 0.3 / 0.1 * 0.1
     assert abs(slip) < 2 / 7 * changing**2 / (1e4 * 0.1)
 
 
-def test_momentum_and_energy_balance(run):
+def test_six_axis_contact_conserves_momentum_and_balances_energy(run):
     seen, _, step = run
     for name in ("off_centre", "oblique", "elsewhere"):
-        found = seen[name]
-        exchanged = np.sum(np.abs(found["force"])) * step[name]
-        assert np.max(np.abs(found["linear"] - found["linear"][0])) < 1e-11 * max(exchanged, 1000)
-        # Runge and Kutta's method does not conserve the angular one to rounding.
-        assert np.max(np.abs(found["momentum"] - found["momentum"][0])) < 1e-8 * max(exchanged, 1000)
+        result = seen[name]
+        exchanged = np.sum(np.abs(result["force"])) * step[name]
+        assert np.max(np.abs(result["linear"] - result["linear"][0])) < 1e-11 * max(exchanged, 1000)
+        # The Runge-Kutta method does not conserve angular momentum to rounding.
+        assert np.max(np.abs(result["momentum"] - result["momentum"][0])) < 1e-8 * max(exchanged, 1000)
         assert exchanged > 0.5
-        power = found["power"]
+        power = result["power"]
         work = np.sum(power[1:] + power[:-1]) / 2 * step[name]
-        gained = found["energy"][-1] - found["energy"][0]
+        gained = result["energy"][-1] - result["energy"][0]
         np.testing.assert_allclose(work, gained, atol=2e-4 * np.max(np.abs(np.cumsum(power))) * step[name])
-    # Friction and damping take energy.
+    # Friction and damping dissipate energy.
     assert seen["oblique"]["energy"][-1] < 0.95 * seen["oblique"]["energy"][0]
 
 
-def test_the_world_may_be_turned_and_boosted(run):
+def test_six_axis_contact_is_invariant_to_rotation_and_boost(run):
     seen, *_ = run
     for key in ("twist", "angular", "position", "force", "moment"):
-        one, other = seen["oblique"][key], seen["elsewhere"][key]
-        np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(one)))
+        plain, turned = seen["oblique"][key], seen["elsewhere"][key]
+        np.testing.assert_allclose(plain, turned, atol=1e-9 * np.max(np.abs(plain)))
     touched = np.max(np.abs(seen["oblique"]["force"][:, :2]))
     assert touched > 10
 
 
-def test_a_law_with_a_memory_beside_another_kind():
-    """Elastoplastic on the central lane: e = 1/sqrt(r), under the bristle that stays at rest, and a tether
-    beside it that stays slack."""
+def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
+    """On the central lane, e = 1/sqrt(r) under a bristle at rest, beside a tether that stays slack."""
     pair, states, contact, step = prepared()
     parameters = contact.parameters._replace(unloading_ratio=jnp.full((2, len(LANES)), 4.0))
     same = [jnp.full((2, len(LANES)), value) for value in (0.2, 1e6, 10.0)]
@@ -306,8 +305,8 @@ def test_a_law_with_a_memory_beside_another_kind():
     assert abs(final.chaser.velocity.x[lane]) < 1e-15
 
 
-def test_derivatives_are_those_of_differences():
-    """Of the final twist by stiffness, damping and friction; and none is NaN where there is no slip."""
+def test_six_axis_contact_derivatives_match_finite_differences():
+    """Differentiate the final twist by stiffness, damping and friction; without slip it is not NaN."""
     pair, states, contact, step = prepared()
 
     @jax.jit
@@ -317,16 +316,16 @@ def test_derivatives_are_those_of_differences():
             stiffness=stiffness * contact.parameters.stiffness, damping=damping * contact.parameters.damping
         )
         law = Regularised(friction * contact.friction.coefficient, contact.friction.slip)
-        given = ContactGroup(contact.candidates, contact.law, changed, law)
-        flight, _ = follow(Space(pair, (given,), ()), states, step, STEPS, step)
+        changed_group = ContactGroup(contact.candidates, contact.law, changed, law)
+        flight, _ = follow(Space(pair, (changed_group,), ()), states, step, STEPS, step)
         final = flight.states
         return jnp.stack([*jax.tree.leaves(final.chaser.velocity), *jax.tree.leaves(final.chaser.spin)])
 
-    one = jnp.ones(3)
-    slopes = np.asarray(jax.jit(jax.jacfwd(speeds))(one))
+    ones = jnp.ones(3)
+    slopes = np.asarray(jax.jit(jax.jacfwd(speeds))(ones))
     assert np.isfinite(slopes).all()
     smooth = [LANES.index(name) for name in ("central", "oblique", "elsewhere")]
     for index in range(3):
         change = jnp.zeros(3).at[index].set(1e-4)
-        expected = np.asarray(speeds(one + change) - speeds(one - change)) / 2e-4
+        expected = np.asarray(speeds(ones + change) - speeds(ones - change)) / 2e-4
         np.testing.assert_allclose(slopes[..., smooth, index], expected[..., smooth], rtol=1e-4, atol=1e-6)

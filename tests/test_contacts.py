@@ -1,4 +1,4 @@
-"""Contact laws whose reference is integrated or which remember: closed forms, SciPy, works, derivatives."""
+"""Contact laws with an integrated reference or with memory: closed forms, SciPy, work, derivatives."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ PERIODS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
 
 
 def contact(**values):
-    """Parameters of every lane, by name; what is not named is nominal."""
+    """Return the parameters of every lane by name, nominal unless specified."""
     numbers = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5}
     numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     lanes = {
@@ -33,50 +33,52 @@ def reference(name, **values):
     return run(contact(**values), mass, velocity)
 
 
-def test_undamped_hardening():
-    """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 where the force is largest; a soft spring stays linear."""
+def test_hardening_undamped_matches_closed_form():
+    """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force; a soft spring stays linear."""
     unit = np.array([1e-5, 5e-5, 1e-4, 2e-4, 1e-3, 10.0])
-    found = reference("hardening", reference_depth=unit)
+    result = reference("hardening", reference_depth=unit)
     square = np.sqrt(1 + 2 * MASS * VELOCITY**2 / (STIFFNESS * unit**2)) - 1
-    np.testing.assert_allclose(found.restitution, 1.0, rtol=0, atol=1e-8)
-    # Of a spring that hardly stiffens the square is rounded.
+    np.testing.assert_allclose(result.restitution, 1.0, rtol=0, atol=1e-8)
+    # For a spring that hardly stiffens, the square is dominated by rounding.
     peak = STIFFNESS * unit * np.sqrt(square) * (1 + square)
-    np.testing.assert_allclose(found.peak_force[:-1], peak[:-1], rtol=1e-8)
-    np.testing.assert_allclose(found.peak_force[-1], VELOCITY * np.sqrt(STIFFNESS * MASS), rtol=1e-8)
-    np.testing.assert_allclose(found.duration[-1], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-8)
+    np.testing.assert_allclose(result.peak_force[:-1], peak[:-1], rtol=1e-8)
+    np.testing.assert_allclose(result.peak_force[-1], VELOCITY * np.sqrt(STIFFNESS * MASS), rtol=1e-8)
+    np.testing.assert_allclose(result.duration[-1], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", [name for name in LAWS if name != "piecewise_linear"])
-def test_one_surface_is_the_nearer_of_two_that_are_infinitely_apart(name):
+def test_single_surface_equals_two_surfaces_infinitely_apart(name):
     law, parameters = LAWS[name], contact(damping=260.0, preload=3.0, friction=2.0)
     position, velocity = np.array([-1e-3, -0.0, 1e-5, 2e-4, 2e-4, np.nan]), np.array([1, -1, 2, -3, 0, 1e-3])
     state = law.init(jnp.asarray(position))
-    one, two = (
+    single, double = (
         two_sided(law, parameters, state, jnp.asarray(position), jnp.asarray(velocity), clearance)
         for clearance in (None, jnp.full(LANES, jnp.inf))
     )
-    jax.tree.map(np.testing.assert_array_equal, one, two)
-    assert one[0][2] > 0
+    jax.tree.map(np.testing.assert_array_equal, single, double)
+    assert single[0][2] > 0
 
 
 @pytest.mark.parametrize("exponent, damping", [(1.5, 0.0), (2.2, 0.0), (1.0, 600.0)])
-def test_depth_damped_that_is_hunt_and_crossley_s(exponent, damping):
+def test_depth_damped_equals_hunt_crossley_for_equal_parameters(exponent, damping):
     stiffness = 1e7 if exponent > 1 else STIFFNESS
-    found = reference("depth_damped", stiffness=stiffness, exponent=exponent, damping=damping)
+    result = reference("depth_damped", stiffness=stiffness, exponent=exponent, damping=damping)
     parameters = MASS, stiffness, exponent, damping / (1.5 * 2e-4 * stiffness), VELOCITY
-    expected = jax.jit(hunt_crossley, compiler_options=QUICK)(*(np.full(LANES, one) for one in parameters))
-    for got, wanted in zip(found, expected, strict=True):
+    expected = jax.jit(hunt_crossley, compiler_options=QUICK)(
+        *(np.full(LANES, value) for value in parameters)
+    )
+    for got, wanted in zip(result, expected, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
-def test_elastoplastic_in_closed_form_and_integrated():
+def test_elastoplastic_closed_form_matches_integration():
     ratio = np.array([1.0, 1.1, 1.5, 2.0, 4.0, 25.0])
-    found = reference("elastoplastic", unloading_ratio=ratio)
-    np.testing.assert_allclose(found.restitution, ratio**-0.5, rtol=1e-15)
+    result = reference("elastoplastic", unloading_ratio=ratio)
+    np.testing.assert_allclose(result.restitution, ratio**-0.5, rtol=1e-15)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS["elastoplastic"]
     run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
-    for got, wanted in zip(run(contact(unloading_ratio=ratio), mass, velocity)[:3], found, strict=True):
+    for got, wanted in zip(run(contact(unloading_ratio=ratio), mass, velocity)[:3], result, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
@@ -84,29 +86,31 @@ def test_elastoplastic_in_closed_form_and_integrated():
 PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0], [200.0, 1.0]]).T
 
 
-def test_preloaded_in_closed_form_and_integrated():
-    """The energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d in, k d^2/2 + (F_0 - F_r) d out, but for what is left in
-    the spring where friction holds the mechanism back."""
+def test_preloaded_closed_form_matches_integration():
+    """Energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d in, k d^2/2 + (F_0 - F_r) d out.
+
+    If friction holds the mechanism back, some energy is left in the spring.
+    """
     preload, friction = PRELOADS
-    found = reference("preloaded", preload=preload, friction=friction)
+    result = reference("preloaded", preload=preload, friction=friction)
     energy, inward = MASS * VELOCITY**2 / 2, preload + friction
     deepest = 2 * energy / (inward + np.sqrt(inward**2 + 2 * STIFFNESS * energy))
     left = np.maximum(friction - preload, 0) ** 2 / (2 * STIFFNESS)
     out = STIFFNESS * deepest**2 / 2 + (preload - friction) * deepest + left
-    np.testing.assert_allclose(found.restitution, np.sqrt(out / energy), rtol=1e-12)
-    np.testing.assert_allclose(found.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
-    np.testing.assert_allclose(found.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
+    np.testing.assert_allclose(result.restitution, np.sqrt(out / energy), rtol=1e-12)
+    np.testing.assert_allclose(result.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
+    np.testing.assert_allclose(result.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
     law = LAWS["preloaded"]
     run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
     integrated = run(contact(preload=preload, friction=friction), mass, velocity)[:3]
-    for got, wanted in zip(integrated, found, strict=True):
+    for got, wanted in zip(integrated, result, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-7)
     stuck = reference("preloaded", preload=0.0, friction=1e4)
     assert np.all(stuck.restitution == 0) and np.all(np.isinf(stuck.duration))
 
 
-def test_elastoplastic_loads_unloads_reloads_and_forgets():
+def test_elastoplastic_loads_unloads_reloads_and_resets():
     law, parameters = LAWS["elastoplastic"], contact(unloading_ratio=2.0)
     state, forces = law.init(jnp.zeros(LANES)), []
     depths = np.array([1.0, 3.0, 2.0, 1.6, 1.0, 2.5, 4.0, 3.0, 0.0, 1.0])
@@ -116,8 +120,8 @@ def test_elastoplastic_loads_unloads_reloads_and_forgets():
     np.testing.assert_allclose(forces, [1, 3, 1, 0.2, 0, 2, 4, 2, 0, 1], rtol=0, atol=1e-12)
 
 
-def test_derivatives_of_integrated_references():
-    """By stiffness, damping and velocity, against differences."""
+def test_integrated_reference_derivatives_match_finite_differences():
+    """Differentiate by stiffness, damping and velocity."""
     values = {"damping": np.linspace(50.0, 900.0, LANES)}
 
     for name in ("hardening", "depth_damped"):
@@ -129,11 +133,11 @@ def test_derivatives_of_integrated_references():
                 stiffness=parameters.stiffness * (1 + scales[0]), damping=parameters.damping * (1 + scales[1])
             )
             velocity = jnp.full((LANES,), VELOCITY) * (1 + scales[2])
-            found = law.reference(changed, jnp.full((LANES,), MASS), velocity)
-            return jnp.stack(found)
+            result = law.reference(changed, jnp.full((LANES,), MASS), velocity)
+            return jnp.stack(result)
 
         both = jax.jit(
-            lambda *given, function=function: (function(*given), jax.jacfwd(function)(*given)),
+            lambda *arguments, function=function: (function(*arguments), jax.jacfwd(function)(*arguments)),
             compiler_options=QUICK,
         )
         value, derivative = both(np.zeros(3), parameters)
@@ -166,8 +170,8 @@ def limit(name):
     if name == "elastoplastic":
         return 1.6**-0.5, VELOCITY * np.sqrt(stiffness * MASS)
     if name == "preloaded":
-        found = reference(name, stiffness=stiffness, preload=5.0, friction=2.0)
-        return float(found.restitution[0]), float(found.peak_force[0])
+        result = reference(name, stiffness=stiffness, preload=5.0, friction=2.0)
+        return float(result.restitution[0]), float(result.peak_force[0])
     laws = {
         "hardening": lambda d, r: stiffness * d * (1 + (d / unit) ** 2) + damping * r,
         "depth_damped": lambda d, r: stiffness * max(d, 0.0) ** 1.5 + damping * r * d / unit,
@@ -176,23 +180,25 @@ def limit(name):
 
 
 @pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2, 1], strict=True)))
-def test_contact_without_delay_converges_to_the_reference(name, order):
-    """Restitution to that of SciPy's or the closed form, which is also the law's own; W_out/W_in to e^2."""
+def test_undelayed_contact_converges_to_reference(name, order):
+    """Compare the restitution with SciPy or the closed form, and with the law's own reference; W_out/W_in
+    with e^2.
+    """
     expected, expected_peak = limit(name)
     parsed = validated(mechanism(LAWS_ALONE[name], IDEAL, 0.0))
     period, phase = grid(PERIODS, (np.arange(16) + 0.5) / 16)
-    found = first_contact(
+    result = first_contact(
         parsed, spread(parsed, len(period), control_period=period, phase=phase), energies=True
     )
-    restitution = found["restitution"].reshape(len(PERIODS), -1)
+    restitution = result["restitution"].reshape(len(PERIODS), -1)
     error = np.sqrt(np.mean((restitution - expected) ** 2, axis=1))
     assert np.polyfit(np.log(PERIODS), np.log(error), 1)[0] > order - 0.3
     assert error[-1] < (1e-4 if order == 2 else 1e-3)
-    assert found["peak_force"][-16:] == pytest.approx(expected_peak, rel=1e-3)
-    balance = found["work_out"] / found["work_in"] - found["restitution"] ** 2
+    assert result["peak_force"][-16:] == pytest.approx(expected_peak, rel=1e-3)
+    balance = result["work_out"] / result["work_in"] - result["restitution"] ** 2
     assert np.abs(balance[-16:]).max() < (5e-4 if order == 2 else 2e-3)
     values = {key: np.squeeze(value) for key, value in LAWS_ALONE[name].items() if key != "law"}
-    own = reference(parsed.contact.law, **values)
-    np.testing.assert_allclose(own.restitution, expected, rtol=0, atol=2e-8)
-    # SciPy's is the largest of samples a millisecond apart.
-    np.testing.assert_allclose(own.peak_force, expected_peak, rtol=2e-4)
+    reference_of_law = reference(parsed.contact.law, **values)
+    np.testing.assert_allclose(reference_of_law.restitution, expected, rtol=0, atol=2e-8)
+    # SciPy's peak is the largest of samples a millisecond apart.
+    np.testing.assert_allclose(reference_of_law.peak_force, expected_peak, rtol=2e-4)

@@ -1,4 +1,4 @@
-"""Uncertain numbers that vary together: closed forms of the Gaussian copula, and what a draw depends on."""
+"""Correlated uncertain parameters: closed forms of the Gaussian copula, and independence of draws."""
 
 import numpy as np
 import pytest
@@ -29,12 +29,12 @@ def mechanism(keys=KEYS, matrix=MATRIX, changes=(), unset=()):
     return from_builtins(raw | table, "some file", changes, unset)
 
 
-def normals(values, one):
-    """The standard normal numbers behind each key's draws, by the distribution functions of SciPy."""
-    m = np.ravel(one.contact.stiffness)[0]
+def normals(values, parsed):
+    """Return the standard normal values behind each key's draws, by SciPy's distribution functions."""
+    m = np.ravel(parsed.contact.stiffness)[0]
     return {
-        DELAY: (values[DELAY] - one.rig.force_sensor.delay) / 0.0001,
-        DAMPING: (values[DAMPING][:, 0] - one.contact.damping[0]) / 12.0,
+        DELAY: (values[DELAY] - parsed.rig.force_sensor.delay) / 0.0001,
+        DAMPING: (values[DAMPING][:, 0] - parsed.contact.damping[0]) / 12.0,
         SPEED: special.ndtri(stats.uniform(0.004, 0.002).cdf(values[SPEED])),
         FREQUENCY: special.ndtri(stats.uniform(27.0, 6.0).cdf(values[FREQUENCY])),
         STIFFNESS: special.ndtri(stats.loguniform(0.5 * m, 2 * m).cdf(values[STIFFNESS][:, 0])),
@@ -42,29 +42,31 @@ def normals(values, one):
 
 
 @pytest.mark.parametrize("draws", [draw, quasi_random])
-def test_each_keeps_its_distribution_and_what_is_behind_is_correlated(draws):
-    one, number = mechanism(), 4096
-    behind = normals(draws(one, number, 5), one)
+def test_correlated_draws_keep_marginals_and_have_stated_correlation(draws):
+    parsed, number = mechanism(), 4096
+    behind = normals(draws(parsed, number, 5), parsed)
     for key, values in behind.items():
         assert stats.kstest(values, stats.norm.cdf).pvalue > 0.01, key
-    found, wanted = np.corrcoef([behind[key] for key in [*KEYS, SPEED]]), np.eye(5)
+    correlations, wanted = np.corrcoef([behind[key] for key in [*KEYS, SPEED]]), np.eye(5)
     wanted[2, :2] = wanted[:2, 2] = 0.98, 0.1
     # Fisher 1915: atanh of a correlation is normal, with variance 1 / (n - 3).
-    beyond = np.abs(np.arctanh(np.tril(found, -1)) - np.arctanh(np.tril(wanted, -1))) * np.sqrt(number - 3)
+    beyond = np.abs(np.arctanh(np.tril(correlations, -1)) - np.arctanh(np.tril(wanted, -1))) * np.sqrt(
+        number - 3
+    )
     assert np.max(beyond) < 3.5
     assert draws is draw or np.max(beyond) < 1
 
 
-def test_a_well_known_combination_of_two_badly_known_numbers_stays_well_known():
-    one = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [0.98, 1.0]])
-    values = draw(one, 4096, 0)
+def test_correlated_draws_keep_small_variance_of_a_combination():
+    parsed = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [0.98, 1.0]])
+    values = draw(parsed, 4096, 0)
     stiffness = 120e3
     combined = values[DAMPING][:, 0] - stiffness * values[DELAY]
     variance = 12.0**2 + (stiffness * 1e-4) ** 2 - 2 * 0.98 * 12.0 * stiffness * 1e-4
     assert abs(np.std(combined) / np.sqrt(variance) - 1) < 4 / np.sqrt(2 * 4096)
 
 
-def test_what_is_correlated_with_nothing_before_it_keeps_its_bits():
+def test_draws_without_earlier_correlation_keep_their_bits():
     apart, together = draw(mechanism(keys=None), 500, 3), draw(mechanism(), 500, 3)
     assert together.keys() == apart.keys()
     for key in set(apart) - {DAMPING}:
@@ -75,20 +77,20 @@ def test_what_is_correlated_with_nothing_before_it_keeps_its_bits():
         np.testing.assert_array_equal(identity[key], apart[key])
 
 
-def test_a_draw_depends_on_its_own_group_and_number_alone():
-    one = mechanism()
-    whole = draw(one, 1500, 7)
+def test_correlated_draw_depends_only_on_its_group_and_index():
+    parsed = mechanism()
+    whole = draw(parsed, 1500, 7)
     changed = mechanism(
         keys=KEYS[:3], matrix=MATRIX[:3], changes=[f"uncertainty.'{FREQUENCY}'.factor=[0.5, 2]"]
     )
-    for key, values in draw(one, 3, 7, first=1022).items():
+    for key, values in draw(parsed, 3, 7, first=1022).items():
         np.testing.assert_array_equal(values, whole[key][1022:1025])
         if key != FREQUENCY:
             np.testing.assert_array_equal(draw(changed, 3, 7, first=1022)[key], values)
-    assert all(len(values) == 0 for values in draw(one, 0, 7).values())
+    assert all(len(values) == 0 for values in draw(parsed, 0, 7).values())
 
 
-def test_quantiles_and_extremes_are_those_of_each_key_alone():
+def test_correlation_leaves_quantiles_and_extremes_unchanged():
     opposed = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [-0.98, 1.0]])
     apart = mechanism(keys=None)
     for key, ends in extremes(opposed).items():
@@ -102,22 +104,22 @@ def test_quantiles_and_extremes_are_those_of_each_key_alone():
         special.ndtri(points[:, 0]) * (np.sqrt(1 - 0.98**2) - 0.98),
         atol=1e-9,
     )
-    # Even where a coordinate is at an end of the box.
+    # This holds even for a coordinate at an end of the box.
     box = at_points(mechanism(), np.array([np.zeros(points.shape[1]), np.full(points.shape[1], 1 - 2**-53)]))
     assert all(np.all(np.isfinite(values)) for values in box.values())
 
 
-def test_of_lists_whose_entries_are_drawn_apart_the_matrix_holds_for_each():
+def test_correlation_matrix_holds_for_each_independent_list_entry():
     apart = {key: UNCERTAIN[key] | {"independent": True} for key in (STIFFNESS, DAMPING)}
     raw = to_builtins(load("varying", {"contact.damping": [260.0, 390.0]}).mechanism)
     table = {"keys": [STIFFNESS, DELAY, DAMPING], "matrix": [[1.0], [0.6, 1.0], [0.5, -0.3, 1.0]]}
-    one = from_builtins(raw | {"uncertainty": UNCERTAIN | apart, "correlation": table}, "some file")
+    parsed = from_builtins(raw | {"uncertainty": UNCERTAIN | apart, "correlation": table}, "some file")
     number = 4096
-    values = draw(one, number, 0)
-    stiffness, damping = np.log(values[STIFFNESS] / one.contact.stiffness), values[DAMPING]
+    values = draw(parsed, number, 0)
+    stiffness, damping = np.log(values[STIFFNESS] / parsed.contact.stiffness), values[DAMPING]
     spread = special.ndtri(stats.uniform(np.log(0.5), np.log(4.0)).cdf(stiffness))
-    found = np.corrcoef([*spread.T, values[DELAY], *damping.T])
-    # What two contacts have in common is the delay.
+    correlations = np.corrcoef([*spread.T, values[DELAY], *damping.T])
+    # Two contacts are correlated through the delay.
     other = 0.6 * -0.3
     wanted = np.array(
         [
@@ -129,19 +131,21 @@ def test_of_lists_whose_entries_are_drawn_apart_the_matrix_holds_for_each():
             [other, 0.5, other, -0.3, 0.09, 1.0],
         ]
     )
-    beyond = np.abs(np.arctanh(np.tril(found, -1)) - np.arctanh(np.tril(wanted, -1))) * np.sqrt(number - 3)
+    beyond = np.abs(np.arctanh(np.tril(correlations, -1)) - np.arctanh(np.tril(wanted, -1))) * np.sqrt(
+        number - 3
+    )
     assert np.max(beyond) < 3.5
     np.testing.assert_array_equal(values[DELAY], draw(mechanism(keys=None), number, 0)[DELAY])
-    for column in ((damping - one.contact.damping) / 12.0).T:
+    for column in ((damping - parsed.contact.damping) / 12.0).T:
         assert stats.kstest(column, stats.norm.cdf).pvalue > 0.01
 
 
-def test_groups():
+def test_correlated_groups_are_connected_components():
     assert correlated_groups(mechanism()) == [(DELAY, STIFFNESS, DAMPING), (FREQUENCY,)]
     assert correlated_groups(mechanism(keys=None)) == []
 
 
-def test_what_is_taken_out_is_taken_out_of_the_table():
+def test_unset_removes_keys_from_correlation_table():
     left = mechanism(unset=[f"uncertainty.'{STIFFNESS}'"])
     assert left.correlation.keys == [DELAY, DAMPING, FREQUENCY]
     assert left.correlation.matrix == [[1.0], [0.98, 1.0], [0.0, 0.0, 1.0]]
@@ -186,7 +190,7 @@ def test_what_is_taken_out_is_taken_out_of_the_table():
         ([DELAY, SPEED, DAMPING], [[1], [0.9, 1], [0.9, -0.9, 1]], "allowed a positive definite matrix"),
     ],
 )
-def test_unusable_tables(keys, matrix, reason):
+def test_unusable_correlation_table_is_rejected(keys, matrix, reason):
     raw = FULL | {"uncertainty": UNCERTAIN, "correlation": {"keys": keys, "matrix": matrix}}
     with pytest.raises(InputError) as caught:
         from_builtins(raw, "some file")

@@ -1,4 +1,4 @@
-"""What a dead zone does to a contact by its closed form, and that the observer undoes it."""
+"""Effect of a dead zone on a contact in closed form, and its removal by the observer."""
 
 import math
 
@@ -16,33 +16,35 @@ GAINS = nominal_gains(MECHANISM, "dead_zone_observer")
 
 @pytest.fixture(scope="module")
 def led():
-    """Phase lead alone: next to no dead zone, and the dead zone."""
+    """Run phase lead alone, with almost no dead zone and with the dead zone."""
     scenario = spread(MECHANISM, 2, force_sensor__dead_zone=np.array([1e-9, DEAD_ZONE]))
     return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
 
 
-def test_a_dead_zone_moves_the_surface(led):
-    """By dz/k: the hardware is pressed by dz more, and leaves as fast as without."""
+def test_dead_zone_shifts_the_surface(led):
+    """The surface moves by dz/k: the hardware is pressed by dz more and rebounds at the same speed."""
     assert led["restitution"][1] == pytest.approx(led["restitution"][0], abs=1e-4)
     assert led["peak_force"][1] - led["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)
 
 
-def test_the_observer_removes_the_dead_zone_s_error(led):
-    """Right stiffness: to a hundredth. Wrong by 30 %: a tenth is left. As late as F: divergence."""
+def test_dead_zone_observer_removes_dead_zone_error(led):
+    """With the right stiffness 1 % of the error is left, with 30 % wrong a tenth; aligned to F itself it
+    diverges.
+    """
     lag = 1 / (2 * math.pi * GAINS["observer_bandwidth"])
     assert GAINS["identification_delay"] == pytest.approx(DELAY - lag, rel=1e-12)
     stiffness = STIFFNESS * np.array([1.0, 0.7, 1.3, 0.0, 1.0])
     alignment = np.array([*[GAINS["identification_delay"]] * 4, DELAY])
     changed = {"observer_stiffness": stiffness, "identification_delay": alignment}
-    found = first_contact(MECHANISM, spread(MECHANISM, 5), "dead_zone_observer", GAINS | changed)
-    left = (found["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
-    moved = found["restitution"] - led["restitution"][0]
+    result = first_contact(MECHANISM, spread(MECHANISM, 5), "dead_zone_observer", GAINS | changed)
+    left = (result["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
+    moved = result["restitution"] - led["restitution"][0]
     print(left, moved)
     assert abs(left[0]) < 0.01 and np.all(np.abs(left[1:3]) < 0.1) and left[3] == pytest.approx(1, rel=1e-3)
     assert np.all(np.abs(moved[:4]) < 1e-3) and moved[4] > 0.05
 
 
-def test_without_a_dead_zone_it_is_phase_lead_exactly():
+def test_dead_zone_observer_equals_phase_lead_without_dead_zone():
     rng = np.random.default_rng(0)
     without = nominal_gains(load("rig-300kg").mechanism, "dead_zone_observer")
     gains = GAINS | {"observer_limit": without["observer_limit"]}
@@ -54,8 +56,8 @@ def test_without_a_dead_zone_it_is_phase_lead_exactly():
 
 
 @pytest.mark.parametrize("overrides", [[], ["rig.force_sensor.delay=0.002"], ["rig.control_period=0.004"]])
-def test_the_observer_is_near_1_below_15_hz(overrides):
-    """|Q| >= 0.9 of the filter at its control period, and its lag no longer than the force's delay."""
+def test_dead_zone_observer_filter_has_gain_near_1_below_15_hz(overrides):
+    """|Q| >= 0.9 for the filter at its control period, and its lag is no longer than the force's delay."""
     parsed = load("rig-300kg", [*overrides, "rig.force_sensor.dead_zone=12"]).mechanism
     gains, period = nominal_gains(parsed, "dead_zone_observer"), parsed.rig.control_period
     still = gains | {"phase_lead": 0.0, "identification_delay": 0.0, "observer_stiffness": 1.0}

@@ -1,4 +1,4 @@
-"""The derivative-free search finds known minima: curved valleys, kinks, many basins, and bounds."""
+"""Derivative-free search on known minima: curved valleys, kinks, many basins, bounds."""
 
 import numpy as np
 import pytest
@@ -7,20 +7,20 @@ from tuning.optimisation.derivative_free import mirror, polish, search_globally
 
 
 def rosenbrock(points):
-    """0 at a share of 0.75 of each gain's range, at the end of a curved valley."""
+    """Return Rosenbrock's function, 0 at 0.75 of each gain's range, at the end of a curved valley."""
     x = 4 * points - 2
     return np.sum(100 * (x[..., 1:] - x[..., :-1] ** 2) ** 2 + (1 - x[..., :-1]) ** 2, axis=-1)
 
 
 def kinked(points):
-    """0 at 0.3, 0.4, ..: kinks and curvature, one gain weighing a thousand times less than another."""
+    """Return a function with kinks and curvature, 0 at 0.3, 0.4, ...; gain weights differ 1000-fold."""
     gains = points.shape[-1]
     away = points - np.linspace(0.3, 0.7, gains)
     return np.sum(np.geomspace(1, 1e-3, gains) * (np.abs(away) + 10 * away**2), axis=-1)
 
 
 def rippled(points):
-    """0 at 0.6: Rastrigin's function, a bowl with 5^gains basins."""
+    """Return Rastrigin's function, 0 at 0.6: a bowl with 5^gains basins."""
     x = 5 * (points - 0.6)
     return np.sum(x**2 + 10 * (1 - np.cos(2 * np.pi * x)), axis=-1)
 
@@ -28,8 +28,8 @@ def rippled(points):
 @pytest.mark.parametrize("gains", [2, 6, 12])
 def test_polish_follows_a_curved_valley(gains):
     start = np.full(gains, 0.6)
-    found = polish(rosenbrock, start, 1200 * gains, reach=0.05)
-    assert found.loss < 1e-3 * rosenbrock(start)
+    result = polish(rosenbrock, start, 1200 * gains, reach=0.05)
+    assert result.loss < 1e-3 * rosenbrock(start)
     longer = polish(rosenbrock, start, 3000 * gains, reach=0.05)
     np.testing.assert_allclose(longer.point, 0.75, atol=1e-4)
 
@@ -37,11 +37,11 @@ def test_polish_follows_a_curved_valley(gains):
 @pytest.mark.parametrize("gains", [2, 6, 12])
 def test_polish_settles_at_a_kink(gains):
     start = np.full(gains, 0.52)
-    found = polish(kinked, start, 400 * gains, reach=0.05)
-    assert found.loss < 1e-3 * kinked(start)
+    result = polish(kinked, start, 400 * gains, reach=0.05)
+    assert result.loss < 1e-3 * kinked(start)
 
 
-def test_a_known_shape_spares_the_learning():
+def test_polish_converges_faster_with_known_covariance():
     generator = np.random.default_rng(0)
     turned, _ = np.linalg.qr(generator.standard_normal((10, 10)))
     hessian = (turned * np.geomspace(1, 1e6, 10)) @ turned.T
@@ -56,15 +56,15 @@ def test_a_known_shape_spares_the_learning():
     assert shaped.loss < 0.1 * blind.loss
 
 
-def test_polish_is_never_worse_than_its_start():
-    # At the minimum, and so wide a reach that nothing drawn is better.
+def test_polish_result_is_never_worse_than_its_start():
+    # Start at the minimum, with so wide a reach that no draw is better.
     start = np.array([0.3, 0.7])
-    found = polish(kinked, start, 64, reach=0.4)
-    assert found.loss == kinked(start) == 0
-    np.testing.assert_array_equal(found.point, start)
+    result = polish(kinked, start, 64, reach=0.4)
+    assert result.loss == kinked(start) == 0
+    np.testing.assert_array_equal(result.point, start)
 
 
-def test_starts_are_searched_side_by_side_and_do_not_depend_on_each_other():
+def test_polish_starts_are_independent_of_each_other():
     starts = np.random.default_rng(1).random((3, 4))
     together = polish(rosenbrock, starts, 320)
     for start, free, loss in zip(starts, together.point, together.loss, strict=True):
@@ -74,7 +74,7 @@ def test_starts_are_searched_side_by_side_and_do_not_depend_on_each_other():
     assert together.evaluations == 320
 
 
-def test_the_same_seed_finds_the_same_and_calls_are_all_alike():
+def test_polish_is_reproducible_and_calls_have_one_shape():
     shapes = []
 
     def losses(points):
@@ -85,62 +85,62 @@ def test_the_same_seed_finds_the_same_and_calls_are_all_alike():
     first, second = (polish(losses, np.full(3, 0.99), 200, candidates=16, reach=0.3) for _ in range(2))
     np.testing.assert_array_equal(first.point, second.point)
     assert set(shapes) == {(16, 3)}
-    # Whole generations, no more than asked for.
+    # Evaluations come in whole generations, no more than requested.
     assert first.evaluations == 192 and len(shapes) == 2 * 12
 
 
-def test_a_minimum_on_the_bound_is_found():
+def test_polish_finds_minimum_on_the_bound():
     target = np.array([0.0, 0.4, 1.0])
-    found = polish(lambda points: np.sum(np.abs(points - target), axis=-1), np.full(3, 0.5), 1500, reach=0.1)
-    np.testing.assert_allclose(found.point, target, atol=1e-3)
+    result = polish(lambda points: np.sum(np.abs(points - target), axis=-1), np.full(3, 0.5), 1500, reach=0.1)
+    np.testing.assert_allclose(result.point, target, atol=1e-3)
 
 
-def test_what_is_not_a_number_is_the_worst():
+def test_polish_treats_nan_as_the_worst_loss():
     def losses(points):
         return np.where(points[..., 0] > 0.55, np.nan, rosenbrock(points))
 
-    found = polish(losses, np.full(2, 0.5), 1000, reach=0.1)
-    # Up to the wall the valley leads down to (1 - x)^2 at x = 0.2.
-    assert found.loss == pytest.approx(0.64, rel=1e-3)
-    assert found.point[0] <= 0.55
+    result = polish(losses, np.full(2, 0.5), 1000, reach=0.1)
+    # The valley descends to (1 - x)^2 at x = 0.2, where the wall is.
+    assert result.loss == pytest.approx(0.64, rel=1e-3)
+    assert result.point[0] <= 0.55
     nowhere = polish(lambda points: np.full(len(points), np.nan), np.full(2, 0.5), 64)
     np.testing.assert_array_equal(nowhere.point, 0.5)
 
 
 @pytest.mark.parametrize("gains", [2, 5, 10])
-def test_a_global_search_finds_the_best_of_many_basins(gains):
-    found = search_globally(rippled, gains, 10_000 * gains)
-    np.testing.assert_allclose(found.point, 0.6, atol=1e-3)
-    assert found.loss < 1e-3
+def test_global_search_finds_the_best_of_many_basins(gains):
+    result = search_globally(rippled, gains, 10_000 * gains)
+    np.testing.assert_allclose(result.point, 0.6, atol=1e-3)
+    assert result.loss < 1e-3
 
 
-def test_a_global_search_finds_what_a_local_search_misses():
+def test_global_search_finds_minimum_that_local_search_misses():
     def losses(points):
-        """A wide basin at 0.2, a narrow and deeper one at 0.8."""
+        """Return the lower of a wide basin at 0.2 and a narrow and deeper one at 0.8."""
         wide = np.sum((points - 0.2) ** 2, axis=-1)
         narrow = 20 * np.sum((points - 0.8) ** 2, axis=-1) - 0.5
         return np.minimum(wide, narrow)
 
     local = polish(losses, np.full(4, 0.3), 4000)
     assert local.loss == pytest.approx(0, abs=1e-6)
-    found = search_globally(losses, 4, 20_000)
-    assert found.loss == pytest.approx(-0.5, abs=1e-6)
-    assert found.loss == losses(found.point)
+    result = search_globally(losses, 4, 20_000)
+    assert result.loss == pytest.approx(-0.5, abs=1e-6)
+    assert result.loss == losses(result.point)
 
 
-def test_a_global_search_keeps_to_its_budget_and_to_one_shape_of_call():
+def test_global_search_keeps_budget_and_one_call_shape():
     shapes = []
 
     def losses(points):
         shapes.append(points.shape)
         return kinked(points)
 
-    found = search_globally(losses, 3, 3000, candidates=8, basins=4)
+    result = search_globally(losses, 3, 3000, candidates=8, basins=4)
     assert set(shapes) == {(32, 3)}
-    assert found.evaluations == 32 * len(shapes) <= 3000
-    assert found.evaluations > 3000 - 64
-    assert found.loss == kinked(found.point)
+    assert result.evaluations == 32 * len(shapes) <= 3000
+    assert result.evaluations > 3000 - 64
+    assert result.loss == kinked(result.point)
 
 
-def test_mirrored_points_are_inside():
+def test_mirror_maps_points_into_unit_box():
     np.testing.assert_allclose(mirror(np.array([-0.2, 0.3, 1.2, 2.1, -1.4])), [0.2, 0.3, 0.8, 0.1, 0.6])

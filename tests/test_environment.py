@@ -1,4 +1,4 @@
-"""Options of the compiler that need not be there in its next version; cores in turn."""
+"""Compiler options that the next version may lack, and use of half of the cores."""
 
 import os
 
@@ -10,27 +10,27 @@ from jaxhil.simulation import environment
 from jaxhil.simulation.environment import ROLLOUT, known_options, on_half_the_cores
 
 
-def test_options_that_the_compiler_lacks_are_left_out():
+def test_compiler_options_unknown_to_xla_are_omitted():
     unknown = {"xla_cpu_no_such_option": 1}
     assert known_options({**ROLLOUT, **unknown}) == ROLLOUT
     assert known_options(unknown) == {}
-    # It would not compile otherwise.
+    # With the unknown option, compilation fails.
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.jit(lambda x: x + 1, compiler_options=unknown)(np.ones(3))
 
 
-def test_an_option_of_llvm_is_given_to_versions_that_know_it_alone(monkeypatch):
+def test_llvm_option_is_set_only_for_versions_that_know_it(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    for version, given in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
+    for version, expected in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
         monkeypatch.setattr(environment, "version", lambda name, version=version: version)
-        assert (environment.WHOLE in environment.flags("")) == given
+        assert (environment.WHOLE in environment.flags("")) == expected
 
 
 AFFINITY = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system cannot be told")
 
 
 @AFFINITY
-def test_halves_of_the_cores_are_left_again():
+def test_half_the_cores_are_released_after_use():
     usable = os.sched_getaffinity(0)
     halves = []
     for half in (0, 1):
@@ -43,7 +43,7 @@ def test_halves_of_the_cores_are_left_again():
 
 
 @AFFINITY
-def test_where_the_system_forbids_halves_all_cores_are_used(monkeypatch):
+def test_all_cores_are_used_if_affinity_is_forbidden(monkeypatch):
     def forbidden(*_):
         raise PermissionError
 

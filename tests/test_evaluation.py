@@ -1,4 +1,4 @@
-"""Batches on every core: order, padding and tiles change no result, and most calls reuse a program."""
+"""Batches on every core: order, padding and tiles do not change results, and most calls reuse a program."""
 
 import os
 import subprocess
@@ -39,29 +39,31 @@ def take(leaf, lanes):
     return None if leaf is None else np.asarray(leaf)[..., lanes]
 
 
-def test_a_lane_does_not_depend_on_its_batch():
+def test_evaluation_of_a_lane_does_not_depend_on_its_batch():
     loop, gains, scenarios = setting()
     whole = evaluate(loop, gains, scenarios)
-    some = np.array([63, 2, 17])
-    part = evaluate(loop, gains, lanes_of(scenarios, some))
+    lanes = np.array([63, 2, 17])
+    part = evaluate(loop, gains, lanes_of(scenarios, lanes))
     wanted = part.wanted
     for field in ("error", "reference_restitution", "peak_ratio"):
-        ours, theirs = getattr(part, field)[wanted], getattr(whole, field)[..., some][wanted]
+        ours, theirs = getattr(part, field)[wanted], getattr(whole, field)[..., lanes][wanted]
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
-    np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., some])
+    np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., lanes])
 
 
-def test_gains_per_lane_equal_common_gains():
+def test_evaluation_with_gains_per_lane_equals_common_gains():
     loop, gains, scenarios = setting(lanes=20)
     common = evaluate(loop, gains, scenarios)
-    each = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
-    np.testing.assert_allclose(each.error[each.wanted], common.error[each.wanted], rtol=1e-10, atol=1e-12)
+    per_lane = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
+    np.testing.assert_allclose(
+        per_lane.error[per_lane.wanted], common.error[per_lane.wanted], rtol=1e-10, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
     "compensator", [pytest.param("phase_lead", marks=pytest.mark.slow), "response_error"]
 )
-def test_neutral_gains_are_no_compensation(compensator):
+def test_neutral_gains_equal_no_compensation(compensator):
     loop, gains, scenarios = setting(compensator)
     plain, _, _ = setting("none")
     neutral = evaluate(loop, neutral_gains(compensator, gains), scenarios)
@@ -69,7 +71,7 @@ def test_neutral_gains_are_no_compensation(compensator):
     np.testing.assert_allclose(neutral.error[none.wanted], none.error[none.wanted], rtol=1e-10, atol=1e-12)
 
 
-def test_other_mechanism_seed_and_number_reuse_the_program():
+def test_evaluation_reuses_program_for_other_mechanism_seed_and_number():
     loop, gains, scenarios = setting()
     evaluate(loop, gains, scenarios)
     programs = programs_of("run_tiles")
@@ -80,7 +82,7 @@ def test_other_mechanism_seed_and_number_reuse_the_program():
     assert programs_of("run_tiles") == programs > 0
 
 
-def test_every_contact_is_set_beside_its_own_reference():
+def test_evaluation_compares_every_contact_with_its_own_reference():
     loop, gains, scenarios = setting("none")
     outcome = evaluate(loop, gains, scenarios)
     damping_ratio = scenarios.contact.damping / (
@@ -95,7 +97,7 @@ def test_every_contact_is_set_beside_its_own_reference():
 
 
 def tiled(scenarios):
-    """Whole delays and durations expected of the lanes as they are dealt out, (tiles in turn, lanes)."""
+    """Return whole delays and expected durations of the lanes in dealt order, (tiles in turn, lanes)."""
     _, _, dealt = ONE_AXIS.shard(scenarios, {})
 
     def in_turn(leaf):
@@ -108,8 +110,8 @@ def tiled(scenarios):
     )
 
 
-def test_lanes_of_a_tile_look_back_alike_and_take_as_long():
-    """But where one delay's lanes end, and where there would be but a few tiles of each delay."""
+def test_tiles_group_lanes_of_equal_delay_and_similar_duration():
+    """Exceptions: the last tile of each delay, and batches with only a few tiles per delay."""
     delays, durations = tiled(setting("none", lanes=4096)[2])
     assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
     assert np.mean(np.ptp(durations, axis=-1)) < 0.1 * np.ptp(durations)
@@ -119,16 +121,16 @@ def test_lanes_of_a_tile_look_back_alike_and_take_as_long():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["varying", "rattling"])
-def test_to_the_bit_a_lane_does_not_depend_on_its_batch(name):
-    # A lagging sensor skips work where no lane of a tile touches.
+def test_evaluation_of_a_lane_keeps_its_bits_in_any_batch(name):
+    # With a lagging sensor, a tile without contact skips work.
     overrides = ("rig.force_sensor.time_constant=0.002",)
     loop, gains, scenarios = setting(lanes=600, name=name, overrides=overrides)
     whole = evaluate(loop, gains, scenarios)
-    for some in (np.arange(0, 600, 2), np.array([3]), np.random.default_rng(0).permutation(600)):
-        part = evaluate(loop, gains, lanes_of(scenarios, some), at_least=600)
+    for lanes in (np.arange(0, 600, 2), np.array([3]), np.random.default_rng(0).permutation(600)):
+        part = evaluate(loop, gains, lanes_of(scenarios, lanes), at_least=600)
         for ours, theirs in zip(part.metrics, whole.metrics, strict=True):
-            np.testing.assert_array_equal(ours, theirs[..., some])
-        np.testing.assert_array_equal(part.error, whole.error[..., some])
+            np.testing.assert_array_equal(ours, theirs[..., lanes])
+        np.testing.assert_array_equal(part.error, whole.error[..., lanes])
 
 
 DIGEST = """
@@ -145,13 +147,13 @@ print(jax.device_count(), hashlib.sha256(content).hexdigest())
 
 
 @pytest.mark.slow
-def test_to_the_bit_a_lane_does_not_depend_on_the_number_of_cores():
-    found = {}
+def test_evaluation_of_a_lane_keeps_its_bits_on_any_number_of_cores():
+    digests = {}
     for cores in 1, 2, 3:
         flags = "" if cores == 1 else f"{DEVICES}={cores}"
-        given = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
+        process_environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, "-c", DIGEST, str(cores)]
-        ran = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
-        devices, found[cores] = ran.stdout.split()
+        ran = subprocess.run(command, env=process_environment, capture_output=True, text=True, check=True)
+        devices, digests[cores] = ran.stdout.split()
         assert int(devices) == max(2, cores)
-    assert len(set(found.values())) == 1
+    assert len(set(digests.values())) == 1

@@ -1,4 +1,4 @@
-"""`jaxhil export` writes a bundle as a whole or not at all; `jaxhil verify` knows a corrupt one."""
+"""`jaxhil export` writes a bundle whole or not at all; `jaxhil verify` detects a corrupt bundle."""
 
 import errno
 import html
@@ -31,7 +31,7 @@ ALWAYS = {
     *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),
     "summary.html",
 }
-# Beside those whose files have something of their own.
+# Compensators whose exported files are like those of the others.
 LIKE_OTHERS = {"dead_zone_observer", "multi_parameter_lead", "passivity", "phase_lead", "smith_hybrid"}
 LIKE_OTHERS |= {"smith_predictor", "virtual_contact"}
 
@@ -60,32 +60,36 @@ def files_of(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
+def test_export_command_writes_signed_bundle_that_verifies(jaxhil, gains, tmp_path):
     folder, private, public = tmp_path / "new" / "bundle", tmp_path / "key.pem", tmp_path / "public.pem"
     pair = Ed25519PrivateKey.generate()
     private.write_bytes(pair.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     public.write_bytes(pair.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
-    # With these gains every run diverges: a watchdog that is on would stop it.
+    # With these gains every run diverges: an active watchdog would stop it.
     blind = ("--set", "restitution_margin=none", "--missed", "1")
     ran = jaxhil("export", gains, "-o", folder, "--format", "csv,ros2", "--sign", private, "--json", *blind)
     assert ran.code == 0, ran
-    said = ran.document
-    assert said["verdict"] == "unknown" and not said["reasons"] and said["stop"] is None
-    assert "runs is good: gains with smaller errors are needed" in said["unknown"][0]
-    assert said["bundle"] == str(folder) and said["formats"] == ["ros2", "csv"]
-    assert said["signed"] is True
+    output = ran.document
+    assert output["verdict"] == "unknown" and not output["reasons"] and output["stop"] is None
+    assert "runs is good: gains with smaller errors are needed" in output["unknown"][0]
+    assert output["bundle"] == str(folder) and output["formats"] == ["ros2", "csv"]
+    assert output["signed"] is True
     assert (
         files_of(folder)
-        == {*said["files"]}
+        == {*output["files"]}
         == ALWAYS | {"ros2.yaml", "gains.csv", "udp_controller.py", "udp_protocol.py", "manifest.sig"}
     )
-    written, given = (load_gain_file(path).document for path in (folder / "gains.json", gains))
-    assert {name for name in written if written[name] != given.get(name)} == {"limits", "figures", "sha256"}
+    written, original = (load_gain_file(path).document for path in (folder / "gains.json", gains))
+    assert {name for name in written if written[name] != original.get(name)} == {
+        "limits",
+        "figures",
+        "sha256",
+    }
     assert os.listdir(tmp_path / "new") == ["bundle"]
     ran = jaxhil("verify", folder, "--scenarios", "4", "--key", public)
     assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
     assert "Signature: by the key given." in ran.out
-    # Once more onto itself, and not signed.
+    # Export again into the same folder, without a signature.
     ran = jaxhil("export", folder, "-o", folder, "--format", "matlab", *blind)
     assert ran.code == 0 and "\nNot known to be good: " in ran.out and "selftest.py" in ran.out
     assert "gains.mat" in files_of(folder) and not {"gains.csv", "manifest.sig"} & files_of(folder)
@@ -97,9 +101,9 @@ def test_a_bundle_is_exported_signed_and_verified(jaxhil, gains, tmp_path):
 
 @pytest.mark.parametrize(
     "compensator",
-    [pytest.param(one, marks=pytest.mark.slow if one in LIKE_OTHERS else ()) for one in COMPENSATORS],
+    [pytest.param(name, marks=pytest.mark.slow if name in LIKE_OTHERS else ()) for name in COMPENSATORS],
 )
-def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_path):
+def test_export_builds_bundle_for_every_compensator(compensator, tmp_path):
     made = build_bundle(document(compensator=compensator), list(WRITERS))
     write_bundle(tmp_path / "bundle", made.files)
     good, output = run_selftest(tmp_path / "bundle", *(["--c"] if shutil.which("cc") else []))
@@ -107,7 +111,7 @@ def test_every_compensator_that_can_be_tuned_can_be_exported(compensator, tmp_pa
     assert run_selftest_alone(check_bundle(tmp_path / "bundle"), "bundle")[1] == []
 
 
-def test_equal_gains_and_seed_make_equal_bundles():
+def test_export_is_reproducible_for_equal_gains_and_seed():
     made = document()
     first, second = (build_bundle(made, ["matlab", "csv"], {"force_limit": 900.0}).files for _ in range(2))
     assert first == second
@@ -115,7 +119,7 @@ def test_equal_gains_and_seed_make_equal_bundles():
     assert {name for name in first if first[name] != other[name]} == {"vectors.csv", "manifest.json"}
 
 
-def test_limits_are_signed_and_rates_kept():
+def test_with_limits_signs_limits_and_stores_alarm_rates():
     made = document()
     changed = with_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
     assert changed["limits"] == {
@@ -126,7 +130,7 @@ def test_limits_are_signed_and_rates_kept():
     assert with_limits(made, None) == made
 
 
-def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path, monkeypatch):
+def test_export_rejects_controller_that_differs_from_simulation(jaxhil, gains, tmp_path, monkeypatch):
     class Wrong(ON_THE_RIG["phase_lead"]):
         def step(self, force_measured, position_desired, velocity_desired, position_measured):
             return (1 + 1e-8) * self._lead.step(force_measured)
@@ -138,16 +142,16 @@ def test_what_differs_from_the_simulation_is_not_written(jaxhil, gains, tmp_path
     assert not (tmp_path / "bundle").exists()
 
 
-def test_limits_that_stop_the_nominal_run_are_reported(jaxhil, gains, tmp_path):
+def test_export_reports_limits_that_stop_the_nominal_run(jaxhil, gains, tmp_path):
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--set", "force_limit=1")
-    said = " ".join(ran.out.split())
-    assert ran.code == 1 and "Bad: the nominal run is stopped at " in said
-    assert "by the guard's check force_limit: " in said and ", force_limit 1 N; " in said
-    assert "--set force_limit=" in said and " lets this run pass" in said
+    output = " ".join(ran.out.split())
+    assert ran.code == 1 and "Bad: the nominal run is stopped at " in output
+    assert "by the guard's check force_limit: " in output and ", force_limit 1 N; " in output
+    assert "--set force_limit=" in output and " lets this run pass" in output
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 
-def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path):
+def test_export_takes_limits_from_named_sweep(jaxhil, gains, tmp_path):
     store, folder = tmp_path / "store", tmp_path / "bundle"
     assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0
     replaced = ["--set", "command_lowest=-0.05", "--set", "force_range=none"]
@@ -160,14 +164,14 @@ def test_limits_come_from_the_sweep_that_is_named(jaxhil, gains, tmp_path):
     alarms, runs = (rates["false_alarms"][name] for name in ("alarms", "runs"))
     assert 0 < runs < 40 and f"false alarms {alarms} of {runs} good runs (95 %: " in ran.out
     assert rates["verdict"] == "unknown" and "\nUnknown: " in ran.out
-    assert {one["name"] for one in rates["fault_runs"]} >= {"force_delay", "simulator_delay"}
+    assert {fault["name"] for fault in rates["fault_runs"]} >= {"force_delay", "simulator_delay"}
     limits = written["limits"]
     assert limits["command_lowest"] == {"value": -0.05, "unit": "m"}
     assert limits["force_range"] == {"value": None, "unit": "N"}
     assert limits["force_limit"]["value"] > 0 and "force_limit" in ran.out
 
 
-def test_a_watchdog_that_stops_good_runs_is_bad(jaxhil, gains, tmp_path):
+def test_export_verdict_is_bad_if_watchdog_stops_good_runs(jaxhil, gains, tmp_path):
     store, folder = tmp_path / "store", tmp_path / "bundle"
     assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0
     command = ["export", gains, "-o", folder, "--sweep", store, "--format", "csv"]
@@ -195,12 +199,12 @@ def test_a_watchdog_that_stops_good_runs_is_bad(jaxhil, gains, tmp_path):
         (["--set", "command_lowest"], ["--set", "'command_lowest'", "none"]),
     ],
 )
-def test_wrong_arguments_are_refused(jaxhil, gains, tmp_path, arguments, words):
+def test_export_command_rejects_wrong_arguments(jaxhil, gains, tmp_path, arguments, words):
     refused(jaxhil("export", gains, "-o", tmp_path / "bundle", *arguments), *words)
     assert not (tmp_path / "bundle").exists()
 
 
-def test_gains_that_cannot_be_read_are_refused(jaxhil, tmp_path):
+def test_export_command_rejects_unreadable_gains(jaxhil, tmp_path):
     refused(
         jaxhil("export", tmp_path / "none.json", "-o", tmp_path / "bundle"), "none.json", "cannot be read"
     )
@@ -208,7 +212,7 @@ def test_gains_that_cannot_be_read_are_refused(jaxhil, tmp_path):
     refused(jaxhil("export", tmp_path, "-o", tmp_path / "bundle"), "gains.json: schema: found nothing")
 
 
-def test_a_folder_that_is_no_bundle_is_left_alone(jaxhil, gains, tmp_path):
+def test_export_leaves_foreign_folder_untouched(jaxhil, gains, tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
@@ -219,16 +223,16 @@ def test_a_folder_that_is_no_bundle_is_left_alone(jaxhil, gains, tmp_path):
     (folder / "thesis.txt").unlink()
     check_target(folder)
     for name in ("manifest.json", "README.md"):
-        own = (folder / name).read_bytes()
-        (folder / name).write_bytes(own + b"my notes")
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content + b"my notes")
         refused(jaxhil("export", gains, "-o", folder), name, "allowed a new or empty folder, or a bundle as")
-        assert (folder / name).read_bytes() == own + b"my notes"
-        (folder / name).write_bytes(own)
+        assert (folder / name).read_bytes() == content + b"my notes"
+        (folder / name).write_bytes(content)
     check_target(folder)
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before):
+def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch, before):
     folder = tmp_path / "bundle"
     if before:
         placed(folder)
@@ -249,7 +253,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before)
     move, moved = os.replace, []
 
     def interrupted(source, target):
-        """What was there has been put aside."""
+        """Interrupt after the old bundle has been moved aside."""
         moved.append(target)
         if len(moved) == 1 + before:
             raise KeyboardInterrupt
@@ -269,14 +273,14 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch, before)
     assert {*os.listdir(tmp_path)} - {"file"} == {"bundle"} and (folder / "manifest.json").exists()
 
 
-def test_a_bundle_is_replaced_in_one_step(tmp_path, monkeypatch):
+def test_write_bundle_replaces_bundle_in_one_step(tmp_path, monkeypatch):
     folder = placed(tmp_path / "bundle")
     monkeypatch.setattr(os, "replace", lambda *_: pytest.fail("a moment without a bundle"))
     write_bundle(folder, {**small_files(), "new": b"new"})
     assert (folder / "new").read_bytes() == b"new" and os.listdir(tmp_path) == ["bundle"]
 
 
-def test_a_link_to_a_folder_stays_one(tmp_path):
+def test_write_bundle_follows_link_to_folder(tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
     write_bundle(tmp_path / "link", small_files())
@@ -286,7 +290,7 @@ def test_a_link_to_a_folder_stays_one(tmp_path):
 @pytest.mark.parametrize(
     "name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "selftest.py", "gains.mat"]
 )
-def test_a_corrupt_bundle_is_not_verified_and_not_run(jaxhil, tmp_path, name):
+def test_verify_command_rejects_corrupt_bundle_without_running_it(jaxhil, tmp_path, name):
     folder = placed(tmp_path / "bundle")
     content = (folder / name).read_bytes()
     trap = f"\nopen({str(tmp_path / 'ran')!r}, 'w')\n".encode()
@@ -298,7 +302,7 @@ def test_a_corrupt_bundle_is_not_verified_and_not_run(jaxhil, tmp_path, name):
     assert not (tmp_path / "ran").exists()
 
 
-def test_what_is_left_of_a_bundle_is_corrupt_and_nothing_is_unusable(jaxhil, tmp_path):
+def test_verify_command_rejects_incomplete_and_missing_bundle(jaxhil, tmp_path):
     folder = placed(tmp_path / "bundle")
     (folder / "manifest.json").unlink()
     ran = jaxhil("verify", folder)
@@ -309,7 +313,7 @@ def test_what_is_left_of_a_bundle_is_corrupt_and_nothing_is_unusable(jaxhil, tmp
     refused(jaxhil("verify", "a" * 5000), "cannot be read")
 
 
-def test_a_self_test_that_fails_is_reported(jaxhil, tmp_path):
+def test_verify_command_reports_failed_self_test(jaxhil, tmp_path):
     files = small_files()
     lines = files["vectors.csv"].split(b"\n")
     fields = lines[50].split(b",")
@@ -324,7 +328,7 @@ def test_a_self_test_that_fails_is_reported(jaxhil, tmp_path):
     assert ran.document["reasons"][0].startswith("vectors.csv: line 51, run 0: force_command: found")
 
 
-def test_readme_has_the_runtime_s_faults_and_this_bundle_s_files():
+def test_bundle_readme_lists_faults_and_files():
     text = small_files()["README.md"].decode()
     for fault in FAULTS:
         assert f"| `{fault.bit:#x}` | `{fault.name}` | {fault.condition} | {fault.reaction} |" in text
@@ -333,8 +337,8 @@ def test_readme_has_the_runtime_s_faults_and_this_bundle_s_files():
     assert "$" not in text
 
 
-def test_readme_shows_a_mechanism_s_name_as_text():
-    """No HTML, no markup of Markdown: as a reader of either shows it, it is the name."""
+def test_bundle_readme_escapes_mechanism_name():
+    """Readers of HTML and of Markdown see the name itself, without markup."""
     name = "<img src=x onerror=a()> *a* _b_ `c` [d](e) | ~f~ \\ $g$ &amp; #"
     made = document()
     text = readme_text({**made, "mechanism": {**made["mechanism"], "name": name}}, ["gains.json"])
@@ -343,7 +347,7 @@ def test_readme_shows_a_mechanism_s_name_as_text():
     assert html.unescape(re.sub(r"\\(.)", r"\1", heading)) == name
 
 
-def test_a_bundle_of_another_mechanism_is_not_replaced(tmp_path):
+def test_export_rejects_folder_with_bundle_of_another_mechanism(tmp_path):
     folder = placed(tmp_path / "bundle")
     before = (folder / "gains.json").read_bytes()
     check_mechanism(folder, json.loads(before)["mechanism"]["name"])
@@ -354,13 +358,13 @@ def test_a_bundle_of_another_mechanism_is_not_replaced(tmp_path):
         check_mechanism(folder, "another")
 
 
-def test_every_format_has_its_files():
+def test_export_writers_write_the_files_of_their_format():
     made = document()
     for name, names in {
         "ros2": {"ros2.yaml"},
         "matlab": {"gains.mat"},
         "csv": {"gains.csv"},
-        "c99": {f"c99/{one}" for one in C_FILES},
+        "c99": {f"c99/{file}" for file in C_FILES},
     }.items():
         assert {*WRITERS[name](made)} == names
     assert len(WRITERS) == 4

@@ -1,4 +1,4 @@
-"""The generated family of mechanisms: files that load, numbers within their ranges, the same every time."""
+"""The generated family of mechanisms: files that load, values within their ranges, reproducible."""
 
 import math
 import subprocess
@@ -26,37 +26,37 @@ def members():
 
 
 def undelayed(members, damped: bool) -> Any:
-    """`Reference` of the nominal contacts in space, by the package's own, in the order of the members."""
-    found = {name: np.empty(len(members)) for name in Reference._fields}
+    """Return the package's own `Reference` of the nominal undelayed contacts, in the order of the members."""
+    references = {name: np.empty(len(members)) for name in Reference._fields}
     for name in LAWS:
-        own = [i for i, m in enumerate(members) if m.contact.law == name]
-        contacts = [members[i].contact for i in own]
+        indices = [i for i, m in enumerate(members) if m.contact.law == name]
+        contacts = [members[i].contact for i in indices]
         parameters: dict[str, Any] = {
             # Segments and depths come first.
             "stiffness": np.moveaxis(np.array([c.stiffness[0] for c in contacts]), 0, -1),
             "damping": np.array([c.damping[0] if damped else 0.0 for c in contacts]),
             "exponent": np.array([c.exponent for c in contacts]),
             "depths": np.moveaxis(np.array([c.depths for c in contacts]), 0, -1),
-            "tension": np.zeros(len(own), bool),
-            **dict.fromkeys(("reference_depth", "unloading_ratio"), np.ones(len(own))),
-            **dict.fromkeys(("preload", "friction"), np.zeros(len(own))),
+            "tension": np.zeros(len(indices), bool),
+            **dict.fromkeys(("reference_depth", "unloading_ratio"), np.ones(len(indices))),
+            **dict.fromkeys(("preload", "friction"), np.zeros(len(indices))),
         }
-        mass = np.array([members[i].bodies.mass for i in own])
-        velocity = np.array([members[i].approach.velocity for i in own])
+        mass = np.array([members[i].bodies.mass for i in indices])
+        velocity = np.array([members[i].approach.velocity for i in indices])
         reference = jax.jit(CONTACT_LAWS[name].reference, compiler_options=QUICK)
         for field, values in reference(ContactParameters(**parameters), mass, velocity)._asdict().items():
-            found[field][own] = values
-    return SimpleNamespace(**found)
+            references[field][indices] = values
+    return SimpleNamespace(**references)
 
 
-def test_written_files_load_and_are_the_family(tmp_path, members):
+def test_family_files_load_as_the_family(tmp_path, members):
     paths = write(tmp_path)
     assert [load(path).mechanism for path in paths] == members
     assert len({path.name for path in paths}) == len({m.name for m in members}) == NUMBER
     assert all(path.stem == mechanism.name for path, mechanism in zip(paths, members, strict=True))
 
 
-def test_the_same_files_every_time_in_another_process_too(tmp_path):
+def test_family_files_are_reproducible_in_another_process(tmp_path):
     once = write(tmp_path / "once")
     command = [sys.executable, "-m", "tests.family", str(tmp_path / "again")]
     subprocess.run(command, check=True, cwd=Path(__file__).parent.parent, stdout=subprocess.DEVNULL)
@@ -65,12 +65,12 @@ def test_the_same_files_every_time_in_another_process_too(tmp_path):
     assert texts(seed=1) != texts(seed=0)
 
 
-def test_a_shorter_family_is_the_beginning_of_a_longer_one(members):
+def test_family_of_fewer_members_is_a_prefix(members):
     for number in (1, 3, 20):
         assert family(number) == members[:number]
 
 
-def test_numbers_are_within_their_ranges_and_fill_them(members):
+def test_family_values_lie_within_and_fill_their_ranges(members):
     drawn = {
         "mass": [m.bodies.mass for m in members],
         "velocity": [m.approach.velocity for m in members],
@@ -78,13 +78,13 @@ def test_numbers_are_within_their_ranges_and_fill_them(members):
         "simulator_frequency": [m.rig.simulator.natural_frequency for m in members],
         "simulator_damping": [m.rig.simulator.damping_ratio for m in members],
         "simulator_delay": [m.rig.simulator.delay for m in members],
-        # A contact lasts half a period, and what it loses makes the damping ratio, to first order.
+        # A contact lasts half a period; its restitution gives the damping ratio, to first order.
         "frequency": 1 / (2 * undelayed(members, damped=False).duration),
         "damping_ratio": -np.log(undelayed(members, damped=True).restitution) / math.pi,
     }
     for name, values in drawn.items():
         low, high = getattr(RANGES, name)
-        # Rounded to six digits; the damping ratio is one to first order.
+        # Values are rounded to six digits; the damping ratio is a first-order estimate.
         slack = 0.1 * high if name == "damping_ratio" else 1e-5 * high
         assert low - slack <= min(values) and max(values) <= high + slack, name
         assert min(values) < low + 0.05 * (high - low) and max(values) > high - 0.05 * (high - low), name
@@ -92,7 +92,7 @@ def test_numbers_are_within_their_ranges_and_fill_them(members):
     assert all(m.rig.control_period == 1e-3 for m in members)
 
 
-def test_every_law_is_there_and_undamped_members_have_fewer_gains(members):
+def test_family_has_every_contact_law_and_undamped_members(members):
     assert {m.contact.law for m in members} == set(LAWS)
     number = [sum(g.tuned(m) for g in COMPENSATORS["response_error"].gains) for m in members]
     damped = [m.contact.damping[0] > 0 for m in members]
@@ -100,7 +100,7 @@ def test_every_law_is_there_and_undamped_members_have_fewer_gains(members):
     assert all(n == (5 if d else 4) for n, d in zip(number, damped, strict=True))
 
 
-def test_every_member_is_uncertain_in_stiffness_force_delay_and_phase(members):
+def test_family_members_are_uncertain_in_stiffness_force_delay_and_phase(members):
     for mechanism in members:
         assert set(mechanism.uncertainty) == {
             "contact.stiffness", "rig.force_sensor.delay", "approach.phase"

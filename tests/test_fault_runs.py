@@ -1,4 +1,4 @@
-"""Faults injected tick by tick: each raised on its tick, nothing else, outputs finite and in their limits."""
+"""Faults injected tick by tick: each is raised on its tick, no other; outputs stay finite and limited."""
 
 from collections.abc import Iterable
 
@@ -13,7 +13,7 @@ from jaxhil.rig.faults import FAULTS, names
 from jaxhil.rig.gain_file import check_gain_document
 
 BLOCK = 500_000
-# What needs a closed loop, a law gone wrong or a call: the tests of guards and watchdog have these.
+# These need a closed loop, a faulty compensator or a call: the tests of guards and watchdog cover them.
 ELSEWHERE = (
     "command_not_finite",
     "restitution",
@@ -27,7 +27,7 @@ needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C com
 
 
 def check(run: FaultRun, results: np.ndarray) -> None:
-    """Raises AssertionError for the first tick at which the controller did what it should not."""
+    """Raise AssertionError for the first tick at which the controller misbehaved."""
     force, position = results[:, RESULT.index("force")], results[:, RESULT.index("position")]
     faults = results[:, RESULT.index("faults")].astype(np.int64)
     wrong = run.wrong(faults, results[:, RESULT.index("tripped")] != 0)
@@ -45,7 +45,7 @@ def check(run: FaultRun, results: np.ndarray) -> None:
 
 
 def counts(run: FaultRun) -> dict[str, int]:
-    """How many ticks raise each fault."""
+    """Return the number of ticks that raise each fault."""
     return {fault.name: int(np.count_nonzero(run.faults & fault.bit)) for fault in FAULTS}
 
 
@@ -65,12 +65,12 @@ def c_runs(ticks: int, law: str, seed: int) -> None:
         check(run, batch.run(run.rows, guarded=True))
 
 
-def test_every_fault_of_a_rig_is_injected():
+def test_fault_run_injects_every_fault_of_a_rig():
     injected = counts(fault_run(60_000, 0, "none"))
     assert [name for name, count in injected.items() if count == 0] == list(ELSEWHERE)
 
 
-def test_a_fault_that_is_not_raised_is_found():
+def test_fault_run_check_detects_missing_fault():
     run = fault_run(2000, 0, "none")
     results = controller_in_python(check_gain_document(document("none")), run.rows)
     check(run, results)
@@ -80,35 +80,35 @@ def test_a_fault_that_is_not_raised_is_found():
         check(run, results)
 
 
-# Faults are raised around the law, whichever it is.
+# Faults are raised around the compensator and do not depend on it.
 FEW = ("none", "response_error")
 
 
 def few_of(laws: Iterable[str]) -> pytest.MarkDecorator:
-    """Return the parameter `law`: those in `FEW` every day, the others with the slow tests."""
+    """Parametrise `law`: those in `FEW` every day, the others with the slow tests."""
     marked = [pytest.param(law, marks=() if law in FEW else pytest.mark.slow) for law in laws]
     return pytest.mark.parametrize("law", marked)
 
 
 @few_of(COMPENSATORS)
-def test_python_raises_every_fault_on_its_tick(law):
+def test_python_controller_raises_every_fault_on_its_tick(law):
     python_runs(20_000, law, 10)
 
 
 @needs_compiler
 @few_of(COMPENSATORS)
-def test_c_raises_every_fault_on_its_tick(law):
+def test_c99_controller_raises_every_fault_on_its_tick(law):
     c_runs(60_000, law, 20)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_ten_million_ticks_in_python(law):
+def test_python_controller_raises_faults_over_ten_million_ticks(law):
     python_runs(10_000_000 if law == "response_error" else 1_000_000, law, 1000)
 
 
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_a_hundred_million_ticks_in_c(law):
+def test_c99_controller_raises_faults_over_a_hundred_million_ticks(law):
     c_runs(100_000_000 if law == "response_error" else 10_000_000, law, 2000)

@@ -1,9 +1,9 @@
-"""Whatever call of the system fails, wherever a command is killed: nothing wrong is left, nothing is lost.
+"""Failing system calls and kills: whatever call fails, no output is wrong and none is lost.
 
-As SQLite is tested: every call that concerns the folders of output and of kept programs fails once, in turn,
-and the process is killed there once, in turn. What is there afterwards is what was there before or what the
-command writes, file by file, whole. The user's files are as they were. The command run again gives what it
-gives undisturbed.
+The method is that of SQLite: every call that concerns the output folder or the folder of cached programs
+fails once, in turn, and the process is killed there once, in turn. Afterwards every file is either the old
+one or the one that the command writes, whole. The user's files are unchanged. Running the command again gives
+the result of an undisturbed run.
 """
 
 import json
@@ -28,14 +28,14 @@ USERS = {".thesis.docx.tmp": b"years", ".thesis.docx.1.tmp": b"of", "notes.txt":
 
 
 class Command(NamedTuple):
-    """A command that writes. Its arguments are given the folder to write to, and that of the gain files."""
+    """Command that writes files. `arguments` takes the output folder and the folder of the gain files."""
 
     arguments: Callable[[Path, Path], list[Any]]
-    again: tuple[str, ...] = ()  # added when it is run again
-    before: tuple[tuple[str, ...], ...] = ()  # run before with each of these instead, undisturbed
-    one_piece: str | None = None  # a folder that is replaced as a whole
-    cold: bool = False  # whether no programs are kept from before
-    new: str | None = None  # a file that is refused where there is one
+    again: tuple[str, ...] = ()  # arguments added in the next run
+    before: tuple[tuple[str, ...], ...] = ()  # earlier undisturbed runs with these arguments
+    one_piece: str | None = None  # folder that is replaced as a whole
+    cold: bool = False  # whether the cache of programs is empty
+    new: str | None = None  # file that the command refuses to overwrite
     logged: bool = False  # whether it reads the log of a run
 
 
@@ -98,7 +98,7 @@ def runner(tmp_path_factory):
 
 
 class Bench:
-    """A command, what was there before it, and what it does undisturbed."""
+    """A command, the files that existed before it, and its undisturbed result."""
 
     def __init__(self, runner: Runner, folder: Path, name: str) -> None:
         self.runner, self.command = runner, COMMANDS[name]
@@ -122,7 +122,7 @@ class Bench:
         self.after = self.tree()
 
     def restore(self) -> None:
-        """What was there before."""
+        """Restore the files that existed before."""
         shutil.rmtree(self.out, ignore_errors=True)
         shutil.copytree(self.kept, self.out)
         for path in self.runner.cache.iterdir() if self.command.cold else ():
@@ -134,45 +134,47 @@ class Bench:
         return self.runner.run(*arguments, *more, folders=(self.out, self.runner.cache), **fault)
 
     def tree(self) -> dict[str, Any]:
-        """Every finished file without dates and times; pieces of work apart, which have to be sealed."""
+        """Return every finished file without dates and times; check separately that checkpoints are
+        checksummed.
+        """
         paths = [path.relative_to(self.out) for path in self.out.rglob("*") if path.is_file()]
         finished = [path for path in paths if not any(map(is_temporary, path.parts))]
         assert all(read_sealed(self.out / path) is not None for path in finished if PIECES in path.parts)
         return {str(path): _content(self.out / path) for path in finished if PIECES not in path.parts}
 
     def everything(self) -> dict[str, bytes]:
-        """Every file below the folder of output, and below that of kept programs, to the bit."""
+        """Return every file below the output folder and the folder of cached programs."""
         files = [
             path for folder in (self.out, self.runner.cache) for path in folder.rglob("*") if path.is_file()
         ]
         return {os.path.relpath(path, self.out): path.read_bytes() for path in files}
 
     def disturb(self, at: int, kill: bool, *more: str) -> bool:
-        """Run it with a fault, and look at what is there: whether anything is another than before."""
+        """Run with a fault and check the files; return whether any file changed."""
         there, everything = self.tree(), self.everything()
         ran = self.run(*more, at=at, kill=kill)
         what = f"{'killed' if kill else 'failed'} at call {at}, {ran.calls[-1:]}: {ran.code} {ran.err[-400:]}"
         assert ran.code != HANGS and "internal error" not in ran.err and "Traceback" not in ran.err, what
-        found = self.tree()
+        result = self.tree()
         if not kill and ran.code == self.undisturbed.code:
-            assert found == self.after, f"{what}: {_differing(found, self.after)}"
+            assert result == self.after, f"{what}: {_differing(result, self.after)}"
             assert ran.document == self.undisturbed.document, what
         elif not kill:
             assert ran.code == 2 and ran.err.splitlines()[-1].startswith("jaxhil: "), what
-        for name, content in found.items():
-            # A verdict grows with what is known.
+        for name, content in result.items():
+            # A verdict changes as more results are finished.
             whole = content in (there.get(name), self.after.get(name)) or _is_signed(content)
             assert whole, f"{what}: {name}"
-        assert there.keys() <= found.keys(), f"{what}: {there.keys() - found.keys()}"
+        assert there.keys() <= result.keys(), f"{what}: {there.keys() - result.keys()}"
         for name, content in USERS.items():
-            assert found[name] == (self.runner.cache / name).read_bytes() == content, f"{what}: {name}"
+            assert result[name] == (self.runner.cache / name).read_bytes() == content, f"{what}: {name}"
         if (piece := self.command.one_piece) is not None:
-            now, old, new = (_below(tree, piece) for tree in (found, there, self.after))
+            now, old, new = (_below(tree, piece) for tree in (result, there, self.after))
             assert now in (old, new), what
         return self.everything() != everything
 
     def run_again(self) -> None:
-        """Undisturbed, after all that."""
+        """Run undisturbed after the fault."""
         new = self.command.new
         refused = new is not None and (self.out / new).exists()
         ran = self.run(*self.command.again)
@@ -196,7 +198,7 @@ def _content(path: Path) -> Any:
 
 
 def _is_signed(content: Any) -> bool:
-    """Whether it is a verdict; `_content` has looked at its digest."""
+    """Return whether it is a verdict; `_content` has checked its digest."""
     return isinstance(content, dict) and "sweep_sha256" in content and "verdict" in content
 
 
@@ -204,11 +206,11 @@ def _below(tree: dict[str, Any], folder: str) -> dict[str, Any]:
     return {name: content for name, content in tree.items() if name.startswith(f"{folder}/")}
 
 
-def _differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    return [name for name in one.keys() | other.keys() if one.get(name) != other.get(name)]
+def _differing(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
+    return [name for name in first.keys() | second.keys() if first.get(name) != second.get(name)]
 
 
-def test_a_sweep_survives_one_fault_after_another(runner, tmp_path):
+def test_sweep_recovers_from_failed_call_and_kill(runner, tmp_path):
     bench = Bench(runner, tmp_path, "sweep")
     bench.restore()
     calls = bench.undisturbed.calls
@@ -222,7 +224,7 @@ def test_a_sweep_survives_one_fault_after_another(runner, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", [False, True], ids=["fails", "killed"])
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_every_call_fails_once_and_is_the_last_once(runner, tmp_path, name, kill):
+def test_command_recovers_from_every_failed_call_and_kill(runner, tmp_path, name, kill):
     bench = Bench(runner, tmp_path, name)
     for at in range(len(bench.undisturbed.calls)):
         bench.restore()

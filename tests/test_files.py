@@ -1,4 +1,6 @@
-"""Files are written whole or not at all, sealed ones are as written or none, nobody else's are touched."""
+"""Files are written whole or not at all; checksummed files are read unchanged or not at all; foreign files
+stay.
+"""
 
 import errno
 import os
@@ -23,7 +25,7 @@ from jaxhil.files import (
 )
 
 
-def test_a_file_is_replaced(tmp_path):
+def test_write_whole_replaces_file(tmp_path):
     path = tmp_path / "file"
     for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
         write_whole(path, content)
@@ -31,7 +33,7 @@ def test_a_file_is_replaced(tmp_path):
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-def test_a_new_file_takes_nobody_s_place(tmp_path, monkeypatch, has_links):
+def test_write_new_never_overwrites(tmp_path, monkeypatch, has_links):
     def refuse(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
@@ -45,7 +47,7 @@ def test_a_new_file_takes_nobody_s_place(tmp_path, monkeypatch, has_links):
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_what_fails_midway_leaves_the_file_as_it_was(tmp_path, monkeypatch, step):
+def test_write_whole_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
     path = tmp_path / "file"
     write_whole(path, b"old")
 
@@ -59,13 +61,13 @@ def test_what_fails_midway_leaves_the_file_as_it_was(tmp_path, monkeypatch, step
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_line_about_something_else_stays(tmp_path):
+def test_writing_passes_other_errors_through(tmp_path):
     with pytest.raises(InputError, match=r"^something else$"), writing(tmp_path):
         raise InputError("something else")
 
 
 def not_plain(folder):
-    """What may stand where a file of ours belongs, by name, and the file that a link leads to."""
+    """Create links, a pipe and a folder where a file belongs; return their names and the link's target."""
     target = folder / "thesis"
     target.write_bytes(b"years")
     (folder / "link").symlink_to(target)
@@ -76,7 +78,7 @@ def not_plain(folder):
     return ["link", "dangling", "device", "pipe", "folder"], target
 
 
-def test_nothing_but_a_plain_file_is_read_or_replaced(tmp_path):
+def test_file_functions_reject_anything_but_plain_files(tmp_path):
     names, target = not_plain(tmp_path)
     before = sorted(os.listdir(tmp_path))
     for name in names:
@@ -92,7 +94,7 @@ def test_nothing_but_a_plain_file_is_read_or_replaced(tmp_path):
     assert target.read_bytes() == b"years" and sorted(os.listdir(tmp_path)) == before
 
 
-def test_a_folder_of_ours_is_no_link(tmp_path):
+def test_make_folder_rejects_links(tmp_path):
     for name in ("new/inner", "new"):
         make_folder(tmp_path / name)
     assert (tmp_path / "new/inner").is_dir()
@@ -103,7 +105,7 @@ def test_a_folder_of_ours_is_no_link(tmp_path):
             make_folder(tmp_path / name)
 
 
-def test_a_link_that_the_user_names_stands_for_its_file(tmp_path):
+def test_follow_resolves_link_named_by_user(tmp_path):
     _, target = not_plain(tmp_path)
     write_whole(follow(tmp_path / "link"), b"picture")
     assert (tmp_path / "link").is_symlink() and target.read_bytes() == b"picture"
@@ -112,7 +114,7 @@ def test_a_link_that_the_user_names_stands_for_its_file(tmp_path):
         write_whole(follow(tmp_path / "device"), b"picture")
 
 
-def test_a_sealed_file_is_as_written_or_none(tmp_path):
+def test_read_sealed_returns_exact_content_or_none(tmp_path):
     path = tmp_path / "file"
     generator = np.random.default_rng(0)
     assert read_sealed(path) is None
@@ -132,7 +134,7 @@ def test_a_sealed_file_is_as_written_or_none(tmp_path):
                 assert read_sealed(path) is None
 
 
-def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+def test_remove_stale_removes_only_files_of_killed_processes(tmp_path):
     killed = """
 import os, signal, sys
 from pathlib import Path
@@ -146,7 +148,7 @@ files.write_whole(Path(sys.argv[1]) / "file", b"new")
     users = [".thesis.docx.tmp", ".jaxhil.tmp", ".jaxhil-12-cafe.tmp", f"{left.name}.tmp", f"a{left.name}"]
     for name in users:
         (tmp_path / name).write_text("years")
-    # One that a process writes right now, and a link by such a name.
+    # Also create a file that a live process is writing, and a link with such a name.
     writes = left.name.replace(left.name.split("-")[1], str(os.getppid()))
     (tmp_path / writes).write_text("half")
     linked = left.name.replace("-0.tmp", "-1.tmp")

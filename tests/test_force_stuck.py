@@ -1,4 +1,4 @@
-"""A force sensor that is stuck trips; one that truly reads no force at the end of a contact does not."""
+"""A stuck force sensor trips the controller; a sensor that truly reads no force after a contact does not."""
 
 import math
 
@@ -17,7 +17,7 @@ TARES = 7
 
 
 def contact(damping_ratio: float, side: float, gap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Position [m] and force [N] of a damped contact in closed form, entered at `SPEED`, until it is free.
+    """Return position [m] and force [N] of a damped contact in closed form, from `SPEED` until release.
 
     M x'' = -k x - b x' while that pushes; then the mechanism stays behind, compressed, and the body leaves.
     """
@@ -39,7 +39,7 @@ def contact(damping_ratio: float, side: float, gap: float) -> tuple[np.ndarray, 
 
 
 def first_stuck(position, force, gap: float, bias: float = 0.0, noise: float = 0.0) -> int | None:
-    """The tick on which the controller calls the force stuck, the same in C; None if it never does."""
+    """Return the tick on which Python and C report the force stuck; None if never."""
     limits = complete({"force_stuck_travel": TRAVEL, "tare_ticks": float(TARES)})
     gain_file = GainFile("none", {}, PERIOD, gap if gap else math.inf, limits)
     rows = np.zeros((TARES + len(force), len(ROW)))
@@ -64,48 +64,56 @@ SIDES = pytest.mark.parametrize(("side", "gap"), [(1.0, 0.0), (1.0, 0.02), (-1.0
 @pytest.mark.parametrize("damping_ratio", [0.25, 0.5, 0.8])
 @pytest.mark.parametrize("dead_zone", [0.0, 2.0])
 @pytest.mark.parametrize("bias", [0.0, 0.1, -3.7])
-def test_sensor_without_noise_that_reads_no_force_is_not_stuck(damping_ratio, dead_zone, bias, side, gap):
-    """At the end of a damped contact it comes out by several times `force_stuck_travel` without a force."""
+def test_force_stuck_is_not_raised_for_noiseless_sensor_without_force(
+    damping_ratio, dead_zone, bias, side, gap
+):
+    """A damped contact ends by moving out several times `force_stuck_travel` without a force."""
     position, force = contact(damping_ratio, side, gap)
     read = np.sign(force) * np.maximum(np.abs(force) - dead_zone, 0.0)
     assert first_stuck(position, read, gap, bias) is None
 
 
 @SIDES
-def test_position_noise_under_no_force_is_no_way_deeper(side, gap):
-    """Noise adds up over the end of a contact to far more than the travel; its way deeper does not."""
+def test_force_stuck_ignores_position_noise_without_force(side, gap):
+    """At a contact's end noise accumulates to far more than the travel, but the penetration does not
+    increase.
+    """
     position, force = contact(0.5, side, gap)
     assert first_stuck(position, force, gap, noise=TRAVEL / 10) is None
 
 
 @SIDES
 @pytest.mark.parametrize("bias", [0.0, -3.7])
-def test_sensor_that_reads_nothing_from_the_first_is_stuck_once_pressed(bias, side, gap):
-    """The cable is off: no mechanism can be pressed in by so much without a force."""
+def test_force_stuck_is_raised_if_sensor_never_reads_force(bias, side, gap):
+    """Disconnect the cable: no mechanism can be pressed in this far without a force."""
     position, force = contact(0.5, side, gap)
     depth = position if side > 0 else -gap - position
-    found = first_stuck(position, np.zeros_like(force), gap, bias)
-    # The travel counts from the last reading before the contact on.
-    assert found is not None and depth[found - 1] <= TRAVEL < depth[found] + SPEED * PERIOD
+    stuck_tick = first_stuck(position, np.zeros_like(force), gap, bias)
+    # The travel counts from the last reading before the contact.
+    assert stuck_tick is not None and depth[stuck_tick - 1] <= TRAVEL < depth[stuck_tick] + SPEED * PERIOD
 
 
 @SIDES
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_sensor_stuck_at_a_force_is_stuck_whichever_way_the_mechanism_moves(share, side, gap):
+def test_force_stuck_is_raised_for_constant_force_while_mechanism_moves(share, side, gap):
     position, force = contact(0.25, side, gap)
     begin = int(20 + share * (np.count_nonzero(force) - 10))
     read = force.copy()
     read[begin:] = read[begin]
     travelled = np.cumsum(np.abs(np.diff(position)))
-    found = first_stuck(position, read, gap)
-    assert found is not None and begin < found
-    assert travelled[found - 2] - travelled[begin - 1] <= TRAVEL < travelled[found - 1] - travelled[begin - 1]
+    stuck_tick = first_stuck(position, read, gap)
+    assert stuck_tick is not None and begin < stuck_tick
+    assert (
+        travelled[stuck_tick - 2] - travelled[begin - 1]
+        <= TRAVEL
+        < travelled[stuck_tick - 1] - travelled[begin - 1]
+    )
 
 
-def test_sensor_stuck_at_no_force_is_stuck_when_pressed_again():
-    """It died at the end of the contact before: as soon as the next one presses, that shows."""
+def test_force_stuck_is_raised_on_next_contact_if_stuck_at_zero():
+    """The sensor fails at the end of a contact; this shows as soon as the next contact presses."""
     position, force = contact(0.5, 1.0, 0.0)
     released = len(force) - int(np.argmax(force[::-1] > 0))
     twice = np.concatenate([position, position]), np.concatenate([force, np.zeros_like(force)])
-    found = first_stuck(*twice, gap=0.0)
-    assert found is not None and found > len(force) > released
+    stuck_tick = first_stuck(*twice, gap=0.0)
+    assert stuck_tick is not None and stuck_tick > len(force) > released

@@ -1,4 +1,4 @@
-"""Approaches that are skipped, beside the same ones flown tick by tick."""
+"""Skipped approaches compared with the same approaches simulated tick by tick."""
 
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ from jaxhil.simulation.scenario import build_scenarios
 
 LANES, TICKS = 5, 1200
 WAITING = sorted(name for name, law in COMPENSATORS.items() if vars(type(law)).get("waits_for_contact"))
-EVERYDAY = "none", "response_error"  # each law is two programs
+EVERYDAY = "none", "response_error"  # each compensator takes two programs
 
 
 def case(law, mechanism="varying", overrides=()):
@@ -30,16 +30,16 @@ def case(law, mechanism="varying", overrides=()):
 @pytest.mark.parametrize(
     "law", [pytest.param(law, marks=() if law in EVERYDAY else pytest.mark.slow) for law in WAITING]
 )
-def test_a_skipped_approach_changes_no_figure(law):
+def test_skipped_approach_changes_no_metric(law):
     loop, gains, scenarios = case(law)
     assert loop.is_idle_in_flight
-    found = run_rollout(loop, gains, scenarios)
+    result = run_rollout(loop, gains, scenarios)
     flown, seen = run_record(loop, gains, scenarios, TICKS)
     assert not np.any(seen.active[-1])
-    for name in set(found._fields) - {"ticks"}:
-        np.testing.assert_allclose(getattr(found, name), getattr(flown, name), rtol=1e-9, err_msg=name)
-    # Figures are entered at the end of a stretch, which comes at other ticks.
-    later = np.asarray(found.ticks) - np.asarray(flown.ticks)
+    for name in set(result._fields) - {"ticks"}:
+        np.testing.assert_allclose(getattr(result, name), getattr(flown, name), rtol=1e-9, err_msg=name)
+    # Metrics are recorded at the end of a segment, which falls on other ticks.
+    later = np.asarray(result.ticks) - np.asarray(flown.ticks)
     assert np.all(np.abs(later) < stretch_length(loop) * scenarios.contacts)
 
 
@@ -52,13 +52,13 @@ def test_a_skipped_approach_changes_no_figure(law):
         ["rig.simulator.velocity_limit=0.5"],
     ],
 )
-def test_what_happens_in_flight_is_flown(overrides):
+def test_approach_with_noise_or_limits_is_not_skipped(overrides):
     loop, _, _ = case("none", overrides=overrides)
     assert not loop.is_idle_in_flight
 
 
 class Early(NoCompensator):
-    """Acts on what the numerical model is in by."""
+    """Compensator that acts on the penetration of the numerical model."""
 
     name: ClassVar[str] = "early"
 
@@ -66,8 +66,8 @@ class Early(NoCompensator):
         return signals.force_measured + jnp.maximum(signals.position_desired, 0), state
 
 
-def test_a_law_that_acts_before_the_contact_is_flown():
-    """One that is made of a law that waits, too."""
+def test_approach_is_not_skipped_for_compensator_active_before_contact():
+    """This includes a compensator built from one that waits for contact."""
     loop, _, _ = case("virtual_contact")
     assert not loop.is_idle_in_flight
     waiting, _, _ = case("none")

@@ -1,4 +1,4 @@
-"""Friction laws: Coulomb's cone, a spring at rest, no NaN where nothing slips or nothing presses."""
+"""Friction laws: Coulomb's cone, a spring at rest, no NaN without slip or without normal force."""
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +29,10 @@ def along_x(force, speed):
 
 @jax.jit
 def pulled(forces, speeds):
-    """Tangential force along x, tick after tick."""
+    """Return the tangential force along x, tick after tick."""
 
-    def tick(state, given):
-        force, state = BRISTLE.step(along_x(*given), state)
+    def tick(state, inputs):
+        force, state = BRISTLE.step(along_x(*inputs), state)
         return state, force.x
 
     return lax.scan(tick, BRISTLE.init(of_one(0.0)), (forces[:, None, None], speeds[:, None, None]))[1][
@@ -40,23 +40,23 @@ def pulled(forces, speeds):
     ]
 
 
-def test_a_bristle_is_a_spring_then_slides_and_forgets():
+def test_bristle_friction_sticks_then_slides_then_resets():
     speeds = np.r_[np.full(10, 1e-6), np.zeros(10), np.full(80, 1e-3), np.zeros(1), np.zeros(1)]
     forces = np.r_[np.full(100, 50.0), 0.0, 50.0]
-    found = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(speeds)))
-    # It sticks: a spring, to the share that it has of the limit.
-    held = STIFFNESS * 1e-6 * PERIOD * 10
-    np.testing.assert_allclose(found[10:20], -held, rtol=held / (COEFFICIENT * 50))
-    np.testing.assert_allclose(found[99], -COEFFICIENT * 50, rtol=1e-6)
-    assert found[100] == 0 and found[101] == 0
+    result = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(speeds)))
+    # While it sticks it is a spring, up to its share of the friction limit.
+    stuck_force = STIFFNESS * 1e-6 * PERIOD * 10
+    np.testing.assert_allclose(result[10:20], -stuck_force, rtol=stuck_force / (COEFFICIENT * 50))
+    np.testing.assert_allclose(result[99], -COEFFICIENT * 50, rtol=1e-6)
+    assert result[100] == 0 and result[101] == 0
 
 
 @pytest.mark.slow
-def test_neither_law_leaves_the_cone():
+def test_friction_force_stays_within_coulomb_cone():
     generator = np.random.default_rng(8)
     forces = generator.uniform(0, 80, 3000) * (generator.random(3000) > 0.1)
-    found = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(generator.normal(size=3000) * 0.02)))
-    assert np.all(np.abs(found) <= COEFFICIENT * forces * (1 + 1e-12))
+    result = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(generator.normal(size=3000) * 0.02)))
+    assert np.all(np.abs(result) <= COEFFICIENT * forces * (1 + 1e-12))
     slip = vector(jnp.asarray(generator.normal(size=(3, 1, 1)) * 10))
     force, _ = REGULARISED.step(along_x(of_one(50.0), of_one(0.0))._replace(slip=slip), ())
     assert 0.999 < norm(force)[0, 0] / (COEFFICIENT * 50) < 1
@@ -65,7 +65,7 @@ def test_neither_law_leaves_the_cone():
 
 
 def touched(count, seed):
-    """Random forces, slips in random tangent planes, and deflections; of every eleventh one is 0."""
+    """Return random forces, slips in random tangent planes, and deflections; every eleventh of each is 0."""
     generator = np.random.default_rng(seed)
     normal = generator.normal(size=(3, count, 1))
     normal /= np.linalg.norm(normal, axis=0)
@@ -79,7 +79,7 @@ def touched(count, seed):
     return Touching(jnp.asarray(force), normal, slip, of_one(PERIOD)), deflection
 
 
-def test_regularised_friction_takes_its_power():
+def test_regularised_friction_dissipates_expected_power():
     """-f_t.t = mu F |t|^2/sqrt(|t|^2 + v_s^2), never negative."""
     touching, _ = touched(3000, 1)
     force, _ = REGULARISED.step(touching, ())
@@ -90,21 +90,21 @@ def test_regularised_friction_takes_its_power():
     assert np.all(taken >= 0) and np.count_nonzero(taken) > 2000
 
 
-def test_a_bristle_takes_what_it_does_not_store():
-    """-f_t.t less the rate of k_t z^2/2 over a step is never negative, however far the bristle was bent."""
+def test_bristle_friction_never_generates_energy():
+    """-f_t.t less the rate of k_t z^2/2 over a step is never negative, however large the deflection."""
     touching, before = touched(3000, 2)
     force, (after,) = BRISTLE.step(touching, (before,))
-    given = np.asarray(-PERIOD * dot(force, touching.slip))
+    work = np.asarray(-PERIOD * dot(force, touching.slip))
     stored = [np.asarray(STIFFNESS / 2 * dot(bent, bent)) for bent in (before, after)]
-    taken = given - (stored[1] - stored[0])
-    assert np.all(taken >= -1e-12 * (np.abs(given) + stored[0] + stored[1]))
-    # It gives back and stores as well.
-    assert np.any(given < 0) and np.any(stored[1] > stored[0]) and np.count_nonzero(taken > 0) > 2000
+    taken = work - (stored[1] - stored[0])
+    assert np.all(taken >= -1e-12 * (np.abs(work) + stored[0] + stored[1]))
+    # The bristle also returns and stores energy.
+    assert np.any(work < 0) and np.any(stored[1] > stored[0]) and np.count_nonzero(taken > 0) > 2000
 
 
 @pytest.mark.slow
-def test_creep_of_what_should_stick():
-    """v_s s/sqrt(1 - s^2) where s = |f_t|/(mu F)."""
+def test_regularised_friction_creeps_as_predicted():
+    """The creep is v_s s/sqrt(1 - s^2) with s = |f_t|/(mu F)."""
     share = 0.6
     creep = SLIP * share / np.sqrt(1 - share**2)
     force, _ = REGULARISED.step(along_x(of_one(50.0), of_one(creep)), ())
@@ -114,10 +114,10 @@ def test_creep_of_what_should_stick():
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [BRISTLE, REGULARISED])
 @pytest.mark.parametrize("force", [0.0, 50.0])
-def test_no_nan_at_no_slip(law, force):
+def test_friction_derivatives_are_finite_without_slip(law, force):
     def tangential(force, speed):
-        found, _ = law.step(along_x(force, speed), law.init(force))
-        return found.x
+        result, _ = law.step(along_x(force, speed), law.init(force))
+        return result.x
 
     slopes = jax.jacfwd(tangential, argnums=(0, 1))(of_one(force), of_one(0.0))
     assert all(np.isfinite(slope).all() for slope in slopes)

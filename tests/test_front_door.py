@@ -1,4 +1,4 @@
-"""`import jaxhil`: what it offers, what it computes, whose settings it leaves alone, and what it refuses."""
+"""`import jaxhil`: offered names, results, untouched JAX settings, one-line errors."""
 
 import json
 import math
@@ -25,7 +25,7 @@ TWO = {"approach.contacts": 2, "contact.stiffness": [124355.0, 90000.0], "contac
 
 
 def refusal(function, *arguments, **named):
-    """The one line with which a call is refused."""
+    """Return the one-line message with which a call is rejected."""
     with pytest.raises(jaxhil.InputError) as refused:
         function(*arguments, **named)
     message = str(refused.value)
@@ -35,7 +35,7 @@ def refusal(function, *arguments, **named):
 
 
 def plain_process(script, **environment):
-    """What a script prints in a process of its own, with jax as it is by default."""
+    """Return the output of a script in its own process, with JAX in its default configuration."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(("XLA", "JAX_"))}
     outside["PYTHONPATH"] = str(Path(__file__).parent.parent)
     command = [sys.executable, "-W", "error", "-c", script]
@@ -46,14 +46,14 @@ def plain_process(script, **environment):
 
 @pytest.fixture
 def command(request):
-    """`jaxhil ARGUMENTS` in this process."""
+    """Run `jaxhil ARGUMENTS` in this process."""
     return request.getfixturevalue("jaxhil")
 
 
-# What is offered.
+# Public names.
 
 
-def test_all_names_are_offered_and_listed():
+def test_jaxhil_offers_and_lists_public_names():
     assert set(jaxhil.__all__) == {*OFFERED, "__version__"} <= set(dir(jaxhil))
     for name in OFFERED:
         assert getattr(jaxhil, name) is not None
@@ -62,7 +62,7 @@ def test_all_names_are_offered_and_listed():
     assert Path(jaxhil.__file__).with_name("py.typed").exists()
 
 
-def test_the_controller_is_imported_without_jax_and_numpy():
+def test_controller_import_needs_neither_jax_nor_numpy():
     imports = "import sys; sys.modules['jax'] = None; import jaxhil, jaxhil.rig"
     assert plain_process(f"{imports}\nprint(jaxhil.rig.Controller.__name__)") == "Controller\n"
     loaded = "print([name for name in ('jax', 'numpy', 'scipy', 'msgspec') if name in sys.modules])"
@@ -72,7 +72,7 @@ def test_the_controller_is_imported_without_jax_and_numpy():
 # Loading.
 
 
-def test_overrides_are_those_of_the_command(command):
+def test_load_overrides_equal_those_of_the_command(command):
     mechanism = jaxhil.load("varying", {"rig.force_sensor.delay": np.float32(0.0035), **TWO})
     assert mechanism.contact.stiffness == [124355.0, 90000.0] and mechanism.approach.contacts == 2
     assert mechanism.rig.force_sensor.delay == float(np.float32(0.0035))
@@ -83,11 +83,11 @@ def test_overrides_are_those_of_the_command(command):
         ("contact.stiffness[4]", 1.0, "1.0"),
         ("contact.law", "hertz", '"hertz"'),
     ):
-        said = refusal(jaxhil.load, "varying", {path: value}).removeprefix(f"varying: overrides {path}: ")
-        assert command("simulate", "--set", f"{path}={text}").err.endswith(f": {said}\n")
+        message = refusal(jaxhil.load, "varying", {path: value}).removeprefix(f"varying: overrides {path}: ")
+        assert command("simulate", "--set", f"{path}={text}").err.endswith(f": {message}\n")
 
 
-# Anything at all that is no mechanism, path, value, compensator or gain.
+# Values of any kind that are not a mechanism, path, value, compensator or gain.
 ANYTHING = st.one_of(
     st.none(),
     st.booleans(),
@@ -106,7 +106,7 @@ ANYTHING = st.one_of(
 @hypothesis.given(
     path=st.one_of(st.sampled_from(["approach.velocity", "contact.law", "rig"]), ANYTHING), value=ANYTHING
 )
-def test_whatever_overrides_hold_is_loaded_or_refused(path, value):
+def test_load_accepts_or_rejects_any_override_in_one_line(path, value):
     try:
         overrides = {path: value}
     except TypeError:
@@ -118,18 +118,18 @@ def test_whatever_overrides_hold_is_loaded_or_refused(path, value):
 
 
 @hypothesis.settings(max_examples=60)
-@hypothesis.given(one=ANYTHING)
-def test_whatever_is_no_mechanism_compensator_gain_or_seed_is_refused(one):
-    refusal(jaxhil.simulate, one)
-    refusal(jaxhil.simulate, "varying", one)
-    if not isinstance(one, float) or not -1e-9 <= one <= 0.03:
-        refusal(jaxhil.simulate, "varying", "phase_lead", {"phase_lead": one})
-    if one is not None and not (isinstance(one, dict) and not one):
-        refusal(jaxhil.simulate, "varying", "phase_lead", one)
-    if isinstance(one, bool) or not isinstance(one, int) or one < 0:
-        refusal(jaxhil.simulate, "varying", seed=one)
-    refusal(jaxhil.jacobian, "varying", of=one, by="approach.velocity")
-    refusal(jaxhil.jacobian, "varying", by=one)
+@hypothesis.given(value=ANYTHING)
+def test_simulate_rejects_any_invalid_argument_in_one_line(value):
+    refusal(jaxhil.simulate, value)
+    refusal(jaxhil.simulate, "varying", value)
+    if not isinstance(value, float) or not -1e-9 <= value <= 0.03:
+        refusal(jaxhil.simulate, "varying", "phase_lead", {"phase_lead": value})
+    if value is not None and not (isinstance(value, dict) and not value):
+        refusal(jaxhil.simulate, "varying", "phase_lead", value)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        refusal(jaxhil.simulate, "varying", seed=value)
+    refusal(jaxhil.jacobian, "varying", of=value, by="approach.velocity")
+    refusal(jaxhil.jacobian, "varying", by=value)
 
 
 # Simulating.
@@ -140,7 +140,7 @@ def run():
     return jaxhil.simulate(jaxhil.load("varying", TWO), "phase_lead")
 
 
-def test_a_run_is_the_command_s(run, command, tmp_path):
+def test_simulate_function_equals_simulate_command(run, command, tmp_path):
     options = [f"--set={path}={value}" for path, value in TWO.items()]
     document = command("simulate", "--compensator", "phase_lead", "--json", *options).document
     assert [
@@ -153,7 +153,7 @@ def test_a_run_is_the_command_s(run, command, tmp_path):
     assert (tmp_path / "new" / "run.svg").read_bytes() == (tmp_path / "command.svg").read_bytes()
 
 
-def test_ticks_are_those_of_the_run(run):
+def test_run_ticks_are_consistent_with_contacts(run):
     period = run.mechanism.rig.control_period
     ticks = len(run.time)
     for name in run.ticks._fields[:-1]:
@@ -162,20 +162,20 @@ def test_ticks_are_those_of_the_run(run):
     np.testing.assert_allclose(run.time, period * np.arange(ticks), rtol=1e-12)
     assert np.all(np.diff(run.contact) >= 0) and set(run.contact) == {0, 1}
     for index, contact in enumerate(run.contacts):
-        own = run.contact == index
-        assert run.velocity_desired[own][0] == pytest.approx(contact.approach_velocity, rel=1e-12)
+        in_contact = run.contact == index
+        assert run.velocity_desired[in_contact][0] == pytest.approx(contact.approach_velocity, rel=1e-12)
         rebound = contact.restitution * contact.approach_velocity
-        # The contact is over a tick later, when the command has died out.
-        assert -run.velocity_desired[own][-1] == pytest.approx(rebound, rel=1e-6)
-        assert np.max(np.abs(run.force_command[own])) == pytest.approx(contact.peak_command, rel=1e-12)
+        # The contact ends a tick later, when the command has died out.
+        assert -run.velocity_desired[in_contact][-1] == pytest.approx(rebound, rel=1e-6)
+        assert np.max(np.abs(run.force_command[in_contact])) == pytest.approx(contact.peak_command, rel=1e-12)
         # M dv = -F_c T, tick by tick.
-        kicks = -run.force_command[own][:-1] * period / run.mechanism.bodies.mass
-        np.testing.assert_allclose(np.diff(run.velocity_desired[own]), kicks, rtol=1e-9, atol=1e-18)
+        kicks = -run.force_command[in_contact][:-1] * period / run.mechanism.bodies.mass
+        np.testing.assert_allclose(np.diff(run.velocity_desired[in_contact]), kicks, rtol=1e-9, atol=1e-18)
     with pytest.raises(AttributeError):
         run.status = "good"
 
 
-def test_ticks_are_written_to_the_last_bit(run, tmp_path):
+def test_run_to_csv_writes_ticks_exactly(run, tmp_path):
     run.to_csv(tmp_path / "run.csv")
     table = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
     assert table.dtype.names == run.ticks._fields
@@ -186,7 +186,7 @@ def test_ticks_are_written_to_the_last_bit(run, tmp_path):
     assert "ends in .png" in refusal(run.plot, tmp_path / "run.gif")
 
 
-def test_a_contact_that_is_not_reached_is_listed():
+def test_run_lists_contact_that_is_not_reached():
     diverging = {**TWO, "rig.force_sensor.delay": 0.9, "contact.stiffness": [1e7]}
     run = jaxhil.simulate(jaxhil.load("varying", diverging), "none")
     first, second = run.contacts
@@ -194,18 +194,18 @@ def test_a_contact_that_is_not_reached_is_listed():
     assert math.isnan(first.error) and not math.isnan(first.peak_force) and math.isnan(second.peak_force)
 
 
-def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
+def test_simulate_accepts_gains_as_dict_and_file(tmp_path):
     mechanism = jaxhil.load("varying", TWO)
     literature = jaxhil.simulate(mechanism, "phase_lead")
-    some = jaxhil.simulate(mechanism, "phase_lead", {"phase_lead": np.float64(0.003)})
-    assert some.gains == literature.gains | {"phase_lead": 0.003}
-    assert some.contacts[0].error != literature.contacts[0].error
-    document = build_document("phase_lead", some.gains, mechanism, 64 * "0", {}, {}, 0, {})
+    changed = jaxhil.simulate(mechanism, "phase_lead", {"phase_lead": np.float64(0.003)})
+    assert changed.gains == literature.gains | {"phase_lead": 0.003}
+    assert changed.contacts[0].error != literature.contacts[0].error
+    document = build_document("phase_lead", changed.gains, mechanism, 64 * "0", {}, {}, 0, {})
     path = tmp_path / "gains.json"
     path.write_text(json.dumps(document))
     for law in ("phase_lead", "none"):
         run = jaxhil.simulate(mechanism, law, path)
-        assert (run.gains, run.compensator, run.contacts) == (some.gains, "phase_lead", some.contacts)
+        assert (run.gains, run.compensator, run.contacts) == (changed.gains, "phase_lead", changed.contacts)
     other = jaxhil.load("varying", {"rig.control_period": 0.00037})
     assert "control_period" in refusal(jaxhil.simulate, other, "phase_lead", str(path))
     assert "which" in refusal(jaxhil.simulate, mechanism, "response_error", path)
@@ -214,7 +214,7 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("compensator", "gains", "said"),
+    ("compensator", "gains", "message"),
     [
         ("phase_led", None, "compensator: found 'phase_led', allowed one of none, dead_zone_observer"),
         ("phase_led", None, "did you mean phase_lead"),
@@ -230,19 +230,21 @@ def test_gains_are_chosen_by_dict_setting_and_file(tmp_path):
         ("phase_lead", "sharp", "no setting's name (phase_lead has none)"),
     ],
 )
-def test_wrong_gains_are_refused_with_what_is_allowed(compensator, gains, said, monkeypatch, tmp_path):
+def test_simulate_rejects_wrong_gains_and_names_expected_ones(
+    compensator, gains, message, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
-    assert said in refusal(jaxhil.simulate, "varying", compensator, gains)
+    assert message in refusal(jaxhil.simulate, "varying", compensator, gains)
 
 
-def test_setting_that_a_law_does_not_have_is_refused_with_those_that_it_has(monkeypatch):
+def test_simulate_rejects_unknown_setting_and_names_available_ones(monkeypatch):
     settings = {"gentle": {"velocity_gain": 50.0}, "firm": {}}
     monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", settings)
     message = refusal(jaxhil.simulate, "varying", "impulse_ledger", "gentl")
     assert "'gentle', 'firm' (did you mean gentle?)" in message
 
 
-# The caller's own jax.
+# JAX settings of the caller.
 
 GUEST = """
 import jax, jax.numpy as jnp, json
@@ -264,23 +266,25 @@ def as_by_default():
 
 
 @pytest.mark.slow
-def test_in_a_process_of_float32_figures_are_the_command_s(as_by_default, command):
+def test_simulate_in_float32_process_equals_command(as_by_default, command):
     *contacts, slope = json.loads(as_by_default)
     document = command("simulate", "varying", "--compensator", "phase_lead", "--json").document
-    wanted = [[one[name] for name in ("restitution", "error", "peak_force")] for one in document["contacts"]]
+    wanted = [
+        [contact[name] for name in ("restitution", "error", "peak_force")] for contact in document["contacts"]
+    ]
     np.testing.assert_allclose(contacts, wanted, rtol=1e-13, atol=1e-14)
     here = jaxhil.jacobian("varying", "phase_lead", by="gains.phase_lead")["gains.phase_lead"]
     np.testing.assert_allclose(slope, here, rtol=1e-10)
 
 
-def test_the_caller_s_flags_are_as_before(run):
+def test_simulate_leaves_jax_config_unchanged(run):
     before = dict(jax.config.values)
     assert jaxhil.simulate(run.mechanism, "phase_lead").contacts == run.contacts
     assert dict(jax.config.values) == before
 
 
 @pytest.mark.slow
-def test_the_caller_s_flags_neither_matter_nor_change(as_by_default):
+def test_simulate_does_not_depend_on_jax_config(as_by_default):
     flags = "\n".join(
         f"jax.config.update({name!r}, {value!r})"
         for name, value in {
@@ -308,20 +312,20 @@ KEYS = {
 
 
 def central_difference(law, of, key, step):
-    """The figure's difference quotient, at twice the step apart."""
+    """Return the metric's central difference over twice the step."""
     base = jaxhil.load("varying", TWO)
     gains = jaxhil.simulate(base, law).gains
     figures = []
     for sign in (1, -1):
-        changed, own = dict(TWO), dict(gains)
+        changed, changed_gains = dict(TWO), dict(gains)
         if key.startswith("gains."):
-            own[key[6:]] += sign * step
+            changed_gains[key[6:]] += sign * step
         elif key == "contact.stiffness":
             changed[key] = [value + sign * step for value in base.contact.stiffness]
         else:
             value = base.contact.stiffness[0] if key.endswith("[0]") else value_at(base, key)
             changed[key] = value + sign * step
-        run = jaxhil.simulate(jaxhil.load("varying", changed), law, own)
+        run = jaxhil.simulate(jaxhil.load("varying", changed), law, changed_gains)
         figures.append(np.array([getattr(contact, of) for contact in run.contacts]))
     return (figures[0] - figures[1]) / (2 * step)
 
@@ -333,7 +337,7 @@ def central_difference(law, of, key, step):
         pytest.param("response_error", "peak_force", marks=pytest.mark.slow),
     ],
 )
-def test_derivatives_are_those_of_differences(law, of):
+def test_jacobian_matches_finite_differences(law, of):
     slopes = jaxhil.jacobian(jaxhil.load("varying", TWO), law, of=of, by=list(KEYS))
     assert list(slopes) == list(KEYS)
     for key, step in KEYS.items():
@@ -344,10 +348,10 @@ def test_derivatives_are_those_of_differences(law, of):
         )
 
 
-def test_a_derivative_by_both_masses_is_that_by_their_sum_in_parallel():
+def test_jacobian_by_both_masses_matches_equivalent_mass():
     masses = {"bodies": {"chaser_mass": 500.0, "target_mass": 1000.0}}
     together = jaxhil.load("varying", {**TWO, **masses})
-    # As many keys as above: one program serves.
+    # As many keys as above: both share one program.
     both = ["bodies.chaser_mass", "bodies.target_mass"] * (len(KEYS) // 2)
     slopes = jaxhil.jacobian(together, "phase_lead", by=both)
     single = jaxhil.load("varying", {**TWO, "bodies": {"equivalent_mass": together.bodies.mass}})
@@ -359,7 +363,7 @@ def test_a_derivative_by_both_masses_is_that_by_their_sum_in_parallel():
 
 
 @pytest.mark.parametrize(
-    ("by", "said"),
+    ("by", "message"),
     [
         (
             "approach.contacts",
@@ -375,16 +379,13 @@ def test_a_derivative_by_both_masses_is_that_by_their_sum_in_parallel():
         ([], "allowed dotted paths"),
     ],
 )
-def test_what_has_no_derivative_is_refused(by, said):
-    assert said in refusal(jaxhil.jacobian, "varying", "phase_lead", by=by)
+def test_jacobian_rejects_key_without_derivative(by, message):
+    assert message in refusal(jaxhil.jacobian, "varying", "phase_lead", by=by)
 
 
-def test_figures_without_a_derivative_are_refused():
-    said = refusal(jaxhil.jacobian, "varying", "phase_lead", of="duration", by="approach.velocity")
-    assert "of: found 'duration', allowed one of restitution" in said
+def test_jacobian_rejects_metric_without_derivative():
+    message = refusal(jaxhil.jacobian, "varying", "phase_lead", of="duration", by="approach.velocity")
+    assert "of: found 'duration', allowed one of restitution" in message
     rounded = jaxhil.load("varying", {"rig.force_sensor.quantum": 0.5})
-    said = refusal(jaxhil.jacobian, rounded, "phase_lead", by="approach.velocity")
-    assert said == "rig.force_sensor.quantum: found 0.5, allowed 0: what is rounded has no derivative"
-
-
-# Laws from elsewhere.
+    message = refusal(jaxhil.jacobian, rounded, "phase_lead", by="approach.velocity")
+    assert message == "rig.force_sensor.quantum: found 0.5, allowed 0: what is rounded has no derivative"

@@ -1,4 +1,4 @@
-"""`import tuning`: five functions, the same figures as the commands, laws from outside, one-line refusals."""
+"""`import tuning`: five functions, the results of the commands, user-registered laws, one-line errors."""
 
 import json
 import os
@@ -26,8 +26,8 @@ def tuned():
 
 @pytest.mark.slow
 @pytest.mark.users_options
-def test_the_script_of_the_interface_runs(tmp_path):
-    """In a process of its own, whose jax computes in float32 and stays so."""
+def test_interface_script_runs(tmp_path):
+    """Run it in its own process, where JAX computes in float32 and must continue to."""
     shutil.copy(SCRIPT, tmp_path)
     check = "import jax; assert not jax.config.jax_enable_x64 and 'XLA_FLAGS' not in __import__('os').environ"
     (tmp_path / "script.py").write_text(f"{SCRIPT.read_text()}\n{check}\n")
@@ -49,29 +49,29 @@ def test_the_script_of_the_interface_runs(tmp_path):
     assert written == {SCRIPT.name, "script.py", "run.csv", "run.png", "gains.json", "bundle"}
 
 
-def test_nothing_is_loaded_before_it_is_asked_for():
+def test_tuning_import_is_lazy():
     code = "import sys, tuning; assert 'sweep' in dir(tuning); tuning.sweep; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.slow
-def test_the_command_tunes_the_same(jaxhil, tuned, tmp_path):
+def test_tune_function_equals_tune_command(jaxhil, tuned, tmp_path):
     jaxhil("tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY)
     written = json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())
     assert written["sha256"] == tuned.document["sha256"]
     assert tuned.verdict == "bad" and tuned.figures["tuned"].rms < tuned.figures["before"].rms
 
 
-def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypatch, capsys):
+def test_sweep_without_folder_equals_stored_sweep(tuned, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     study = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5)
     assert not list(tmp_path.iterdir()) and capsys.readouterr() == ("", "")
-    kept = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5, folder="store")
-    assert study.table.equals(kept.table) and study.table.num_rows == 40
-    assert study.failure_probability == kept.failure_probability
+    stored = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5, folder="store")
+    assert study.table.equals(stored.table) and study.table.num_rows == 40
+    assert study.failure_probability == stored.failure_probability
     assert study.interval.low <= study.failure_probability <= study.interval.high
-    with study.store() as one, kept.store() as other:
-        assert one.manifest.sha256 == other.manifest.sha256
+    with study.store() as first, stored.store() as second:
+        assert first.manifest.sha256 == second.manifest.sha256
     again = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5, folder="store", resume=True)
     max(Path("store", "parts").iterdir()).unlink()
     with pytest.raises(jaxhil.InputError, match="store: found 32 scenarios, allowed the study's 40"):
@@ -79,7 +79,7 @@ def test_a_study_that_keeps_nothing_is_the_stored_one(tuned, tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_laws_from_outside_go_all_the_way(tmp_path):
+def test_user_registered_laws_are_tuned_swept_exported_and_verified(tmp_path):
     jaxhil.register(SquaredSpring())
     jaxhil.register(ScaledLead())
     contact = {"law": "squared_spring", "stiffness": [1e8]}
@@ -107,15 +107,15 @@ def test_laws_from_outside_go_all_the_way(tmp_path):
     assert tuning.verify(tmp_path / "bundle").good
 
     class Other(ScaledLeadOnTheRig):
-        """The same, by another source."""
+        """The same controller from another source."""
 
     jaxhil.register(ScaledLead(), runtime=Other)
-    found = tuning.verify(tmp_path / "bundle")
-    assert not found.good and "jaxhil_runtime.py: is not what this version exports" in found.reasons
+    actual = tuning.verify(tmp_path / "bundle")
+    assert not actual.good and "jaxhil_runtime.py: is not what this version exports" in actual.reasons
 
 
 @pytest.mark.slow
-def test_an_objective_of_the_users_own_gets_contacts_and_scenarios():
+def test_user_objective_receives_contacts_and_scenarios():
     shapes = []
 
     def largest(metrics):
@@ -139,7 +139,7 @@ def test_an_objective_of_the_users_own_gets_contacts_and_scenarios():
         ("least", "rms, cvar, worst"),
     ],
 )
-def test_an_objective_that_will_not_do_is_refused(objective, words):
+def test_tune_rejects_unusable_objective(objective, words):
     with pytest.raises(jaxhil.InputError, match="objective: found") as refused:
         tuning.tune("rig-300kg", "phase_lead", objective=objective, **SMALL)
     assert words in str(refused.value) and "\n" not in str(refused.value)
@@ -169,7 +169,7 @@ def test_an_objective_that_will_not_do_is_refused(objective, words):
         (lambda: tuning.verify("nowhere", scenarios=0), "scenarios: found 0"),
     ],
 )
-def test_what_will_not_do_is_refused_in_one_line(call, words):
+def test_tuning_functions_reject_unusable_arguments_in_one_line(call, words):
     with pytest.raises(jaxhil.InputError) as refused:
         call()
     assert words in str(refused.value) and "\n" not in str(refused.value)

@@ -1,4 +1,4 @@
-"""Gain files: written whole, read back equal, refused in one line; the envelope against integration."""
+"""Gain files: written whole, read back equal, rejected in one line; envelope compared with integration."""
 
 import copy
 import itertools
@@ -29,7 +29,7 @@ ENVELOPE = {"delay": {"low": 0.01, "high": 0.012, "unit": "s"}}
 
 
 def make(mechanism_name="varying", compensator="response_error", overrides=(), **changes):
-    """The document of a mechanism with gains by the literature's rule, or as in `changes`."""
+    """Return the document of a mechanism with gains by the literature's rule, or as in `changes`."""
     mechanism, sha256, _ = load(mechanism_name, overrides)
     gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
     gains.update(changes)
@@ -39,7 +39,7 @@ def make(mechanism_name="varying", compensator="response_error", overrides=(), *
 
 @pytest.mark.parametrize("compensator", COMPENSATORS)
 @pytest.mark.parametrize("mechanism_name", builtin_names())
-def test_what_is_written_is_read_back(mechanism_name, compensator, tmp_path):
+def test_gain_file_is_read_back_as_written(mechanism_name, compensator, tmp_path):
     document = make(mechanism_name, compensator)
     path = tmp_path / "gains.json"
     write_gain_file(path, document)
@@ -52,14 +52,14 @@ def test_what_is_written_is_read_back(mechanism_name, compensator, tmp_path):
     assert Controller.from_file(path).control_period == loaded.mechanism.rig.control_period
 
 
-def test_digest_leaves_out_date_and_timings():
+def test_gain_file_digest_ignores_date_and_timings():
     document = make()
     later = {**document, "created": "2031-01-01T00:00:00+00:00", "timings": {}}
     assert digest(later) == digest(document) == document["sha256"]
     assert digest({**document, "seed": 8}) != document["sha256"]
 
 
-def test_units_and_bounds_are_the_registry_s():
+def test_gain_file_units_and_bounds_are_those_of_the_registry():
     document, mechanism = make(), load("varying").mechanism
     for gain in COMPENSATORS["response_error"].gains:
         entry = document["gains"][gain.name]
@@ -70,13 +70,13 @@ def test_units_and_bounds_are_the_registry_s():
         )
 
 
-def test_overrides_are_in_the_file():
+def test_gain_file_contains_overrides():
     loaded = check_document(make(overrides=["contact.stiffness=5e4", "rig.force_sensor.range=900"]))
     assert loaded.mechanism.contact.stiffness == [5e4]
     assert loaded.mechanism.rig.force_sensor.range == 900.0
 
 
-def test_written_as_sorted_ascii_json_and_signed(tmp_path):
+def test_gain_file_is_sorted_ascii_json_with_digest(tmp_path):
     path = tmp_path / "gains.json"
     document = make()
     write_gain_file(path, {**document, "note": "Dämpfung", "sha256": "stale"})
@@ -88,7 +88,7 @@ def test_written_as_sorted_ascii_json_and_signed(tmp_path):
     assert load_gain_file(path).document["note"] == "Dämpfung"
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_gain_file_survives_failed_write(tmp_path, monkeypatch):
     path = tmp_path / "gains.json"
     write_gain_file(path, make())
     before = path.read_bytes()
@@ -106,12 +106,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["gains.json"]
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_gain_file_write_rejects_missing_folder(tmp_path):
     with pytest.raises(InputError, match="cannot be written: No such file or directory"):
         write_gain_file(tmp_path / "nowhere" / "gains.json", make())
 
 
-def test_what_is_not_finite_becomes_null():
+def test_plain_replaces_non_finite_values_by_null():
     Pair = namedtuple("Pair", "error peak")
     value = {"a": np.array([1.0, np.nan]), "b": (np.inf, 2), "c": np.float32(0.5), "d": Pair(-math.inf, True)}
     assert plain(value) == {"a": [1.0, None], "b": [None, 2], "c": 0.5, "d": {"error": None, "peak": True}}
@@ -127,12 +127,12 @@ def test_what_is_not_finite_becomes_null():
         ({"phase_leed": 0.0}, "gains: phase_leed: found an extra gain, allowed phase_lead, "),
     ],
 )
-def test_gains_that_do_not_fit(changes, message):
+def test_build_document_rejects_gains_out_of_bounds(changes, message):
     with pytest.raises(InputError, match=message):
         make(**changes)
 
 
-def test_missing_gain_and_unknown_compensator():
+def test_build_document_rejects_missing_gain_and_unknown_compensator():
     mechanism, sha256, _ = load("varying")
     with pytest.raises(
         InputError, match="gains: lead_filter: found nothing, allowed phase_lead, lead_filter"
@@ -142,12 +142,12 @@ def test_missing_gain_and_unknown_compensator():
         build_document("pid", {}, mechanism, sha256, {}, {}, 0, {})
 
 
-def test_rounding_beyond_a_bound_is_put_on_it():
+def test_build_document_clips_rounding_beyond_bound():
     assert make(forgetting=1.0 + 2e-16 * 5)["gains"]["forgetting"]["value"] == 1.0
 
 
 def change(document, path, value):
-    """A signed copy of the document with the value at a dotted path replaced, or removed if None."""
+    """Return a signed copy of the document with the value at a dotted path replaced, or removed if None."""
     document = copy.deepcopy(document)
     *parents, last = path.split(".")
     table = document
@@ -188,7 +188,7 @@ def change(document, path, value):
         ("timings", None, "timings: found nothing"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(path, value, message, tmp_path):
+def test_gain_file_rejects_inconsistent_entry(path, value, message, tmp_path):
     file = tmp_path / "gains.json"
     file.write_text(json.dumps(change(make(), path, value)))
     with pytest.raises(InputError) as caught:
@@ -198,7 +198,7 @@ def test_a_file_that_does_not_fit_is_refused(path, value, message, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff", b'{"schema": NaN}', b"[" * 100_000])
-def test_what_is_no_gain_file_is_refused(content, tmp_path):
+def test_gain_file_rejects_other_content(content, tmp_path):
     file = tmp_path / "gains.json"
     file.write_bytes(content)
     with pytest.raises(InputError) as caught:
@@ -207,7 +207,7 @@ def test_what_is_no_gain_file_is_refused(content, tmp_path):
 
 
 def assert_refused_everywhere(file, document, text, jaxhil):
-    """Check that the library, the rig's controller and the commands refuse a document in the same line."""
+    """Check that library, rig controller and commands reject a document with the same message."""
     file.write_text(json.dumps({**document, "sha256": digest(document)}))
     for read, error in ((load_gain_file, InputError), (Controller.from_file, GainFileError)):
         with pytest.raises(error) as caught:
@@ -217,7 +217,7 @@ def assert_refused_everywhere(file, document, text, jaxhil):
         assert jaxhil(*command, file) == Ran(2, "", f"jaxhil: {text}\n")
 
 
-def test_gain_file_of_an_earlier_version_is_refused_with_the_way_to_a_new_one(tmp_path, jaxhil):
+def test_gain_file_of_earlier_version_is_rejected_with_advice(tmp_path, jaxhil):
     file, document = tmp_path / "gains.json", make("varying", "impulse_ledger")
     for name in ("prior_friction_spread", "prior_preload_spread"):
         del document["gains"][name]
@@ -229,13 +229,13 @@ def test_gain_file_of_an_earlier_version_is_refused_with_the_way_to_a_new_one(tm
 
 
 @pytest.mark.parametrize("law", ["retrospective_reference", "retrospective_delay_bank"])
-def test_gain_file_of_a_retired_law_is_refused_with_its_replacement(law, tmp_path, jaxhil):
+def test_gain_file_of_retired_compensator_is_rejected_with_replacement(law, tmp_path, jaxhil):
     file, document = tmp_path / "gains.json", make("varying", "impulse_ledger")
     text = f"{file}: compensator: found '{law}', expected 'impulse_ledger', which replaces it"
     assert_refused_everywhere(file, {**document, "compensator": law}, text, jaxhil)
 
 
-def test_an_edit_without_a_new_digest_is_refused(tmp_path):
+def test_gain_file_rejects_edit_without_new_digest(tmp_path):
     file = tmp_path / "gains.json"
     write_gain_file(file, make())
     file.write_text(file.read_text().replace('"value": 0.98', '"value": 0.97'))
@@ -249,7 +249,7 @@ DOCUMENT = make()
 
 
 def places(value, path=()):
-    """Every path into nested objects and lists."""
+    """Yield every path into nested objects and lists."""
     yield path
     entries = (
         value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -267,7 +267,7 @@ JSON = st.recursive(
 
 @settings(max_examples=200, deadline=None)
 @given(st.sampled_from([path for path in places(DOCUMENT) if path]), JSON)
-def test_any_change_is_taken_or_refused_in_one_line(path, value):
+def test_gain_file_accepts_or_rejects_any_change_in_one_line(path, value):
     document = copy.deepcopy(DOCUMENT)
     table = document
     for key in path[:-1]:
@@ -282,7 +282,7 @@ def test_any_change_is_taken_or_refused_in_one_line(path, value):
         assert loaded.document is document
 
 
-def test_envelope_of_a_linear_contact():
+def test_envelope_of_linear_contact_matches_closed_form():
     mechanism = load("varying").mechanism
     draws = {
         "contact.stiffness": np.array([[1e5, 4e5, 5e4], [2e5, 8e5, 1e5]]),
@@ -307,13 +307,13 @@ def test_envelope_of_a_linear_contact():
         np.testing.assert_allclose([envelope[name]["low"], envelope[name]["high"]], [low, high], rtol=1e-12)
 
 
-def test_envelope_counts_only_contacts_that_are_made():
+def test_envelope_counts_only_simulated_contacts():
     mechanism = load("varying", ["approach.contacts=1"]).mechanism
     frequency = validity_envelope(mechanism, build_scenarios(mechanism))["contact_frequency"]
     np.testing.assert_allclose([frequency["low"], frequency["high"]], math.sqrt(124355 / 350) / (2 * math.pi))
 
 
-def test_envelope_of_hunt_crossley_is_that_of_the_typical_stiffness():
+def test_envelope_of_hunt_crossley_uses_typical_stiffness():
     overrides = ["contact.law=hunt_crossley", "contact.stiffness=[1e7]", "contact.damping=[0.1]"]
     mechanism = load("claw-350kg", [*overrides, "contact.exponent=1.3"]).mechanism
     envelope = validity_envelope(mechanism, build_scenarios(mechanism))
@@ -321,8 +321,8 @@ def test_envelope_of_hunt_crossley_is_that_of_the_typical_stiffness():
     np.testing.assert_allclose(envelope["contact_frequency"]["low"], omega / (2 * math.pi), rtol=1e-12)
 
 
-def test_envelope_of_a_law_from_elsewhere():
-    """F = k d^2: M v^2/2 = k d^3/3, and F = k^(1/3) (3 M v^2/2)^(2/3); damping is none of its."""
+def test_envelope_of_user_registered_contact_law():
+    """F = k d^2: M v^2/2 = k d^3/3, so F = k^(1/3) (3 M v^2/2)^(2/3); the law has no damping."""
     jaxhil.register(SquaredSpring())
     stiffness, velocity = np.array([[4e8, 1e9], [2e8, 5e8]]), np.array([0.004, 0.006])
     overrides = ["contact.law=squared_spring", "contact.stiffness=[1e9, 5e8]", "approach.contacts=2"]
@@ -332,12 +332,12 @@ def test_envelope_of_a_law_from_elsewhere():
     force = np.cbrt(stiffness) * np.cbrt((1.5 * 300 * velocity**2) ** 2)
     frequency = force / (velocity * 300) / (2 * math.pi)
     for name, values in (("force", force), ("contact_frequency", frequency)):
-        found = [envelope[name]["low"], envelope[name]["high"]]
-        np.testing.assert_allclose(found, [np.min(values), np.max(values)], rtol=1e-6)
+        result = [envelope[name]["low"], envelope[name]["high"]]
+        np.testing.assert_allclose(result, [np.min(values), np.max(values)], rtol=1e-6)
 
 
 @pytest.mark.parametrize("velocity", [0.002, 0.005, 0.01, 0.05])
-def test_envelope_of_layers_by_integration(velocity):
+def test_envelope_of_layers_matches_integration(velocity):
     mechanism = load("layered", [f"approach.velocity={velocity}", "approach.contacts=1"]).mechanism
     slopes, depths = [8e4, 1.6e5, 3.2e5], [0.0002, 0.0004]
 
@@ -346,7 +346,7 @@ def test_envelope_of_layers_by_integration(velocity):
         return sum(k * max(0.0, min(depth, b) - a) for k, a, b in zip(slopes, edges, edges[1:], strict=False))
 
     def work(depth):
-        # Trapezes between the corners are exact.
+        # The trapezoidal rule between the corners is exact.
         corners = [d for d in (0.0, *depths) if d < depth] + [depth]
         return sum((force(a) + force(b)) / 2 * (b - a) for a, b in itertools.pairwise(corners))
 

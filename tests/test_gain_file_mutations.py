@@ -1,4 +1,4 @@
-"""A gain file that is corrupted in any way is refused, or loads the very same values; never anything else."""
+"""A corrupted gain file is rejected or loads exactly the same values."""
 
 import json
 import random
@@ -17,46 +17,48 @@ ALPHABET = b'0123456789.-+eE,:{}[]" \n\ttruefalsnINaity\\/\x00\xff'
 
 
 def content() -> bytes:
-    """A gain file with limits, some of them null."""
+    """Return a gain file with limits, some of them null."""
     document = gain_document()
     document["limits"] = {
-        name: {"value": None if one.default == one.highest else one.default, "unit": one.unit}
-        for name, one in LIMITS.items()
+        name: {"value": None if limit.default == limit.highest else limit.default, "unit": limit.unit}
+        for name, limit in LIMITS.items()
     }
     return json.dumps(sign(document), indent=2, sort_keys=True).encode()
 
 
 def mutated(whole: bytes, rng: random.Random) -> bytes:
-    """The file with one of the ways in which files go wrong."""
-    place = rng.randrange(len(whole))
+    """Return the file with one typical corruption."""
+    index = rng.randrange(len(whole))
     other = rng.randrange(len(whole))
     kind = rng.randrange(9)
-    if kind == 0:  # a bit falls over
-        return whole[:place] + bytes([whole[place] ^ 1 << rng.randrange(8)]) + whole[place + 1 :]
+    if kind == 0:  # a bit is flipped
+        return whole[:index] + bytes([whole[index] ^ 1 << rng.randrange(8)]) + whole[index + 1 :]
     if kind == 1:  # another character
-        return whole[:place] + bytes([rng.choice(ALPHABET)]) + whole[place + 1 :]
-    if kind == 2:  # one too many
-        return whole[:place] + bytes([rng.choice(ALPHABET)]) + whole[place:]
-    if kind == 3:  # one is lost
-        return whole[:place] + whole[place + 1 :]
-    if kind == 4:  # two neighbours change places
-        return whole[:place] + whole[place : place + 2][::-1] + whole[place + 2 :]
+        return whole[:index] + bytes([rng.choice(ALPHABET)]) + whole[index + 1 :]
+    if kind == 2:  # an extra character
+        return whole[:index] + bytes([rng.choice(ALPHABET)]) + whole[index:]
+    if kind == 3:  # a lost character
+        return whole[:index] + whole[index + 1 :]
+    if kind == 4:  # two neighbours are swapped
+        return whole[:index] + whole[index : index + 2][::-1] + whole[index + 2 :]
     if kind == 5:  # the end is lost
-        return whole[:place]
-    if kind == 6:  # a block is lost, or there twice
-        return whole[:place] + whole[other:]
+        return whole[:index]
+    if kind == 6:  # a block is lost or duplicated
+        return whole[:index] + whole[other:]
     digits = [n for n, byte in enumerate(whole) if chr(byte).isdigit()]
-    place = rng.choice(digits)
-    if kind == 7:  # a digit is another
-        return whole[:place] + str(rng.randrange(10)).encode() + whole[place + 1 :]
-    line = whole.split(b"\n")  # lines change places
+    index = rng.choice(digits)
+    if kind == 7:  # a digit is changed
+        return whole[:index] + str(rng.randrange(10)).encode() + whole[index + 1 :]
+    line = whole.split(b"\n")  # lines are swapped
     first, second = rng.randrange(len(line)), rng.randrange(len(line))
     line[first], line[second] = line[second], line[first]
     return b"\n".join(line)
 
 
 def check(count: int, seed: int, path: Path) -> dict[str, int]:
-    """Mutate `count` times; how many were refused and loaded. Raises AssertionError for what must not be."""
+    """Mutate `count` times; return how many files were rejected and loaded. Raise AssertionError for a wrong
+    load.
+    """
     whole = content()
     path.write_bytes(whole)
     expected = on_the_rig(path)
@@ -65,11 +67,11 @@ def check(count: int, seed: int, path: Path) -> dict[str, int]:
     counts = {"refused": 0, "loaded": 0}
     for _ in range(count):
         path.write_bytes(mutated(whole, rng))
-        found = on_the_rig(path)
-        counts["refused" if found is None else "loaded"] += 1
-        assert found in (None, expected), path.read_bytes()
-        if found is not None:
-            # What the rig takes, every other command takes or refuses, with the same values.
+        result = on_the_rig(path)
+        counts["refused" if result is None else "loaded"] += 1
+        assert result in (None, expected), path.read_bytes()
+        if result is not None:
+            # Other commands accept or reject what the rig accepts, with the same values.
             try:
                 loaded = load_gain_file(path)
             except InputError as error:
@@ -87,13 +89,13 @@ def on_the_rig(path: Path) -> GainFile | None:
         return None
 
 
-def test_mutations_are_refused_or_load_the_same_values(tmp_path):
+def test_mutated_gain_file_is_rejected_or_loads_equal_values(tmp_path):
     counts = check(1500, 0, tmp_path / "gains.json")
     assert counts["refused"] > 1000 and counts["loaded"] > 10
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_mutations_are_refused_or_load_the_same_values(tmp_path):
+def test_mutated_gain_file_never_loads_other_values_in_100000_mutations(tmp_path):
     counts = check(100_000, 1, tmp_path / "gains.json")
     print(counts)
     assert sum(counts.values()) == 100_000 and counts["loaded"] > 500

@@ -1,4 +1,4 @@
-"""The gates of either side, jax and the rig's: a triangle of two periods over the time beyond a threshold."""
+"""Gates of JAX and of the runtime: a triangle of two periods over the time beyond a threshold."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ PHASES = np.linspace(0, 1, 21)
 
 
 def on_jax(positions, clearance=np.inf):
-    """Gate at every tick of a reading (ticks, lanes), but for the first."""
+    """Return the gate at every tick of a reading (ticks, lanes), except the first."""
     return np.asarray(_gates(jnp.asarray(positions), clearance))
 
 
@@ -38,7 +38,7 @@ def _shares(positions, clearance):
 @jax.jit
 @jax.grad
 def slope(positions, clearance):
-    """Of the last gate, by every reading (ticks,)."""
+    """Return the derivative of the last gate by every reading (ticks,)."""
     shares = _shares(positions, clearance)
     return gate(shares[1], shares[0])
 
@@ -60,37 +60,37 @@ SIDES = pytest.mark.parametrize("gates", [on_jax, rig])
 
 
 def crossing(enters, leaves):
-    """(ticks, lanes) of a reading that is beyond 0 from one time to the other, in periods."""
+    """Return a reading (ticks, lanes) that is beyond 0 between the two times, in periods."""
     rising, falling = TICKS[:, None] - enters, leaves - TICKS[:, None]
     return np.where(rising < falling, rising, falling)
 
 
 @SIDES
-def test_the_sum_is_the_time_beyond_and_the_delay_one_period(gates):
+def test_gate_sum_is_time_in_contact_and_delay_is_one_period(gates):
     enters, duration = (leaf.ravel() for leaf in np.meshgrid(PHASES, 7.3 + PHASES))
     leaves = enters + duration
-    found = gates(crossing(enters, leaves))
-    np.testing.assert_allclose(found.sum(axis=0), duration, rtol=0, atol=1e-13)
-    moment = np.einsum("t,tn->n", TICKS[1:], found)
+    result = gates(crossing(enters, leaves))
+    np.testing.assert_allclose(result.sum(axis=0), duration, rtol=0, atol=1e-13)
+    moment = np.einsum("t,tn->n", TICKS[1:], result)
     np.testing.assert_allclose(moment, (leaves**2 - enters**2) / 2 + duration, rtol=0, atol=1e-11)
 
 
 @SIDES
-def test_inside_one_outside_zero_and_between_them_the_triangle(gates):
-    found = gates(crossing(PHASES, PHASES + 20))
+def test_gate_is_one_inside_zero_outside_and_triangular_between(gates):
+    result = gates(crossing(PHASES, PHASES + 20))
     age = TICKS[1:, None] - PHASES
-    # The integral of the triangle over the time since the entry, up to two periods.
+    # The integral of the triangle over the time since the onset, up to two periods.
     entered = np.where(age < 1, age**2 / 2, 1 - (2 - age) ** 2 / 2)
     entered = np.where(age < 0, 0, np.where(age > 2, 1, entered))
     early = TICKS[1:] < 15
-    np.testing.assert_allclose(found[early], entered[early], rtol=0, atol=1e-14)
-    # The way out mirrors the way in.
+    np.testing.assert_allclose(result[early], entered[early], rtol=0, atol=1e-14)
+    # The release mirrors the onset.
     left = gates(crossing(PHASES - 20, PHASES))
     np.testing.assert_allclose(left[early][1:], 1 - entered[early][1:], rtol=0, atol=1e-14)
-    assert np.all((found >= 0) & (found <= 1)) and np.any(found == 1) and np.any(found == 0)
+    assert np.all((result >= 0) & (result <= 1)) and np.any(result == 1) and np.any(result == 0)
 
 
-def test_once_differentiable_in_the_time_of_the_crossing():
+def test_gate_is_continuously_differentiable_in_crossing_time():
     def gates_of(enters):
         x = jnp.asarray(TICKS, float) - enters
         excess = jnp.where(x > 0, x, 0)
@@ -98,7 +98,7 @@ def test_once_differentiable_in_the_time_of_the_crossing():
         return gate(shares[1:], shares[:-1])
 
     slope_of = jax.jit(jax.jacfwd(gates_of))
-    for at in (-1.0, 0.0, 2.0):  # where an entry moves to another tick
+    for at in (-1.0, 0.0, 2.0):  # where an onset moves to another tick
         slopes = [slope_of(jnp.asarray(at + side)) for side in (-1e-9, 0.0, 1e-9)]
         np.testing.assert_allclose(slopes[0], slopes[2], rtol=0, atol=1e-8)
         np.testing.assert_allclose(slopes[1], slopes[2], rtol=0, atol=1e-8)
@@ -106,12 +106,12 @@ def test_once_differentiable_in_the_time_of_the_crossing():
 
 
 @SIDES
-def test_two_surfaces(gates):
+def test_gate_with_two_surfaces_opens_in_the_gap(gates):
     """A reading that crosses the gap is free for the time in the gap; less if that is under two periods."""
     speed = np.array([0.5, 1.1, 2.9, 6.0, 30.0])
     down = 10.5 * speed - speed * TICKS[:, None]
-    found = gates(down, CLEARANCE)[8:]
-    free = (1 - found).sum(axis=0)
+    result = gates(down, CLEARANCE)[8:]
+    free = (1 - result).sum(axis=0)
     np.testing.assert_allclose(free[:2], CLEARANCE / speed[:2], rtol=0, atol=1e-12)
     assert np.all((free[2:] > 0) & (free[2:] < CLEARANCE / speed[2:]))
     assert np.all(gates(np.full((5, 1), -1.0), CLEARANCE) == 0)
@@ -119,15 +119,15 @@ def test_two_surfaces(gates):
     assert np.all(gates(np.array([[1.0], [-1.0], [2.0]]), 0.0)[1:] == 1)
 
 
-# Neither they nor their differences are subnormal: XLA's programs take such numbers for 0.
+# Neither values nor their differences are subnormal: XLA programs flush such numbers to 0.
 NORMAL = st.floats(-1e3, 1e3).filter(lambda x: x == 0 or abs(x) > 1e-290)
 READINGS = NORMAL | st.sampled_from([0.0, 1e-300, -1e-300, -CLEARANCE])
 
 
 @given(st.lists(READINGS, min_size=3, max_size=3), st.sampled_from([np.inf, 0.0, CLEARANCE]))
-def test_both_sides_agree_and_have_derivatives_anywhere(readings, clearance):
+def test_gate_agrees_between_jax_and_runtime_with_finite_derivatives(readings, clearance):
     x = np.array(readings)[:, None]
     np.testing.assert_allclose(on_jax(x, clearance), rig(x, clearance), rtol=0, atol=1e-12)
-    # A change of a few denormals has a slope that no float holds.
+    # The slope of a change of a few denormals overflows.
     if np.abs(np.diff(x, axis=0))[np.diff(x, axis=0) != 0].min(initial=1.0) > 1e-150:
         assert np.all(np.isfinite(slope(jnp.asarray(x[:, 0]), clearance)))

@@ -1,4 +1,4 @@
-"""The search of the whole box, blind to the tuned gains: how far they are from what it found."""
+"""Global search of the whole box without the tuned gains, and their distance from its optimum."""
 
 import numpy as np
 import pytest
@@ -18,20 +18,20 @@ def validation():
 
 
 @pytest.mark.slow
-def test_a_gradient_optimum_is_confirmed_and_a_bad_one_exposed(validation):
-    (found,) = find_gains(validation, SETTINGS)
-    assert found.best is not None
-    good = compare_with_global_search(validation, 0, found, SETTINGS, factor=20)
+def test_global_search_confirms_good_optimum_and_exposes_bad_one(validation):
+    (result,) = find_gains(validation, SETTINGS)
+    assert result.best is not None
+    good = compare_with_global_search(validation, 0, result, SETTINGS, factor=20)
     assert good is not None
-    assert good.spent == found.evaluations and good.evaluations <= 20 * good.spent
-    assert good.tuned == pytest.approx(found.best.rms, rel=1e-9)
+    assert good.spent == result.evaluations and good.evaluations <= 20 * good.spent
+    assert good.tuned == pytest.approx(result.best.rms, rel=1e-9)
     assert abs(good.above) < 0.02
     assert good.above == pytest.approx(good.tuned / good.best - 1)
-    astray = found.best._replace(coordinates=np.clip(found.best.coordinates + 0.1, 0, 1))
-    bad = compare_with_global_search(validation, 0, found._replace(best=astray), SETTINGS, factor=20)
+    astray = result.best._replace(coordinates=np.clip(result.best.coordinates + 0.1, 0, 1))
+    bad = compare_with_global_search(validation, 0, result._replace(best=astray), SETTINGS, factor=20)
     assert bad is not None
     assert bad.best == good.best and bad.above > 0.5
 
 
-def test_where_all_starts_failed_there_is_nothing_to_certify(validation):
+def test_global_search_returns_none_if_all_starts_failed(validation):
     assert compare_with_global_search(validation, 0, MultistartResult(None, [], 100), SETTINGS) is None

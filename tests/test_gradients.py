@@ -1,10 +1,10 @@
-"""Forward-mode derivatives of the restitution against central differences, scenario by scenario.
+"""Forward-mode derivatives of the restitution compared with central differences, scenario by scenario.
 
-200 random scenarios of the built-in `varying` mechanism, random gains within their bounds: the derivative of
-the first contact's restitution by every gain of response_error, by both delays, stiffness and damping. The
-loop is piecewise smooth: where a discrete event moves to another tick within the step of the difference, the
-two rightly differ, and the event is found by its name. The law's gates have a derivative there too: over an
-identification delay that crosses any number of ticks the restitution is one smooth curve.
+Take 200 random scenarios of the built-in `varying` mechanism and random gains within their bounds: the
+derivative of the first contact's restitution by every gain of response_error, by both delays, stiffness and
+damping. The loop is piecewise smooth: if a discrete event moves to another tick within the step of the
+difference, the two rightly differ, and the event is named. The compensator's gates have a derivative there
+too: over an identification delay that crosses any number of ticks, the restitution is one smooth curve.
 """
 
 import functools
@@ -25,7 +25,7 @@ from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
 
 SCENARIOS = 200
-SPARE = 16  # scenarios drawn beyond, for those whose contact ends late or never under their gains
+SPARE = 16  # extra scenarios, to replace those whose contact ends late or never under their gains
 LONGEST = 480  # ticks
 GAINS = COMPENSATORS["response_error"].gains
 PHYSICAL = ("force_delay", "simulator_delay", "stiffness", "damping")
@@ -33,14 +33,14 @@ NAMES = (*(gain.name for gain in GAINS), *PHYSICAL)
 OFFSETS = np.array([-2.0, -1.0, 1.0, 2.0])
 WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12  # error of fourth order in the step
 STEPS = (1e-6, 1e-5)  # of the scale of each parameter
-AGREEING = 48  # pairs of a parameter and a scenario, of those that agree, whose runs are recorded
+AGREEING = 48  # recorded pairs of a parameter and a scenario that agree
 
 MECHANISM = load("varying").mechanism
 PERIOD = MECHANISM.rig.control_period
 
 
 def random_gains(number):
-    """Uniform within bounds, log-uniform where searched so; the threshold up to ten times its nominal."""
+    """Draw gains within bounds, log-uniform where searched so; the threshold up to ten times its nominal."""
     generator = np.random.default_rng(3)
     gains = {}
     for gain in GAINS:
@@ -53,13 +53,13 @@ def random_gains(number):
 
 
 def scales(values):
-    """What a step is a fraction of, by name: a gain's range, or the value itself."""
+    """Return the scale of each parameter's step by name: a gain's range, or the value itself."""
     ranges = {g.name: g.upper(MECHANISM) - g.lower(MECHANISM) for g in GAINS if not g.logarithmic}
     return {name: np.full(SCENARIOS, ranges[name]) if name in ranges else values[name] for name in NAMES}
 
 
 def problem(scenario, values):
-    """(gains, scenario) with the parameters of `values`."""
+    """Return (gains, scenario) with the parameters of `values`."""
     table = scenario.contact.stiffness.shape
     contact = scenario.contact._replace(
         stiffness=jnp.broadcast_to(values["stiffness"], table),
@@ -82,7 +82,7 @@ evaluate = jax.jit(restitution, static_argnums=0, compiler_options=QUICK)
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def derivatives(loop, scenario, values):
-    """(parameters, scenarios)"""
+    """Return the derivatives, (parameters, scenarios)."""
 
     def along(index):
         tangents = {
@@ -100,18 +100,18 @@ def chosen(scenario, lanes):
 
 @pytest.fixture(scope="module")
 def study():
-    """(loop, scenario, values by name, scales by name, derivatives in units of the scales)."""
+    """Return (loop, scenario, values by name, scales by name, derivatives in units of the scales)."""
     number = SCENARIOS + SPARE
     scenario = join([build_scenarios(MECHANISM, draw(MECHANISM, number, seed=11))])
     scenario = scenario._replace(contacts=np.ones(number, np.int32))
     values = random_gains(number) | {
         "force_delay": scenario.force_sensor.delay,
-        # Nominal is a whole number of periods: every step would cross it.
+        # The nominal value is a whole number of periods: every step would cross it.
         "simulator_delay": np.random.default_rng(4).uniform(0.0031, 0.0049, number),
         "stiffness": scenario.contact.stiffness[0],
         "damping": scenario.contact.damping[0],
     }
-    # As many lanes as the differences have: one program serves.
+    # As many lanes as the differences have: both share one program.
     lanes = np.resize(np.arange(number), len(OFFSETS) * SCENARIOS)
     loop = build_loop(MECHANISM, "response_error", scenario)
     ticks = np.asarray(evaluate(loop, *chosen((scenario, values), lanes))[1])[:number]
@@ -126,20 +126,20 @@ def study():
 
 
 def differences(study, step):
-    """Central differences (parameters, scenarios), in units of the scales."""
+    """Return central differences (parameters, scenarios), in units of the scales."""
     loop, scenario, values, scale, _ = study
     lanes = np.tile(np.arange(SCENARIOS), len(OFFSETS))
-    copies, found = chosen(scenario, lanes), []
+    copies, result = chosen(scenario, lanes), []
     for name in NAMES:
         moved = {other: value[lanes] for other, value in values.items()}
         moved[name] += step * np.repeat(OFFSETS, SCENARIOS) * scale[name][lanes]
-        found.append(np.asarray(evaluate(loop, copies, moved)[0]).reshape(len(OFFSETS), SCENARIOS))
-    return np.einsum("o,pos->ps", WEIGHTS, np.stack(found)) / step
+        result.append(np.asarray(evaluate(loop, copies, moved)[0]).reshape(len(OFFSETS), SCENARIOS))
+    return np.einsum("o,pos->ps", WEIGHTS, np.stack(result)) / step
 
 
 @pytest.fixture(scope="module")
 def disagreements(study):
-    """By step, the (parameter, scenario) pairs for which derivative and difference do not agree."""
+    """Return by step the (parameter, scenario) pairs for which derivative and difference disagree."""
     exact = study[-1]
     return {
         step: np.argwhere(~(np.abs(differences(study, step) - exact) <= 1e-5 * np.abs(exact) + 1e-8))
@@ -147,23 +147,25 @@ def disagreements(study):
     }
 
 
-def test_derivatives_are_finite_and_not_idle(study):
+def test_restitution_derivatives_are_finite_and_nonzero(study):
     exact = study[-1]
     assert np.all(np.isfinite(exact))
-    # Every parameter moves most scenarios' restitution, the threshold included.
+    # Every parameter, including the threshold, changes the restitution of most scenarios.
     moved = np.mean(np.abs(exact) > 1e-6, axis=1)
     assert np.all(moved > 0.5), dict(zip(NAMES, moved, strict=True))
 
 
-def test_derivatives_agree_with_central_differences(disagreements):
+def test_restitution_derivatives_match_central_differences(disagreements):
     scenarios = np.unique(disagreements[1e-6][:, 1])
     assert len(scenarios) <= 0.01 * SCENARIOS
 
 
 @pytest.fixture(scope="module")
 def sweep():
-    """(delay [s], restitution, its derivative [1/s]) of the nominal first contact, the identification delay
-    in fine steps over more than two periods."""
+    """Return (delay [s], restitution, its derivative [1/s]) of the nominal first contact.
+
+    The identification delay varies in fine steps over more than two periods.
+    """
     delay = np.arange(2.7, 5.3, 0.005) * PERIOD
     scenario = join([build_scenarios(MECHANISM, {"approach.phase": np.full(len(delay), 0.4)})])
     scenario = scenario._replace(contacts=np.ones(len(delay), np.int32))
@@ -181,17 +183,17 @@ def sweep():
 
 
 def test_restitution_is_continuous_in_the_identification_delay(sweep):
-    """Ticks enter the gates and leave them all along the way."""
+    """Ticks enter and leave the gates over the whole range."""
     delay, restitution, slope = sweep
     steps = np.diff(restitution)
     assert np.abs(restitution[-1] - restitution[0]) > 0.01
-    # Each step is the integral of the derivative over it: no jump is left over.
+    # Each step equals the integral of the derivative over it: there is no jump.
     expected = np.diff(delay) * (slope[1:] + slope[:-1]) / 2
     np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(steps.sum(), expected.sum(), rtol=1e-4)
 
 
-def test_derivative_by_the_identification_delay_is_the_central_difference(sweep):
+def test_restitution_derivative_by_identification_delay_matches_difference(sweep):
     delay, restitution, slope = sweep
     difference = (restitution[2:] - restitution[:-2]) / (delay[2:] - delay[:-2])
     # At a whole number of periods the interpolation between two samples, and with it the curve, has a kink.
@@ -202,9 +204,9 @@ def test_derivative_by_the_identification_delay_is_the_central_difference(sweep)
 
 
 def events(loop, scenario, values):
-    """Discrete events of recorded runs (the lanes), by name.
+    """Return discrete events of recorded runs (the lanes) by name.
 
-    Whether something is so at a tick, (ticks, runs), or a number of whole periods, (runs,).
+    An event is a boolean per tick, (ticks, runs), or a number of whole periods, (runs,).
     """
     gains, changed = problem(scenario, {name: jnp.asarray(value) for name, value in values.items()})
     ticks = jax.tree.map(np.asarray, run_record(loop, gains, changed, LONGEST)[1])
@@ -215,7 +217,7 @@ def events(loop, scenario, values):
         line.start(measured[0, lane], ticks.signals.velocity_desired[0, lane])
         aligned[:, lane] = [line.step(x) for x in measured[:, lane]]
     running = ticks.active
-    # All contacts recorded are over.
+    # All recorded contacts have ended.
     assert not running[-1].any()
 
     def whole(delay):
@@ -233,18 +235,18 @@ def events(loop, scenario, values):
 
 
 def named_events(study, pairs, step):
-    """For every pair, the names of the events that differ between the runs of its difference."""
+    """Return for every pair the names of the events that differ between the runs of its difference."""
     loop, scenario, values, scale, _ = study
     offsets, asked = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]), len(pairs)
-    pairs = np.resize(pairs, (max(asked, AGREEING), 2))  # one program serves
+    pairs = np.resize(pairs, (max(asked, AGREEING), 2))  # one program for both steps
     lanes = np.repeat(pairs[:, 1], len(offsets))
     moved = {name: value[lanes] for name, value in values.items()}
     for row, (parameter, lane) in enumerate(pairs):
         name = NAMES[parameter]
         moved[name][row * len(offsets) : (row + 1) * len(offsets)] += step * offsets * scale[name][lane]
-    found = events(loop, chosen(scenario, lanes), moved)
+    result = events(loop, chosen(scenario, lanes), moved)
     names = [set() for _ in pairs]
-    for name, happens in found.items():
+    for name, happens in result.items():
         runs = happens.reshape(*happens.shape[:-1], len(pairs), len(offsets))
         differ = (runs != runs[..., :1]).any(axis=-1)
         for row in np.flatnonzero(differ.any(axis=0) if differ.ndim == 2 else differ):
@@ -253,9 +255,9 @@ def named_events(study, pairs, step):
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_every_disagreement_has_an_event(study, disagreements, step):
+def test_derivative_disagreement_is_explained_by_discrete_event(study, disagreements, step):
     pairs = disagreements[step]
-    # The larger step meets events for certain: else this test would be idle.
+    # The larger step certainly crosses events: otherwise this test would check nothing.
     assert len(pairs) > 0 or step == STEPS[0]
     if len(pairs):
         names = named_events(study, pairs, step)
@@ -265,12 +267,12 @@ def test_every_disagreement_has_an_event(study, disagreements, step):
             len(np.unique(pairs[:, 1])),
             [(NAMES[p], int(s), sorted(n)) for (p, s), n in zip(pairs, names, strict=True)],
         )
-        unexplained = [(NAMES[p], s) for (p, s), found in zip(pairs, names, strict=True) if not found]
+        unexplained = [(NAMES[p], s) for (p, s), result in zip(pairs, names, strict=True) if not result]
         assert not unexplained
 
 
-def test_runs_that_agree_have_no_event(study, disagreements):
-    """The events named above are not simply always there."""
+def test_derivative_agreement_has_no_discrete_event(study, disagreements):
+    """The events of the test above are not always present."""
     step = STEPS[0]
     parted = {(p, s) for p, s in disagreements[step]}
     pairs = np.array([(p, s) for p in range(len(NAMES)) for s in range(SCENARIOS) if (p, s) not in parted])

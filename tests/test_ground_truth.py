@@ -1,8 +1,8 @@
-"""The loop against the closed forms of model.md, section 6, and against SciPy's solvers in the limit T -> 0.
+"""The closed loop compared with the closed forms of model.md, section 6, and with SciPy for T -> 0.
 
-The order of convergence is that of the error's root mean square over contact phases, and over contact
-frequencies within 10 % where there is a delay: at any one of them the last sample before separation falls
-differently for each T, and the error jumps about.
+The order of convergence is that of the error's root mean square over contact phases, and, with a delay, over
+contact frequencies within 10 %: at any single frequency the last sample before separation falls differently
+for each T, and the error varies irregularly.
 """
 
 from math import pi
@@ -46,14 +46,14 @@ LIMITS = {
 
 
 def fitted_order(errors):
-    """Order of convergence of the r.m.s. of errors (periods, ...)."""
+    """Return the order of convergence of the r.m.s. of errors (periods, ...)."""
     rms = np.sqrt(np.mean(errors.reshape(len(PERIODS), -1) ** 2, axis=1))
     return np.polyfit(np.log(PERIODS), np.log(rms), 1)[0]
 
 
 @pytest.fixture(scope="module")
 def kelvin_voigt():
-    """Restitution and works (of M v^2 / 2) of every entry of LIMITS: (periods, frequencies, phases)."""
+    """Return restitution and work (in M v^2 / 2) of every entry of LIMITS: (periods, frequencies, phases)."""
     parsed = validated(mechanism({}, IDEAL, 0.0))
     index, period, omega, phase = grid(np.arange(len(LIMITS)), PERIODS, FREQUENCIES, PHASES)
     delay, ratio, tension = (np.array([limit[0][i] for limit in LIMITS.values()])[index] for i in range(3))
@@ -67,13 +67,13 @@ def kelvin_voigt():
         contact__tension=tension,
         force_sensor__delay=delay / omega,
     )
-    found = first_contact(parsed, scenario, energies=True)
+    result = first_contact(parsed, scenario, energies=True)
     shape = (len(LIMITS), len(PERIODS), len(FREQUENCIES), len(PHASES))
     energy = MASS * VELOCITY**2 / 2
     results = zip(
-        found["restitution"].reshape(shape),
-        found["work_in"].reshape(shape) / energy,
-        found["work_out"].reshape(shape) / energy,
+        result["restitution"].reshape(shape),
+        result["work_in"].reshape(shape) / energy,
+        result["work_out"].reshape(shape) / energy,
         strict=True,
     )
     return dict(zip(LIMITS, results, strict=True))
@@ -87,27 +87,29 @@ def test_restitution_of_kelvin_voigt_contact_converges(kelvin_voigt, name):
     _, expected, order = LIMITS[name]
     error = kelvin_voigt[name][0] - expected
     assert order - 0.1 < fitted_order(error) < order + 0.4
-    # The phase average loses most of a smooth contact's error.
+    # Averaging over the phases cancels most of a smooth contact's error.
     assert np.abs(error[-1]).max() < (2e-5 if order == 2 else 2.5e-3)
     assert abs(error[-1].mean()) < (2e-6 if order == 2 else 1e-3)
 
 
-def test_series_of_the_delayed_contact():
+def test_delayed_restitution_series_matches_reference_values():
     assert continuous.delayed_restitution(0.05) == pytest.approx(1.081644885391, abs=1e-12)
     assert continuous.delayed_restitution(0.2) == pytest.approx(1.364341497637, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
 def behind_simulator():
-    """Restitution of linear contact behind a second-order simulator and two fractional delays, T -> 0."""
+    """Return the restitution of linear contact behind a second-order simulator and two fractional delays, T
+    -> 0.
+    """
     return continuous.delayed_contact(MASS, VELOCITY, STIFFNESS, (2 * pi * 12.0, 0.8, 0.0037), 0.0083)
 
 
-# Hold, latency, and their mean delay in periods (item 7), which the transport delay is made shorter by.
+# Hold, latency, and their mean delay in periods (item 7), by which the transport delay is shortened.
 @pytest.mark.parametrize(
     "hold, latency, periods", [("linear", 0, 0.0), ("linear", 1, 1.0), ("zoh", 0, -0.5), ("zoh", 1, 0.5)]
 )
-def test_contact_behind_simulator_and_two_delays_converges(behind_simulator, hold, latency, periods):
+def test_restitution_behind_simulator_and_two_delays_converges(behind_simulator, hold, latency, periods):
     rig = {"command_hold": hold, "command_latency": latency}
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, SECOND_ORDER, 0.0083, **rig))
     period, phase = grid(PERIODS, (np.arange(32) + 0.5) / 32)
@@ -123,7 +125,7 @@ def test_contact_behind_simulator_and_two_delays_converges(behind_simulator, hol
     )
     error = first_contact(parsed, scenario)["restitution"].reshape(len(PERIODS), -1) - behind_simulator
     assert 1.8 < fitted_order(error) < 2.4
-    # A hold or latency misjudged by half a period would make 0.035 at T = 4 ms, 0.004 at 0.5 ms.
+    # A hold or latency wrong by half a period would give 0.035 at T = 4 ms, 0.004 at 0.5 ms.
     assert np.abs(error[0]).max() < 3e-3 and np.abs(error[-1]).max() < 3e-5
     assert abs(error[-1].mean()) < 1e-5
 
@@ -132,7 +134,7 @@ def test_contact_behind_simulator_and_two_delays_converges(behind_simulator, hol
 
 
 @pytest.mark.parametrize("name, phase", [("delay 0.05", 0.05), ("delay 0.2", 0.2)])
-def test_delayed_contact_is_close_to_the_characteristic_root(kelvin_voigt, name, phase):
+def test_restitution_of_delayed_contact_is_close_to_characteristic_root(kelvin_voigt, name, phase):
     root = 2 * lambertw(0.5j * phase)
     growth = np.exp(pi * root.real / abs(root.imag))
     excess = kelvin_voigt[name][0][-1].mean() - growth
@@ -170,52 +172,57 @@ NONLINEAR = {
 
 @pytest.fixture(scope="module")
 def nonlinear():
-    """By name, (restitution, peak force, W_in, W_out) of shape (4, periods, phases); works in M v^2 / 2."""
+    """Return by name (restitution, peak force, W_in, W_out), (4, periods, phases); work in M v^2 / 2."""
     results = {}
     period, phase = grid(PERIODS, (np.arange(32) + 0.5) / 32)
     for group in (("hertz", "hunt-crossley", "quadratic"), ("layers", "damped layers")):
         parsed = [validated(mechanism(NONLINEAR[name][0], IDEAL, 0.0)) for name in group]
         scenario = join(spread(m, len(period), control_period=period, phase=phase) for m in parsed)
-        found = first_contact(parsed[0], scenario, energies=True)
+        result = first_contact(parsed[0], scenario, energies=True)
         energy = MASS * VELOCITY**2 / 2
         table = np.stack(
-            [found["restitution"], found["peak_force"], found["work_in"] / energy, found["work_out"] / energy]
+            [
+                result["restitution"],
+                result["peak_force"],
+                result["work_in"] / energy,
+                result["work_out"] / energy,
+            ]
         )
         results |= zip(group, np.moveaxis(table.reshape(4, len(group), len(PERIODS), -1), 1, 0), strict=True)
     return results
 
 
 @pytest.mark.parametrize("name", NONLINEAR)
-def test_nonlinear_contact_converges_to_the_continuous_solution(nonlinear, name):
+def test_restitution_of_nonlinear_contact_converges_to_continuous_solution(nonlinear, name):
     _, law, order = NONLINEAR[name]
     depths = tuple(LAYERS["depths"]) if "layers" in name else ()
     expected, expected_peak = continuous.contact(MASS, VELOCITY, law, depths)
     restitution, peak = nonlinear[name][:2]
     error = restitution - expected
-    # Softer onsets than linear ones converge faster.
+    # Onsets softer than linear ones converge faster.
     assert order - 0.2 < fitted_order(error) < order + (0.3 if order == 1 else 1)
     assert np.abs(error[-1]).max() < (1e-4 if order == 2 else 1e-3)
     assert peak[-1] == pytest.approx(expected_peak, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", [name for name in LIMITS if "delay" not in name or name == "undelayed"])
-def test_work_energy_of_kelvin_voigt_contact(kelvin_voigt, name):
+def test_energy_balance_of_kelvin_voigt_contact_converges(kelvin_voigt, name):
     (_, ratio, _), _, order = LIMITS[name]
     restitution, work_in, work_out = kelvin_voigt[name]
     balance = work_out / work_in - restitution**2
     assert order - 0.25 < fitted_order(balance)
-    # The controller feels the jump b v at either end up to a period longer or shorter than the mechanism.
+    # The controller sees the jump b v at either end up to a period longer or shorter than the mechanism.
     jump = 4 * ratio * OMEGA * PERIODS[-1]
     assert np.abs(balance[-1]).max() < (1e-4 if order == 2 else jump)
     assert np.abs(work_in[-1] - 1).max() < (1e-4 if order == 2 else 2 * jump)
 
 
 @pytest.mark.parametrize("name", NONLINEAR)
-def test_work_energy_of_nonlinear_contact(nonlinear, name):
+def test_energy_balance_of_nonlinear_contact_converges(nonlinear, name):
     restitution, _, work_in, work_out = nonlinear[name]
     order = NONLINEAR[name][2]
     balance = work_out / work_in - restitution**2
-    # A damper acts by the mechanism's velocity, not by the model's: works differ by a period's motion.
+    # A damper acts on the mechanism's velocity, not on the model's: the work differs by a period's motion.
     damped = "damping" in NONLINEAR[name][0]
     assert (1 if damped else order) - 0.3 < fitted_order(balance)
     assert np.abs(balance[-1]).max() < (2e-4 if order == 2 else 2e-3)
@@ -228,14 +235,14 @@ def test_work_energy_of_nonlinear_contact(nonlinear, name):
 @pytest.mark.parametrize(
     "integrator, latency, periods", [("zoh", 0, 0.5), ("explicit_euler", 0, 1.0), ("zoh", 1, 1.5)]
 )
-def test_delay_of_integrator(integrator, latency, periods):
+def test_integrator_delay_matches_closed_form(integrator, latency, periods):
     rig = {"integrator": integrator, "command_latency": latency}
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, **rig))
     period, phase = grid(PERIODS, PHASES)
     scenario = spread(parsed, len(period), control_period=period, phase=phase)
     restitution = first_contact(parsed, scenario)["restitution"].reshape(len(PERIODS), -1)
     error = restitution - np.array([[continuous.delayed_restitution(OMEGA * periods * T)] for T in PERIODS])
-    # Smaller than a delay of 0.02 T would make them, and of a higher order than any delay.
+    # The errors are smaller than for a delay of 0.02 T, and of a higher order than for any delay.
     delay = 2 / (pi * OMEGA) * error.mean(axis=1)
     assert np.all(np.abs(delay[1:]) < 0.02 * PERIODS[1:])
     assert 1.7 < fitted_order(error) < 2.6
@@ -244,11 +251,13 @@ def test_delay_of_integrator(integrator, latency, periods):
 # Item 10.
 
 
-def test_noise_of_a_stiffness_fitted_early_in_a_contact():
-    """Least squares of F on x with an intercept: sigma_k = sigma_F sqrt(12 T) / (v t^1.5); on increments, the
-    noise of the first and last force alone counts: sqrt(t / 6 T) times that."""
+def test_stiffness_fit_noise_early_in_contact_matches_closed_form():
+    """Least squares of F on x with an intercept: sigma_k = sigma_F sqrt(12 T) / (v t^1.5).
+
+    On increments, only the noise of the first and last force counts: sqrt(t / 6 T) times that.
+    """
     lanes, samples, deviation, period = 1500, 40, 0.01, 1e-3
-    # Soft enough that x = v t while it is fitted.
+    # The contact is so soft that x = v t during the fit.
     parsed = validated(
         mechanism(
             {"law": "linear", "stiffness": [200.0]},
@@ -273,7 +282,7 @@ def test_noise_of_a_stiffness_fitted_early_in_a_contact():
     steps = np.diff(position, axis=0)
     on_increments = np.sum(steps * np.diff(force, axis=0), axis=0) / np.sum(steps**2, axis=0)
     predicted = deviation * np.sqrt(12 * period) / (VELOCITY * duration**1.5)
-    # The standard deviation of so many lanes is known to 4 / sqrt(2 lanes).
+    # The standard deviation over the lanes is known to 4 / sqrt(2 lanes).
     accuracy = 4 / np.sqrt(2 * lanes)
     assert fitted.mean() == pytest.approx(200.0, abs=4 * predicted / np.sqrt(lanes))
     assert fitted.std() == pytest.approx(predicted, rel=accuracy)

@@ -1,4 +1,4 @@
-"""README and guide say what is there: links, files, names, and numbers that follow from their theory."""
+"""README and guide are consistent with the repository: links, files, names, and numbers from the theory."""
 
 import cmath
 import math
@@ -50,40 +50,40 @@ def page(request):
 
 
 def section(text, number):
-    """What stands under the heading with this number."""
+    """Return the text under the heading with this number."""
     return re.search(rf"^## {number} .*?(?=^## |\Z)", text, re.M | re.S)[0]
 
 
 def items(text):
-    """The closed forms of model.md, by their number."""
-    found = re.findall(r"^(\d+)\. (.*?)(?=^\d+\. |^\S|\Z)", section(text, 6), re.M | re.S)
-    return {int(number): words for number, words in found}
+    """Return the closed forms of model.md by number."""
+    result = re.findall(r"^(\d+)\. (.*?)(?=^\d+\. |^\S|\Z)", section(text, 6), re.M | re.S)
+    return {int(number): words for number, words in result}
 
 
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 200
 
 
-def test_links_resolve(page):
+def test_guide_links_resolve(page):
     links = [target for target, _ in LINK.findall(page.read_text(encoding="utf-8"))]
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert not missing
 
 
-def test_files_exist(page):
-    """Every path below a folder of the repository, but for those with a NAME of the reader's own."""
-    found = FILE.findall(page.read_text(encoding="utf-8"))
-    missing = [name for name in found if "NAME" not in name and not (ROOT / name).exists()]
+def test_guide_names_existing_files(page):
+    """Check every path below a folder of the repository, except those with NAME as placeholder."""
+    result = FILE.findall(page.read_text(encoding="utf-8"))
+    missing = [name for name in result if "NAME" not in name and not (ROOT / name).exists()]
     assert not missing
 
 
-def test_every_page_and_notebook_is_in_the_index():
+def test_guide_index_links_every_page_and_notebook():
     index = text_of("index.md")
     linked = {(GUIDE / target).resolve() for target, _ in LINK.findall(index)}
     assert {*PAGES, *(ROOT / "notebooks").glob("*.ipynb")} - {GUIDE / "index.md"} <= linked
 
 
-def test_sections_that_code_cites_are_there(model):
+def test_guide_has_the_sections_that_code_cites(model):
     assert re.findall(r"^## (.*)$", model, re.M) == SECTIONS
     headings = {
         "model": len(SECTIONS),
@@ -99,57 +99,57 @@ def test_sections_that_code_cites_are_there(model):
         assert all(1 <= int(item) <= last for item in re.findall(r"\d+", listed)), path
 
 
-def test_every_law_and_status_is_described(model):
+def test_guide_describes_every_law_and_status(model):
     in_tables = set(re.findall(r"^\| `(\w+)` \|", section(model, 3) + section(model, 5), re.M))
     assert in_tables == {*COMPENSATORS, *LAWS}
     statuses = section(text_of("impulse_ledger.md"), 6)
     assert set(re.findall(r"^\| `(\w+)` \|", statuses, re.M)) == {status.name for status in STATUSES}
 
 
-def test_gains_of_the_impulse_ledger_are_described():
+def test_guide_describes_gains_of_impulse_ledger():
     rows = GAIN.findall(section(text_of("impulse_ledger.md"), 7))
     assert len(rows) == len(dict(rows))
     assert dict(rows) == {gain.name: gain.unit for gain in COMPENSATORS["impulse_ledger"].gains}
 
 
 def numbers(words):
-    """Every number with a decimal point."""
+    """Return every number with a decimal point."""
     return [float(number) for number in re.findall(r"\d+\.\d+", words)]
 
 
 def grown(root):
-    """e by a root of a characteristic equation."""
+    """Return e for a root of the characteristic equation."""
     return math.exp(math.pi * root.real / abs(root.imag))
 
 
 def root_of(function, start):
-    """A root near `start`, by Newton's method."""
+    """Return a root near `start` by Newton's method."""
     root, step = start, 1e-6
     for _ in range(60):
         root -= function(root) * 2 * step / (function(root + step) - function(root - step))
     return root
 
 
-def test_closed_forms_of_a_delay(model):
+def test_guide_closed_forms_of_delay_are_correct(model):
     rows = re.findall(r"\| (0\.\d+) \| (\d\.\d+) \|", items(model)[1])
     assert len(rows) == 4
     for phase, e in rows:
         assert continuous.delayed_restitution(float(phase)) == pytest.approx(float(e), abs=1e-12)
-    found = numbers(items(model)[2])
+    result = numbers(items(model)[2])
     phases = np.array([0.05, 0.2])
     roots = 2 / phases * lambertw(0.5j * phases)
     first_order = np.exp(np.pi * phases / 2)
     expected = [grown(roots[0]), 0.05, grown(roots[1]), 0.2, *first_order]
-    assert found == pytest.approx(expected, abs=5e-7)
+    assert result == pytest.approx(expected, abs=5e-7)
 
 
-def test_closed_forms_of_damping(model):
-    found = numbers(items(model)[3])
+def test_guide_closed_forms_of_damping_are_correct(model):
+    result = numbers(items(model)[3])
     expected = [continuous.separates_at_surface(0.05), 0.05, continuous.separates_at_no_force(0.05), 0.05]
-    assert found == pytest.approx(expected, abs=5e-7)
+    assert result == pytest.approx(expected, abs=5e-7)
 
 
-def test_lead_and_smith_predictor(model):
+def test_guide_numbers_of_lead_and_smith_predictor_are_correct(model):
     phase = 0.2
     root = root_of(lambda s: s**2 + (1 + phase * s) * cmath.exp(-s * phase), 1j)
     assert grown(root) - 1 == pytest.approx(math.expm1(math.pi / 6 * phase**3), rel=0.03)
@@ -171,8 +171,8 @@ def test_lead_and_smith_predictor(model):
     assert numbers(items(model)[14]) == pytest.approx(readings, abs=5e-4)
 
 
-def test_the_script_is_the_one_that_is_run():
-    """`test_front_door_tuning` runs it with small numbers."""
+def test_guide_script_is_the_tested_interface_script():
+    """`test_front_door_tuning` runs the script with small numbers."""
     block = re.search(r"^```python\n(.*?)^```", text_of("python.md"), re.M | re.S)
     run = (ROOT / "tests" / "interface_script.py").read_text(encoding="utf-8")
     sizes = re.compile(r"\b(scenarios|starts|judged)=[\d_]+")
@@ -188,8 +188,8 @@ def test_the_script_is_the_one_that_is_run():
     ],
     ids=lambda path: path.name,
 )
-def test_examples_run(path, tmp_path):
-    """The blocks of a page that are marked as runnable, one after the other in a process of their own."""
+def test_guide_examples_run(path, tmp_path):
+    """Run the blocks of a page that are marked as runnable, in order, in their own process."""
     blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))
     assert blocks
     inherited = os.environ.get("PYTHONPATH")
@@ -200,6 +200,6 @@ def test_examples_run(path, tmp_path):
     )  # fmt: skip
     assert ran.returncode == 0 and not ran.stderr, ran.stderr
     assert ran.stdout
-    # What a page prints below the example that comes last is what that prints.
+    # The text block below the last example of a page is that example's output.
     *_, shown = re.findall(r"^```text\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
     assert path.name == "README.md" or ran.stdout.endswith(shown)

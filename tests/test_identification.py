@@ -1,4 +1,4 @@
-"""Both identifications, jax and the rig's, against weighted batch least squares."""
+"""Identification in JAX and in the runtime compared with weighted batch least squares."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,11 +29,11 @@ def rig(readings, weights, forgetting):
 
 
 def batch(readings, weights, forgetting):
-    """theta and P that minimise the prior's and the readings' squares, each faded by all later readings."""
-    kept = 1 - weights * (1 - forgetting)
-    faded = np.append(np.cumprod(kept[::-1])[::-1][1:], 1.0)
+    """Return theta and P that minimise the squares of prior and readings, faded by all later readings."""
+    retention = 1 - weights * (1 - forgetting)
+    faded = np.append(np.cumprod(retention[::-1])[::-1][1:], 1.0)
     phi, force = readings[:, :2], readings[:, 2]
-    prior = np.prod(kept) * np.diag(1 / np.array(VARIANCES))
+    prior = np.prod(retention) * np.diag(1 / np.array(VARIANCES))
     information = prior + np.einsum("n,ni,nj->ij", weights * faded, phi, phi)
     covariance = np.linalg.inv(information)
     theta = covariance @ (prior @ INITIAL + np.einsum("n,ni,n->i", weights * faded, phi, force))
@@ -46,9 +46,9 @@ SIDES = pytest.mark.parametrize("identify", [on_jax, rig])
 
 @SIDES
 @pytest.mark.parametrize("forgetting", [0.9, 0.98, 1.0])
-def test_weighted_batch_least_squares(identify, forgetting):
+def test_identification_equals_weighted_batch_least_squares(identify, forgetting):
     rng = np.random.default_rng(0)
-    # Large regressors first: the bound on the covariance never acts.
+    # Large regressors come first: the bound on the covariance is never active.
     readings = rng.normal(size=(30, 3)) + np.array([[3.0, 6.0, 0.0], [-5.0, 5.0, 0.0]] + 28 * [[0.0] * 3])
     weights = np.r_[1.0, 1.0, rng.uniform(0, 1, 28)]
     expected = batch(readings, weights, forgetting)
@@ -57,7 +57,7 @@ def test_weighted_batch_least_squares(identify, forgetting):
 
 
 @SIDES
-def test_no_weight_changes_nothing_and_a_little_changes_little(identify):
+def test_identification_is_linear_in_small_weights(identify):
     rng = np.random.default_rng(1)
     readings = rng.normal(size=(3, 3))
     weights = np.array([1.0, 0.5, 0.0])

@@ -1,4 +1,4 @@
-"""Whole campaigns: the numbers, the verdict, the mechanism file."""
+"""Identification of whole campaigns: estimates, verdict, mechanism file."""
 
 from dataclasses import replace
 
@@ -20,17 +20,17 @@ from tuning.identification.mechanism_file import to_toml, uncertainty_tables
 FEW = (0.003, 0.006, 0.012) * 3
 
 
-def known(name, seed=0, options=None, **changes):
+def identify_kind(name, seed=0, options=None, **changes):
     law = campaigns.KINDS[name].contact["law"]
     return identify(campaigns.campaign(name, seed, **changes), options=options or Options(law=law, seed=seed))
 
 
 @pytest.fixture(scope="module")
 def clean():
-    return known("clean", speeds=FEW, seconds=30.0)
+    return identify_kind("clean", speeds=FEW, seconds=30.0)
 
 
-def test_a_clean_campaign_gives_the_rig_back(clean):
+def test_identify_recovers_rig_from_clean_campaign(clean):
     assert clean["rig.simulator.natural_frequency"].value == pytest.approx(12.0, rel=0.003)
     assert clean["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
     assert clean["rig.force_sensor.delay"].value == pytest.approx(0.0037, abs=2.5e-4)
@@ -39,12 +39,12 @@ def test_a_clean_campaign_gives_the_rig_back(clean):
     assert clean["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.003)
     assert clean["rig.contact_plane"].value == pytest.approx(0.0, abs=5e-6)
     assert clean["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.04)
-    for one in clean.estimates:
-        assert one.low <= one.value <= one.high
+    for estimate in clean.estimates:
+        assert estimate.low <= estimate.value <= estimate.high
     assert clean.good and clean.verdict.startswith("Good") and clean.effect < 0.01
 
 
-def test_its_mechanism_file_loads_with_what_is_uncertain_and_correlated(clean, tmp_path):
+def test_identified_mechanism_file_loads_with_uncertainty_and_correlation(clean, tmp_path):
     path = tmp_path / "mechanism.toml"
     path.write_text(to_toml(clean.mechanism, "identified"))
     mechanism = jaxhil.load(str(path))
@@ -56,7 +56,7 @@ def test_its_mechanism_file_loads_with_what_is_uncertain_and_correlated(clean, t
     apparent = (
         draws["contact.damping"][:, 0] - draws["contact.stiffness"][:, 0] * draws["rig.force_sensor.delay"]
     )
-    # The floors of the delay and of the stiffness alone: 2e-5 s and 0.1 %.
+    # The floors of the delay and the stiffness alone are 2e-5 s and 0.1 %.
     floor = np.hypot(1.2e5 * 2e-5, 0.001 * 1.2e5 * 0.0037)
     assert apparent.std() < 1.3 * np.hypot(clean["apparent damping"].std, floor)
 
@@ -66,9 +66,12 @@ DEFECTS = {"hold": "command hold", "sign": "sign of the force", "scale": "scale"
 
 @pytest.mark.parametrize(
     ("wrong", "worst"),
-    [("order", "motion model"), *(pytest.param(*one, marks=pytest.mark.slow) for one in DEFECTS.items())],
+    [
+        ("order", "motion model"),
+        *(pytest.param(*defect, marks=pytest.mark.slow) for defect in DEFECTS.items()),
+    ],
 )
-def test_a_defect_is_named_and_the_verdict_bad(wrong, worst):
+def test_identify_names_defect_and_verdict_is_bad(wrong, worst):
     campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
     options = Options(law="kelvin_voigt", order=2 if wrong == "order" else None)
     runs = campaign.runs
@@ -80,30 +83,30 @@ def test_a_defect_is_named_and_the_verdict_bad(wrong, worst):
         ]
     elif wrong == "scale":
         runs = [replace(run, position_measured=1.02 * run.position_measured) for run in runs]
-    found = identify(replace(campaign, runs=tuple(runs)), options=options)
-    assert not found.good and found.verdict.startswith("Bad")
-    assert any(line.name.startswith(worst) and line.there for line in found.lines)
+    result = identify(replace(campaign, runs=tuple(runs)), options=options)
+    assert not result.good and result.verdict.startswith("Bad")
+    assert any(line.name.startswith(worst) and line.there for line in result.lines)
 
 
-def test_a_contact_that_stiffens_from_touch_to_touch_is_a_drift():
-    found = known("drifting", speeds=FEW)
-    assert not found.good
-    assert next(line for line in found.lines if line.name.startswith("drift")).there
+def test_identify_reports_stiffening_contact_as_drift():
+    result = identify_kind("drifting", speeds=FEW)
+    assert not result.good
+    assert next(line for line in result.lines if line.name.startswith("drift")).there
 
 
-def test_a_dead_zone_is_told_from_a_bias_and_the_pair_it_confounds_named():
+def test_identify_separates_dead_zone_from_bias_and_names_confounded_pair():
     law = campaigns.KINDS["dead_zone"].contact["law"]
     options = Options(law=law, fixed={"rig.contact_plane": 0.0})
-    found = known("dead_zone", options=options, speeds=FEW)
-    dead = found["rig.force_sensor.dead_zone"]
+    result = identify_kind("dead_zone", options=options, speeds=FEW)
+    dead = result["rig.force_sensor.dead_zone"]
     assert dead.value == pytest.approx(4.0, rel=0.03) and dead.low < 4.0 < dead.high
-    assert any({"rig.force_sensor.delay", "contact.damping.0"} == {*pair[:2]} for pair in found.confounded)
-    assert found.mechanism["rig"]["force_sensor"]["dead_zone"] == dead.value
+    assert any({"rig.force_sensor.delay", "contact.damping.0"} == {*pair[:2]} for pair in result.confounded)
+    assert result.mechanism["rig"]["force_sensor"]["dead_zone"] == dead.value
 
 
 @pytest.mark.parametrize("surface", [-2e-5, 2e-5])
 def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
-    """With the surface 14 um off, damping was found 298 +- 0.4 N s/m where 348 is true, and called good."""
+    """A surface 14 um off gave a damping of 298 +- 0.4 N s/m for a true 348, with a good verdict."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     moved = [
         replace(
@@ -113,135 +116,137 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
         )
         for run in campaign.runs
     ]
-    found = identify(replace(campaign, runs=tuple(moved)), options=Options(law="kelvin_voigt"))
+    result = identify(replace(campaign, runs=tuple(moved)), options=Options(law="kelvin_voigt"))
     truth = campaigns.KINDS["dead_zone"]
     for key, value in (
         ("rig.force_sensor.dead_zone", truth.rig["force_sensor"]["dead_zone"]),
         ("contact.damping.0", truth.contact["damping"][0]),
         ("rig.force_sensor.delay", truth.rig["force_sensor"]["delay"]),
     ):
-        assert found[key].low < value < found[key].high, key
-    assert not found.good and any("--fix rig.contact_plane" in note for note in found.notes)
+        assert result[key].low < value < result[key].high, key
+    assert not result.good and any("--fix rig.contact_plane" in note for note in result.notes)
 
 
 @pytest.mark.slow
-def test_without_free_motion_the_prior_tells_the_motion_and_without_contact_the_contact():
+def test_identify_uses_prior_for_missing_motion_or_contact():
     campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)
-    told = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.delay": 0.0043}
-    found = identify(campaign, jaxhil.load("varying", told), Options(law="kelvin_voigt"))
-    assert found["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.005)
-    assert found.mechanism["rig"]["simulator"]["delay"] == 0.0043 and "prior" in found.notes[0]
+    overrides = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.delay": 0.0043}
+    result = identify(campaign, jaxhil.load("varying", overrides), Options(law="kelvin_voigt"))
+    assert result["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.005)
+    assert result.mechanism["rig"]["simulator"]["delay"] == 0.0043 and "prior" in result.notes[0]
     free = campaigns.campaign("clean", 2, speeds=(), seconds=30.0)
-    found = identify(free, jaxhil.load("varying"))
-    assert found.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
-    assert found["rig.simulator.natural_frequency"].value == pytest.approx(12.0, rel=0.003)
+    result = identify(free, jaxhil.load("varying"))
+    assert result.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
+    assert result["rig.simulator.natural_frequency"].value == pytest.approx(12.0, rel=0.003)
 
 
 @pytest.mark.parametrize("speeds, seconds, says", (
     ((0.006, 0.012), 0, "rig.simulator (a run of kind free would) and contact.stiffness"),
     ((), 5.0, "contact.stiffness (a run of kind contact or press would)"),
 ))  # fmt: skip
-def test_without_a_prior_what_is_missing_is_said_and_there_is_no_mechanism(speeds, seconds, says):
-    found = identify(campaigns.campaign("clean", 2, speeds, seconds))
-    assert found.mechanism is None and not found.good
-    assert f"neither the logs nor a prior tell {says}" in found.verdict
-    assert found["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.06)
+def test_identify_names_missing_runs_without_prior(speeds, seconds, says):
+    result = identify(campaigns.campaign("clean", 2, speeds, seconds))
+    assert result.mechanism is None and not result.good
+    assert f"neither the logs nor a prior tell {says}" in result.verdict
+    assert result["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.06)
 
 
-def test_a_contact_that_touches_hardly_tell_is_the_priors():
-    """Touches that the noise drowns: 2.67 N of it, 0.3 mm/s."""
+def test_identify_uses_prior_for_contact_below_noise():
+    """The noise of 2.67 N exceeds the contact force at 0.3 mm/s."""
     campaign = campaigns.campaign("noisy", 0, speeds=(0.0002, 0.0003), seconds=5.0)
     options = Options(law="linear", fixed={"rig.contact_plane": 0.0}, hold_out=0.0)
-    found = identify(campaign, jaxhil.load("varying"), options)
-    assert found.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
-    assert "the contact is the prior's" in found.notes[0]
-    assert not any(one.key.startswith("contact") for one in found.estimates)
+    result = identify(campaign, jaxhil.load("varying"), options)
+    assert result.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
+    assert "the contact is the prior's" in result.notes[0]
+    assert not any(estimate.key.startswith("contact") for estimate in result.estimates)
 
 
-def test_what_is_told_is_taken_as_told(clean):
+def test_identify_keeps_fixed_values(clean):
     fixed = {"rig.contact_plane": 0.0, "rig.position_sensor.delay": 0.001}
-    found = known("clean", speeds=FEW, seconds=30.0, options=Options(law="kelvin_voigt", fixed=fixed))
-    assert found["rig.contact_plane"].told and "rig.contact_plane" not in found.mechanism["uncertainty"]
-    assert found["rig.simulator.delay"].value == pytest.approx(
+    result = identify_kind(
+        "clean", speeds=FEW, seconds=30.0, options=Options(law="kelvin_voigt", fixed=fixed)
+    )
+    assert result["rig.contact_plane"].told and "rig.contact_plane" not in result.mechanism["uncertainty"]
+    assert result["rig.simulator.delay"].value == pytest.approx(
         clean["rig.simulator.delay"].value - 0.001, abs=1e-6
     )
-    shift = found["rig.force_sensor.delay"].value - clean["rig.force_sensor.delay"].value
+    shift = result["rig.force_sensor.delay"].value - clean["rig.force_sensor.delay"].value
     assert shift == pytest.approx(0.001, abs=1e-4)
-    assert found.mechanism["rig"]["position_sensor"]["delay"] == 0.001
+    assert result.mechanism["rig"]["position_sensor"]["delay"] == 0.001
     with pytest.raises(jaxhil.InputError, match=r"fix: found rig\.range"):
         identify(
             campaigns.campaign("clean", 0, speeds=(), seconds=5.0), options=Options(fixed={"rig.range": 1.0})
         )
 
 
-def test_a_controller_that_answers_late_makes_the_motion_late(clean):
+def test_identify_attributes_computing_delay_to_motion(clean):
     campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
     late = replace(campaign, timing=replace(campaign.timing, computing_delay=2), integrator="explicit_euler")
-    found = identify(late, options=Options(law="kelvin_voigt"))
+    result = identify(late, options=Options(law="kelvin_voigt"))
     delay = clean["rig.simulator.delay"].value
-    assert found["rig.simulator.delay"].value == pytest.approx(delay + 0.002, abs=1e-8)
+    assert result["rig.simulator.delay"].value == pytest.approx(delay + 0.002, abs=1e-8)
     force = clean["rig.force_sensor.delay"].value
-    assert found["rig.force_sensor.delay"].value == pytest.approx(force, abs=1e-6)
+    assert result["rig.force_sensor.delay"].value == pytest.approx(force, abs=1e-6)
     assert (
-        found.mechanism["rig"]["integrator"] == "explicit_euler"
+        result.mechanism["rig"]["integrator"] == "explicit_euler"
         and "integrator" not in clean.mechanism["rig"]
     )
 
 
-def test_of_the_prior_only_that_is_left_which_logs_do_not_tell(clean):
+def test_identify_keeps_prior_only_for_unobservable_values(clean):
     sensors = {"rig.force_sensor.time_constant": 0.002, "rig.force_sensor.dead_zone": 3.0}
     prior = jaxhil.load("rig-300kg", {**sensors, "rig.force_sensor.range": 800.0})
     stated = {"rig.position_sensor.noise_std": Uncertainty(distribution="normal", std=1e-7)}
     stated |= {"rig.simulator.damping_ratio": Uncertainty(distribution="normal", std=0.3)}
     prior = msgspec.structs.replace(prior, uncertainty=stated, correlation=None)
     campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
-    found = identify(campaign, prior, Options(law="kelvin_voigt")).mechanism
-    sensor, uncertain = found["rig"]["force_sensor"], found["uncertainty"]
+    result = identify(campaign, prior, Options(law="kelvin_voigt")).mechanism
+    sensor, uncertain = result["rig"]["force_sensor"], result["uncertainty"]
     assert not {"time_constant", "dead_zone"} & sensor.keys() and sensor["range"] == 800.0
     assert uncertain["rig.position_sensor.noise_std"]["std"] == 1e-7
     assert uncertain["rig.simulator.damping_ratio"]["std"] < 1e-3
 
 
-def test_an_entry_of_the_lists_that_is_never_met_is_that_before_it():
+def test_identify_copies_previous_list_entry_for_missing_contact():
     campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.006, 0.012, 0.003) * 2, seconds=15.0)
     runs = tuple(run for run in campaign.runs if run.kind != "contact" or run.contact_index[0] != 1)
-    found = identify(replace(campaign, runs=runs), options=Options(law="kelvin_voigt"))
-    first, between, last = found.mechanism["contact"]["stiffness"]
+    result = identify(replace(campaign, runs=runs), options=Options(law="kelvin_voigt"))
+    first, between, last = result.mechanism["contact"]["stiffness"]
     assert first == between == pytest.approx(1.2e5, rel=0.01) and last == pytest.approx(7e4, rel=0.01)
-    assert "only entries 0, 2 were met" in found.notes[0]
+    assert "only entries 0, 2 were met" in result.notes[0]
 
 
 @pytest.mark.slow
-def test_an_entry_that_touches_hardly_tell_is_that_before_it():
-    """The second entry is met by touches that only graze the contact."""
+def test_identify_copies_previous_list_entry_for_grazing_contact():
+    """Touches of the second entry only graze the contact."""
     campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.012, 0.0002, 0.012, 0.006, 0.0002, 0.006))
-    found = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
-    first, second, last = found.mechanism["contact"]["stiffness"]
+    result = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+    first, second, last = result.mechanism["contact"]["stiffness"]
     assert first == second == pytest.approx(1.2e5, rel=0.02) and last == pytest.approx(7e4, rel=0.02)
-    assert "contact.stiffness.1: known to 30 % at best: taken as the entry before it" in found.notes[0]
+    assert "contact.stiffness.1: known to 30 % at best: taken as the entry before it" in result.notes[0]
 
 
 @pytest.mark.slow
-def test_a_position_sensor_that_lags_more_than_the_force_sensor_takes_some_of_the_delay(monkeypatch):
+def test_identify_splits_delay_if_position_sensor_lags_more(monkeypatch):
     rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=30.0)
-    found = identify(campaign, options=Options(law="kelvin_voigt"))
-    share = found["rig.position_sensor.delay"].value
-    assert found["rig.simulator.delay"].value + share == pytest.approx(0.0073, abs=2e-5)
-    assert 0.0 < found["rig.force_sensor.delay"].value == pytest.approx(share - 0.0018, abs=2.5e-4)
-    assert "the position sensor lags more than the force sensor" in found.notes[0] and found.good
-    assert check(campaign, from_builtins(found.mechanism, "found")).good
-    # A prior tells the share, and the rest follows.
+    result = identify(campaign, options=Options(law="kelvin_voigt"))
+    share = result["rig.position_sensor.delay"].value
+    assert result["rig.simulator.delay"].value + share == pytest.approx(0.0073, abs=2e-5)
+    assert 0.0 < result["rig.force_sensor.delay"].value == pytest.approx(share - 0.0018, abs=2.5e-4)
+    assert "the position sensor lags more than the force sensor" in result.notes[0] and result.good
+    assert check(campaign, from_builtins(result.mechanism, "found")).good
+    # A prior specifies the position sensor's share; the other delays follow.
     prior = campaign_rigs.mechanism("slow")
-    found = identify(campaign, prior, Options(law="kelvin_voigt"))
-    assert found["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
-    assert found["rig.force_sensor.delay"].value == pytest.approx(0.0012, abs=2.5e-4)
-    assert found.mechanism["rig"]["position_sensor"]["delay"] == 0.003 and found.notes == ()
+    result = identify(campaign, prior, Options(law="kelvin_voigt"))
+    assert result["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
+    assert result["rig.force_sensor.delay"].value == pytest.approx(0.0012, abs=2.5e-4)
+    assert result.mechanism["rig"]["position_sensor"]["delay"] == 0.003 and result.notes == ()
 
 
-def test_a_mechanism_that_cannot_be_is_named_and_not_written():
-    """It was refused by the key of a file that nobody had written."""
+def test_identify_does_not_write_impossible_mechanism():
+    """The message must not name a key of a file that does not exist."""
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 2, seconds=10.0)
     negative = tuple(replace(run, force_measured=-run.force_measured) for run in campaign.runs)
     result = identify(replace(campaign, runs=negative), options=Options(law="kelvin_voigt", hold_out=0.0))
@@ -253,15 +258,17 @@ def test_a_mechanism_that_cannot_be_is_named_and_not_written():
     ({"law": "rubber"}, "law: found 'rubber', allowed linear"),
     ({"order": 7}, "order: found 7, allowed 0, 1, 2"),
 ))  # fmt: skip
-def test_a_law_or_an_order_that_there_is_not_is_refused(options, message):
+def test_identify_rejects_unknown_law_and_order(options, message):
     with pytest.raises(jaxhil.InputError, match=message):
         identify(campaigns.campaign("clean", 0, (), 5.0), options=Options(**options))
 
 
-def test_of_every_speed_some_touches_are_held_out():
+def test_identify_holds_out_touches_of_every_speed():
     runs = campaigns.campaign("clean", 0, seconds=0, rest=0).runs
-    held = held_out(runs, 0.2)
-    assert held.sum() == 3 and {run.speed for run, out in zip(runs, held, strict=True) if out} == {
+    is_held_out = held_out(runs, 0.2)
+    assert is_held_out.sum() == 3 and {
+        run.speed for run, out in zip(runs, is_held_out, strict=True) if out
+    } == {
         0.003,
         0.006,
         0.012,
@@ -269,10 +276,10 @@ def test_of_every_speed_some_touches_are_held_out():
     assert not held_out(runs, 0.0).any() and not held_out(runs[:2], 0.2).any()
 
 
-def test_standard_deviations_have_floors_and_the_correlation_stays_positive_definite():
+def test_uncertainty_tables_have_floors_and_positive_definite_correlation():
     rng = np.random.default_rng(0)
-    one = rng.standard_normal(3000)
-    draws = np.column_stack([one, one, 1e-9 * rng.standard_normal(3000), rng.standard_normal(3000)])
+    column = rng.standard_normal(3000)
+    draws = np.column_stack([column, column, 1e-9 * rng.standard_normal(3000), rng.standard_normal(3000)])
     tables = uncertainty_tables(["a.x.0", "a.x.1", "b", "c"], draws, np.array([0.0, 0.0, 0.5, 0.0]))
     assert (
         tables["uncertainty"]["b"]["std"] == pytest.approx(0.5)

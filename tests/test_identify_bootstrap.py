@@ -1,4 +1,4 @@
-"""Fits to contacts drawn again: as wide as stated where noise is all, and wider where contacts differ."""
+"""Bootstrap over contacts: intervals as stated for pure noise, and wider if contacts differ."""
 
 from copy import copy
 from dataclasses import replace
@@ -17,7 +17,7 @@ from tuning.identification.rational import STRUCTURES, Model
 
 
 def scattering(seed, share, speeds=campaigns.SPEEDS):
-    """A campaign whose stiffness and damping differ from contact to contact by that share."""
+    """Return a campaign whose stiffness and damping vary from contact to contact by that share."""
     whole = campaigns.campaign("clean", seed, speeds=(), seconds=10.0)
     kind, rng = campaigns.KINDS["clean"], np.random.default_rng(seed)
     runs = list(whole.runs)
@@ -35,7 +35,7 @@ def of(campaign, repeats):
 
 @pytest.fixture(scope="module")
 def fit():
-    """Of eight contacts that are alike."""
+    """Fit eight equal contacts."""
     kind, timing = campaigns.KINDS["clean"], campaigns.campaign("clean", 0, (), 0, 0).timing
     runs = campaigns._touch_runs(kind, np.random.default_rng(0), (0.006, 0.012) * 4)
     model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
@@ -43,22 +43,23 @@ def fit():
 
 
 @pytest.mark.parametrize("times", (1.2, 3.0))
-def test_draws_scatter_as_the_fits_do_where_those_scatter_more(fit, monkeypatch, times):
-    had = fit.posterior.draws
+def test_bootstrap_widens_draws_if_fits_scatter_more(fit, monkeypatch, times):
+    original = fit.posterior.draws
     monkeypatch.setattr(
-        "tuning.identification.bootstrap.fits", lambda *_: had.mean(axis=0) + times * (had - had.mean(axis=0))
+        "tuning.identification.bootstrap.fits",
+        lambda *_: original.mean(axis=0) + times * (original - original.mean(axis=0)),
     )
-    found = bootstrap.bootstrap(fit, 20)
-    # Of n fits' scatter about their own mean n / (n - 1) is that about the truth.
+    result = bootstrap.bootstrap(fit, 20)
+    # The variance of n fits about the truth is n / (n - 1) times that about their own mean.
     expected = times * np.sqrt(8.0 / 7.0) if times > 1.5 else 1.0
-    np.testing.assert_allclose(found.draws().std(axis=0), expected * had.std(axis=0), rtol=0.05)
-    assert ("those of noise" if times < 1.5 else "the bootstrap's") in found.resampled.split(
+    np.testing.assert_allclose(result.draws().std(axis=0), expected * original.std(axis=0), rtol=0.05)
+    assert ("those of noise" if times < 1.5 else "the bootstrap's") in result.resampled.split(
         "intervals are "
     )[1]
 
 
 @pytest.mark.slow
-def test_where_contacts_differ_intervals_widen_to_match():
+def test_bootstrap_widens_intervals_if_contacts_differ():
     campaign = scattering(0, 0.02, (0.012, 0.006) * 4)
     stated, wide = of(campaign, 0), of(campaign, 20)
     assert any("intervals are the bootstrap's" in note for note in wide.notes)
@@ -70,11 +71,11 @@ def test_where_contacts_differ_intervals_widen_to_match():
     assert written == pytest.approx(wide["contact.stiffness.0"].std, rel=0.01)
 
 
-def test_an_interrupted_bootstrap_goes_on_with_the_same_draws(fit, tmp_path, monkeypatch):
-    done, said, most = [], [], 2
+def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
+    done, messages, most = [], [], 2
 
     def means(drawn, problem, readings, seed, near):
-        """Numbers that scatter, in place of fits."""
+        """Return scattering numbers in place of fits."""
         if len(done) == most:
             raise KeyboardInterrupt
         done.append(drawn)
@@ -85,22 +86,22 @@ def test_an_interrupted_bootstrap_goes_on_with_the_same_draws(fit, tmp_path, mon
     with pytest.raises(KeyboardInterrupt):
         bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path))
     most = 100
-    again = bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path, resume=True), say=said.append)
-    assert len(done) == 4 and said == ["fits to contacts drawn again: 15 of 20"]
+    again = bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path, resume=True), say=messages.append)
+    assert len(done) == 4 and messages == ["fits to contacts drawn again: 15 of 20"]
     whole = bootstrap.bootstrap(fit, 20)
     assert again.resampled == whole.resampled
     np.testing.assert_array_equal(again.posterior.draws, whole.posterior.draws)
 
 
-def test_fits_are_kept_for_the_same_problem_alone(fit, tmp_path, monkeypatch):
+def test_bootstrap_checkpoints_fit_only_the_same_problem(fit, tmp_path, monkeypatch):
     monkeypatch.setattr(bootstrap, "means", lambda drawn, *_: np.zeros((len(drawn), 3)))
 
-    def anew(one, seed=0):
-        """How many of four pieces that are kept for `fit` do not fit."""
-        bootstrap.fits(fit, 20, 0, None, Pieces(tmp_path), said.append)
-        kept = Pieces(tmp_path, resume=True)
-        bootstrap.fits(one, 20, seed, None, kept, said.append)
-        return len(kept.other)
+    def anew(other_fit, seed=0):
+        """Return how many of the four checkpoints of `fit` are rejected for another problem."""
+        bootstrap.fits(fit, 20, 0, None, Pieces(tmp_path), messages.append)
+        checkpoints = Pieces(tmp_path, resume=True)
+        bootstrap.fits(other_fit, 20, seed, None, checkpoints, messages.append)
+        return len(checkpoints.other)
 
     def changed(owner, **values):
         problem = copy(fit.problem)
@@ -111,7 +112,7 @@ def test_fits_are_kept_for_the_same_problem_alone(fit, tmp_path, monkeypatch):
             setattr(problem, owner, target)
         return replace(fit, problem=problem)
 
-    said = []
+    messages = []
     assert anew(fit) == anew(changed("problem")) == 0
     assert anew(fit, seed=1) == 4
     assert anew(changed("problem", plane=1e-6)) == 4
@@ -120,7 +121,7 @@ def test_fits_are_kept_for_the_same_problem_alone(fit, tmp_path, monkeypatch):
     assert anew(changed("law", shape={"exponent": 1.5})) == 4
 
 
-def test_what_it_cannot_say_is_said():
+def test_bootstrap_rejects_too_few_contacts_and_repeats():
     few = campaigns.campaign("clean", 0, speeds=(0.006, 0.012, 0.006), seconds=5.0)
     assert "no bootstrap: 3 contacts, 6 are needed" in of(few, 20).notes
     with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, allowed 0, or 20 or more"):
@@ -129,14 +130,14 @@ def test_what_it_cannot_say_is_said():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "repeats"), ((0.0, 40), (0.02, 40)))
-def test_intervals_cover_the_stiffness_whether_contacts_differ_or_not(share, repeats):
+def test_bootstrap_intervals_cover_stiffness_with_and_without_variation(share, repeats):
     inside, without, widened = [], [], 0
     for seed in range(repeats):
         campaign = scattering(100 + seed, share)
         wide, stated = of(campaign, 40), of(campaign, 0)
-        for flags, found in ((inside, wide), (without, stated)):
-            one = found["contact.stiffness.0"]
-            flags.append(one.low <= 1.2e5 <= one.high)
+        for flags, result in ((inside, wide), (without, stated)):
+            stiffness = result["contact.stiffness.0"]
+            flags.append(stiffness.low <= 1.2e5 <= stiffness.high)
         widened += any("the bootstrap's" in note for note in wide.notes)
     covered = f"covered {np.mean(inside)}, without {np.mean(without)}, {widened} widened"
     print(f"contacts differ by {share}: {covered}")

@@ -1,7 +1,7 @@
-"""Acceptance on campaigns with known truth: coverage of intervals, errors, laws, verdicts.
+"""Acceptance of the identification on campaigns with known truth: coverage, errors, laws, verdicts.
 
-All of it is slow; `test_identify.py` has a sample for every day. Print the figures with
-`pytest -m slow -s tests/test_identify_campaigns.py`.
+All tests are slow; `test_identify.py` has a sample for every day. Print the results with `pytest -m slow -s
+tests/test_identify_campaigns.py`.
 """
 
 import campaigns
@@ -18,7 +18,7 @@ MASS = 350.0
 
 
 def truth(name):
-    """The true numbers by key, as a gauge without a delay of the position sensor has them."""
+    """Return the true values by key, as seen by a gauge without a delay of the position sensor."""
     kind = campaigns.KINDS[name]
     simulator, sensor = kind.rig["simulator"], kind.rig["force_sensor"]
     ahead = kind.rig["position_sensor"].get("delay", 0.0)
@@ -51,19 +51,19 @@ RMS_BARS = {
 
 
 @pytest.mark.parametrize("name", ("clean", "noisy", "coloured", "jitter"))
-def test_stated_95_percent_intervals_cover_that_often(name):
+def test_identify_intervals_have_stated_95_percent_coverage(name):
     numbers = truth(name)
     inside, scores, errors = ({key: [] for key in numbers} for _ in range(3))
     for seed in range(REPEATS):
         campaign = campaigns.campaign(name, 10_000 + seed)
-        found = identify(campaign, options=Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed))
+        result = identify(campaign, options=Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed))
         for key, value in numbers.items():
-            one = found[key]
-            inside[key].append(one.low <= value <= one.high)
-            errors[key].append(one.value - value)
-            scores[key].append(errors[key][-1] / one.std)
+            estimate = result[key]
+            inside[key].append(estimate.low <= value <= estimate.high)
+            errors[key].append(estimate.value - value)
+            scores[key].append(errors[key][-1] / estimate.std)
         if name == "noisy":
-            assert found["rig.force_sensor.quantum"].value == pytest.approx(0.5, rel=1e-9)
+            assert result["rig.force_sensor.quantum"].value == pytest.approx(0.5, rel=1e-9)
     print(name)
     for key in numbers:
         rms = np.sqrt(np.mean(np.square(scores[key])))
@@ -72,7 +72,7 @@ def test_stated_95_percent_intervals_cover_that_often(name):
             f"  {key:36s} covered {np.mean(inside[key]):.3f}, rms error {rms_error:.3g}, over std {rms:.3f}"
         )
         assert rms_error <= RMS_BARS.get(key, (np.inf, np.inf))[name == "noisy"]
-    # The bars are 92 to 98 %; three standard errors of 400 repeats are allowed beyond the stated 95 %.
+    # The limits are 92 to 98 %: the stated 95 % and three standard errors of 400 repeats.
     shares = {key: np.mean(values) for key, values in inside.items()}
     assert all(0.917 <= share <= 0.985 for share in shares.values()), shares
 
@@ -92,30 +92,34 @@ BARS = {
 
 
 @pytest.mark.parametrize("name", BARS)
-def test_errors_are_within_the_bars(name):
+def test_identify_errors_lie_within_allowed_limits(name):
     numbers, bars = truth(name), BARS[name]
     kind = campaigns.KINDS[name]
     critical = 2.0 * np.sqrt(min(kind.contact["stiffness"]) * MASS)
     rows, good, left = [], 0, []
     for seed in range(10):
-        found = identify(
+        result = identify(
             campaigns.campaign(name, 20_000 + seed), options=Options(law="kelvin_voigt", seed=seed)
         )
-        delays = found["rig.force_sensor.delay"].value
-        lag = next((one.value for one in found.estimates if one.key.endswith("sensor.time_constant")), 0.0)
+        delays = result["rig.force_sensor.delay"].value
+        lag = next(
+            (item.value for item in result.estimates if item.key.endswith("sensor.time_constant")), 0.0
+        )
         true_lag = kind.rig["force_sensor"].get("time_constant", 0.0)
-        plane = next((one.value for one in found.estimates if one.key == "rig.contact_plane"), np.nan)
+        plane = next((item.value for item in result.estimates if item.key == "rig.contact_plane"), np.nan)
         rows.append([
-            found["rig.simulator.delay"].value - numbers["rig.simulator.delay"],
+            result["rig.simulator.delay"].value - numbers["rig.simulator.delay"],
             delays + lag - numbers["rig.force_sensor.delay"] - true_lag,
-            max(abs(found[key].value / value - 1.0) for key, value in numbers.items() if "stiffness" in key),
+            max(abs(result[key].value / value - 1.0) for key, value in numbers.items() if "stiffness" in key),
             plane - numbers["rig.contact_plane"],
-            (found["apparent damping"].value - (numbers["apparent damping"] + 0.0)) / critical,
+            (result["apparent damping"].value - (numbers["apparent damping"] + 0.0)) / critical,
         ])  # fmt: skip
-        # Noise and dead zones leave damping and delay uncertain; that is no defect.
-        good += found.good or found.worst.name == UNCERTAINTY
-        held = next(line for line in found.lines if line.name == "restitution of touches not fitted")
-        left.append(float(held.finding.rsplit(" ", 1)[1]))
+        # Noise and dead zones leave damping and delay uncertain; that is not a defect.
+        good += result.good or result.worst.name == UNCERTAINTY
+        held_out_line = next(
+            line for line in result.lines if line.name == "restitution of touches not fitted"
+        )
+        left.append(float(held_out_line.finding.rsplit(" ", 1)[1]))
     print(name, "rms z of the restitution of touches not fitted", np.sqrt(np.mean(np.square(left))))
     assert 0.7 < np.sqrt(np.mean(np.square(left))) < 1.5
     rms, worst = np.sqrt(np.mean(np.square(rows), axis=0)), np.max(np.abs(rows), axis=0)
@@ -131,28 +135,28 @@ def test_errors_are_within_the_bars(name):
     ("clean", "kelvin_voigt"), ("hertz", "hunt_crossley"), ("stiffnesses", "kelvin_voigt"),
     ("layered", "piecewise_linear"),
 ))  # fmt: skip
-def test_the_law_is_named_in_20_of_20(name, law):
+def test_identify_selects_the_true_contact_law_in_20_of_20_campaigns(name, law):
     for seed in range(20):
-        found = identify(campaigns.campaign(name, 30_000 + seed), options=Options(hold_out=0.0))
-        assert found.contact.law.name == law, (seed, found.contact.law)
+        result = identify(campaigns.campaign(name, 30_000 + seed), options=Options(hold_out=0.0))
+        assert result.contact.law.name == law, (seed, result.contact.law)
 
 
-def test_no_drift_is_missed():
+def test_identify_detects_every_drift():
     for seed in range(20):
-        found = identify(campaigns.campaign("drifting", 40_000 + seed), options=Options(law="kelvin_voigt"))
-        assert not found.good
+        result = identify(campaigns.campaign("drifting", 40_000 + seed), options=Options(law="kelvin_voigt"))
+        assert not result.good
 
 
-def test_delay_and_lag_of_the_force_sensor_are_found_as_well_as_the_bound_allows():
-    """The Cramer-Rao bound of delay, lag, plane, stiffness, damping and bias together, by differences."""
+def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
+    """Compute the joint bound of delay, lag, plane, stiffness, damping and bias by differences."""
     true = np.array([0.0025, 0.0016, 0.0, 1.2e5, 650.0, 0.0])
     steps = np.array([2e-6, 2e-6, 2e-8, 10.0, 0.1, 0.01])
     off, bounds = [], []
     for seed in range(10):
         campaign = campaigns.campaign("lagging", 20_000 + seed)
-        found = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
-        off.append(found["delay and lag of force"].value - 0.0041)
-        problem = found.contact.problem
+        result = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+        off.append(result["delay and lag of force"].value - 0.0041)
+        problem = result.contact.problem
 
         def force(numbers, problem=problem):
             lag = Problem(problem.motion, problem.readings, problem.law, None, numbers[1])
@@ -166,19 +170,21 @@ def test_delay_and_lag_of_the_force_sensor_are_found_as_well_as_the_bound_allows
         bounds.append(np.sqrt(covariance[:2, :2].sum()))
     rms = np.sqrt(np.mean(np.square(off)))
     print(f"rms error {1e3 * rms:.3f} ms, bound {1e3 * np.mean(bounds):.3f} ms")
-    # Of 10 normal numbers the rms is below 1.6 standard deviations in 997 of 1000 cases.
+    # The rms of 10 normal values is below 1.6 standard deviations in 997 of 1000 cases.
     assert rms < 1.6 * np.mean(bounds)
 
 
-def test_a_press_tells_the_force_delay_from_the_damping():
-    """At the published noise the Cramer-Rao bound of 30 s at 0.05 mm is 0.05 ms; of touches alone 0.2 ms."""
+def test_identify_separates_force_delay_from_damping_with_press_run():
+    """At the published noise the Cramer-Rao bound of 30 s at 0.05 mm is 0.05 ms; from touches alone it is 0.2
+    ms.
+    """
     off = []
     for seed in range(5):
-        found = identify(
+        result = identify(
             campaigns.campaign("noisy", 50_000 + seed, press=True), options=Options(law="kelvin_voigt")
         )
-        off.append((found["rig.force_sensor.delay"].value - 0.0037, found["rig.force_sensor.delay"].std))
-        assert found.good
+        off.append((result["rig.force_sensor.delay"].value - 0.0037, result["rig.force_sensor.delay"].std))
+        assert result.good
     off = np.array(off)
     print("rms error", np.sqrt(np.mean(off[:, 0] ** 2)), "std", off[:, 1].mean())
     assert np.sqrt(np.mean(off[:, 0] ** 2)) < 1.2 * 5.1e-5 and off[:, 1].max() < 1e-4

@@ -1,4 +1,4 @@
-"""Logs of an independent rig against mechanisms that are theirs, or nearly."""
+"""`check` of logs of an independent rig against its own mechanism and against similar ones."""
 
 from dataclasses import replace
 
@@ -17,14 +17,14 @@ def clean():
     return campaigns.campaign("clean", 0, speeds=FEW, seconds=10.0, rest=2.0)
 
 
-def worst(found):
-    return found.worst.name if found.worst else None
+def worst(result):
+    return result.worst.name if result.worst else None
 
 
-def test_logs_of_the_mechanism_itself_are_good(clean):
-    found = check(clean, campaign_rigs.mechanism("clean"))
-    assert found.good and found.effect == 0.0 and found.estimates == ()
-    names = [line.name for line in found.lines]
+def test_check_accepts_logs_of_the_same_mechanism(clean):
+    result = check(clean, campaign_rigs.mechanism("clean"))
+    assert result.good and result.effect == 0.0 and result.estimates == ()
+    names = [line.name for line in result.lines]
     assert "motion model" in names and "contact law" in names and "drift from touch to touch" not in names
 
 
@@ -40,23 +40,23 @@ def test_logs_of_the_mechanism_itself_are_good(clean):
         ({"rig__command_hold": "zoh"}, None),
     ],
 )
-def test_another_mechanism_is_bad(clean, changed, name):
-    """The hold is the logs', not the mechanism's: told with them."""
-    found = check(clean, campaign_rigs.mechanism("clean", **changed))
-    assert found.good == (name is None)
-    assert name in [None, *(line.name for line in found.lines if line.there)]
+def test_check_rejects_logs_of_another_mechanism(clean, changed, name):
+    """The command hold belongs to the logs, not to the mechanism."""
+    result = check(clean, campaign_rigs.mechanism("clean", **changed))
+    assert result.good == (name is None)
+    assert name in [None, *(line.name for line in result.lines if line.there)]
 
 
 def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
-    runs = [replace(run, source=f"run_{place}.csv") for place, run in enumerate(clean.runs)]
-    place = next(place for place, run in reversed(list(enumerate(runs))) if run.kind == "contact")
-    runs[place] = replace(runs[place], force_measured=1.1 * runs[place].force_measured, begin=7.0)
-    found = check(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
-    (line,) = (line for line in found.lines if line.name == "contact law")
-    assert line.there and line.where.startswith(f"run_{place}.csv from 7.")
+    runs = [replace(run, source=f"run_{index}.csv") for index, run in enumerate(clean.runs)]
+    index = next(index for index, run in reversed(list(enumerate(runs))) if run.kind == "contact")
+    runs[index] = replace(runs[index], force_measured=1.1 * runs[index].force_measured, begin=7.0)
+    result = check(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
+    (line,) = (line for line in result.lines if line.name == "contact law")
+    assert line.there and line.where.startswith(f"run_{index}.csv from 7.")
 
 
-def test_the_hold_that_logs_are_told_with_is_checked(clean):
+def test_check_detects_wrong_command_hold(clean):
     wrong = replace(clean, timing=replace(clean.timing, command_hold="zoh"))
     assert "command hold" in [
         line.name for line in check(wrong, campaign_rigs.mechanism("clean")).lines if line.there
@@ -65,7 +65,7 @@ def test_the_hold_that_logs_are_told_with_is_checked(clean):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in campaigns.KINDS if name != "drifting"])
-def test_every_kind_of_rig_explains_its_own_logs(name):
+def test_check_accepts_logs_of_every_kind_of_rig(name):
     if name in ("coloured", "jitter"):
         pytest.skip("the same rig as clean")
     good = [
@@ -75,15 +75,15 @@ def test_every_kind_of_rig_explains_its_own_logs(name):
 
 
 @pytest.mark.slow
-def test_a_drift_is_noticed():
-    found = check(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
-    assert not found.good and any(line.name.startswith("drift") and line.there for line in found.lines)
+def test_check_detects_drift():
+    result = check(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
+    assert not result.good and any(line.name.startswith("drift") and line.there for line in result.lines)
 
 
-def test_what_cannot_be_set_against_logs_is_refused(clean):
-    held = replace(clean, runs=tuple(run for run in clean.runs if run.kind == "rest"))
+def test_check_rejects_logs_without_motion_and_unsupported_contact_law(clean):
+    at_rest_only = replace(clean, runs=tuple(run for run in clean.runs if run.kind == "rest"))
     with pytest.raises(InputError, match="found neither free motion nor contact"):
-        check(held, campaign_rigs.mechanism("clean"))
+        check(at_rest_only, campaign_rigs.mechanism("clean"))
     plastic = campaign_rigs.mechanism("clean", contact__law="elastoplastic", contact__unloading_ratio=2.0,
                                   contact__damping=[0.0])  # fmt: skip
     with pytest.raises(InputError, match=r"contact\.law: found 'elastoplastic', expected linear"):

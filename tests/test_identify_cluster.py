@@ -1,4 +1,4 @@
-"""Fits to contacts drawn again on a dask.distributed cluster: the same intervals to the bit, whoever dies."""
+"""Bootstrap over contacts on a dask.distributed cluster: the same bits, even if a worker is killed."""
 
 import campaigns
 import numpy as np
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.users_options
 
 @pytest.fixture(scope="module")
 def fit():
-    """Of so many rows that BLAS would share a sum of products among its threads."""
+    """Fit so many rows that BLAS would divide a dot product among its threads."""
     runs = campaigns._touch_runs(campaigns.KINDS["clean"], np.random.default_rng(0), (0.006, 0.012) * 15)
     model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     timing = campaigns.campaign("clean", 0, (), 0, 0).timing
@@ -24,14 +24,14 @@ def fit():
 
 
 @pytest.mark.parametrize("asked", (("--scheduler", "tcp://127.0.0.1:1"), ("--resume",)))
-def test_what_is_of_the_bootstrap_alone_is_one_line_without(jaxhil, asked):
-    found = jaxhil("identify", "x.csv", *asked)
-    assert found.code == 2
-    assert f"{asked[0]}: found no --bootstrap, allowed beside one" in found.err
+def test_identify_rejects_bootstrap_options_without_bootstrap(jaxhil, asked):
+    run = jaxhil("identify", "x.csv", *asked)
+    assert run.code == 2
+    assert f"{asked[0]}: found no --bootstrap, allowed beside one" in run.err
 
 
 @pytest.mark.slow
-def test_the_same_draws_though_a_worker_is_killed(fit, tmp_path, monkeypatch):
+def test_bootstrap_gives_the_same_draws_if_a_worker_is_killed(fit, tmp_path, monkeypatch):
     assert fit.readings.counts.sum() > 10_000
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         bootstrap.bootstrap(fit, 20, scheduler="nowhere://x")

@@ -17,20 +17,20 @@ FEW = (0.003, 0.006, 0.012) * 3
 
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
-    """Pictures have tests of their own."""
+    """Skip the plots; they have their own tests."""
     monkeypatch.setattr("tuning.identification.pictures.draw", lambda *_: {})
 
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
-    """Logs of a clean rig."""
+    """Return the logs of a clean rig."""
     folder = tmp_path_factory.mktemp("day")
     write(folder, campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0))
     return folder
 
 
 def drafted(jaxhil, folder):
-    """The drafted mapping, with the mass that only its user knows."""
+    """Draft a mapping and add the mass, which only the user knows."""
     ran = jaxhil("identify", "--guess", *logs(folder))
     assert ran.code == 0 and ran.err == ""
     path = folder / "map.toml"
@@ -38,9 +38,9 @@ def drafted(jaxhil, folder):
     return path
 
 
-def test_a_day_of_logs_becomes_a_mechanism_file(jaxhil, day, tmp_path):
-    given = ("identify", *logs(day), "--map", drafted(jaxhil, day), "--law", "kelvin_voigt", "-o", tmp_path)
-    ran = jaxhil(*given, "--json")
+def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path):
+    command = ("identify", *logs(day), "--map", drafted(jaxhil, day), "--law", "kelvin_voigt", "-o", tmp_path)
+    ran = jaxhil(*command, "--json")
     assert ran.code == 0 and ran.document["verdict"] == "good"
     assert ran.document == json.loads((tmp_path / "identification.json").read_text())
     assert digest(ran.document) == ran.document["sha256"]
@@ -51,34 +51,34 @@ def test_a_day_of_logs_becomes_a_mechanism_file(jaxhil, day, tmp_path):
     assert mechanism.rig.force_sensor.delay == pytest.approx(0.0037, abs=2.5e-4)
     assert mechanism.contact.stiffness == [pytest.approx(1.2e5, rel=0.003)]
     assert "rig.force_sensor.delay" in mechanism.correlation.keys
-    (delay,) = (one for one in ran.document["estimates"] if one["key"] == "rig.force_sensor.delay")
+    (delay,) = (item for item in ran.document["estimates"] if item["key"] == "rig.force_sensor.delay")
     assert delay["low"] < 0.0037 < delay["high"] and delay["unit"] == "s" and delay["prior"] is None
 
-    # Without a prior all mechanisms have one name, and logs of another rig must not replace what was written.
+    # Without a prior all mechanisms share a name; logs of another rig must not overwrite the results.
     (tmp_path / "other").mkdir()
     write(tmp_path / "other", campaigns.campaign("clean", 1, speeds=FEW[:3], seconds=5.0))
-    refused = jaxhil("identify", *logs(tmp_path / "other"), *given[-6:])
+    refused = jaxhil("identify", *logs(tmp_path / "other"), *command[-6:])
     assert refused.code == 2 and "found results of other logs ('contact_02.csv' and " in refused.err
     assert ran.document == json.loads((tmp_path / "identification.json").read_text())
 
-    # The file explains its own logs, and one of another rig does not.
-    told, map = tmp_path / "mechanism.toml", ("--map", drafted(jaxhil, day))
-    ran = jaxhil("identify", "--check", *logs(day), told, *map)
+    # The file explains its own logs; a file of another rig does not.
+    mechanism_file, map = tmp_path / "mechanism.toml", ("--map", drafted(jaxhil, day))
+    ran = jaxhil("identify", "--check", *logs(day), mechanism_file, *map)
     assert ran.code == 0 and "What identified leaves of runs: 9 contact, 1 free, 1 rest" in ran.out
-    told.write_text(told.read_text().replace("stiffness = [1", "stiffness = [2"))
-    ran = jaxhil("identify", "--check", *logs(day), *map, "--prior", told, "--json")
+    mechanism_file.write_text(mechanism_file.read_text().replace("stiffness = [1", "stiffness = [2"))
+    ran = jaxhil("identify", "--check", *logs(day), *map, "--prior", mechanism_file, "--json")
     assert ran.code == 1 and ran.document["estimates"] == [] and "contact law" in ran.document["reason"]
 
-    # What is not ours is not written over.
+    # A file that this program did not write is not overwritten.
     (tmp_path / "identification.json").unlink()
-    refused = jaxhil(*given)
+    refused = jaxhil(*command)
     assert refused.code == 2 and "mechanism.toml: found a file of something else" in refused.err
 
 
-def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
+def test_identify_command_verdict_is_bad_for_wrong_mapping(jaxhil, day, tmp_path):
     path = tmp_path / "map.toml"
     path.write_text(drafted(jaxhil, day).read_text().replace('"linear"', '"zoh"'))
-    given = (
+    command = (
         "identify",
         *logs(day),
         "--map",
@@ -90,13 +90,13 @@ def test_what_is_told_wrongly_is_a_bad_verdict(jaxhil, day, tmp_path):
         "-o",
         tmp_path,
     )
-    ran = jaxhil(*given)
+    ran = jaxhil(*command)
     assert ran.code == 1
     assert "Bad: the model does not explain this rig: command hold" in ran.out
     assert "off the prior" in ran.out and (tmp_path / "mechanism.toml").exists()
 
 
-def test_nothing_is_written_where_neither_logs_nor_prior_tell_what_a_file_must_have(jaxhil, day, tmp_path):
+def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, tmp_path):
     free = [path for path in logs(day) if path.name.startswith("free")]
     ran = jaxhil("identify", *free, "--map", drafted(jaxhil, day), "-o", tmp_path)
     assert ran.code == 1 and not list(tmp_path.iterdir())
@@ -127,16 +127,16 @@ def test_nothing_is_written_where_neither_logs_nor_prior_tell_what_a_file_must_h
         (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line(jaxhil, day, tmp_path, arguments, words):
+def test_identify_command_rejects_wrong_arguments_in_one_line(jaxhil, day, tmp_path, arguments, words):
     words_for = {
         "LOGS": logs(day),
         "LOG": logs(day)[:1],
         "MAP": [drafted(jaxhil, day)] if "MAP" in arguments else [],
     }
-    given = [one for word in arguments for one in words_for.get(word, [word])]
-    own = {"--prior", "--guess", "--check", "--bayes", "--design"} & {*arguments}
-    prior = [] if own else ["--prior", "rig-300kg"]
-    ran = jaxhil("identify", *given, *prior, "-o", tmp_path)
+    words_given = [value for word in arguments for value in words_for.get(word, [word])]
+    modes = {"--prior", "--guess", "--check", "--bayes", "--design"} & {*arguments}
+    prior = [] if modes else ["--prior", "rig-300kg"]
+    ran = jaxhil("identify", *words_given, *prior, "-o", tmp_path)
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1
     assert all(word in ran.err for word in words)
 
@@ -145,24 +145,24 @@ KINDS = ["jitter", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("no
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_logs_give_back_what_an_independent_rig_did(jaxhil, kind, tmp_path):
-    """Ticks, commands and readings, whatever the stamps scatter and whichever rows were lost."""
+def test_read_campaign_recovers_signals_of_independent_rig(jaxhil, kind, tmp_path):
+    """Ticks, commands and readings survive scattered stamps and lost rows."""
     campaign = campaigns.campaign(kind, 1, speeds=FEW, seconds=20.0)
     write(tmp_path, campaign, campaigns.KINDS[kind].jitter)
-    found = read_campaign(logs(tmp_path), load_mapping(drafted(jaxhil, tmp_path)))
+    recovered = read_campaign(logs(tmp_path), load_mapping(drafted(jaxhil, tmp_path)))
     for run in campaign.runs:
         name = f"{run.kind}_{campaign.runs.index(run):02}.csv"
-        parts = [one for one in found.runs if one.source == name]
-        # The first row's tick is called 0; the first rows are never lost.
-        ticks = np.concatenate([one.tick for one in parts])
-        valid = np.concatenate([one.valid for one in parts])
+        parts = [part for part in recovered.runs if part.source == name]
+        # The first row has tick 0; the first rows are never lost.
+        ticks = np.concatenate([part.tick for part in parts])
+        valid = np.concatenate([part.valid for part in parts])
         np.testing.assert_array_equal(ticks[valid], run.tick[run.valid])
         for channel in ("position_desired", "position_measured", "force_measured"):
-            values = np.concatenate([getattr(one, channel) for one in parts])
+            values = np.concatenate([getattr(part, channel) for part in parts])
             np.testing.assert_allclose(
                 values[valid], getattr(run, channel)[run.valid], rtol=1e-12, atol=1e-15
             )
-        back = np.concatenate([one.position_desired for one in parts])
-        # A cubic tells the multisine to a thousandth of its size; the model tells a contact's command.
+        back = np.concatenate([part.position_desired for part in parts])
+        # A cubic reproduces the multisine to 0.1 %; the model reproduces the command of a contact.
         error = np.max(np.abs(back - run.position_desired[ticks]))
         assert error < (1e-10 if run.kind == "contact" else 5e-6)

@@ -1,4 +1,4 @@
-"""The contact from forces over known motion: exact where there is no noise, honest where there is."""
+"""Contact identification from forces over known motion: exact without noise, calibrated with noise."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,7 +24,7 @@ SECOND = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8),
 
 
 def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, time_constant=0.0):
-    """Readings of a kind of campaign over the motion of the true motion simulator."""
+    """Return the readings of a kind of campaign over the motion of the true motion simulator."""
     kind = campaigns.KINDS[name]
     sensor = {**kind.rig["force_sensor"], "noise_std": noise}
     kind = replace(kind, rig={**kind.rig, "force_sensor": sensor})
@@ -41,7 +41,7 @@ def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, t
     ("stiffnesses", kelvin_voigt(), 2e-4, [1.2e5, 2.4e5, 7e4, 650.0, 0.0]),
     ("hertz", HERTZ, 0.0, [6e6, 1.2e7, 0.0]),
 ))  # fmt: skip
-def test_without_noise_the_numbers_are_exact_at_the_true_delay_and_plane(name, law, plane, expected):
+def test_contact_fit_is_exact_without_noise(name, law, plane, expected):
     exact = problem(name, law, noise=0.0, speeds=(0.006, 0.012, 0.006))
     inner = exact.at(0.0037, plane)
     np.testing.assert_allclose(inner.coefficients, expected, rtol=1e-7, atol=1e-6)
@@ -52,15 +52,15 @@ def test_without_noise_the_numbers_are_exact_at_the_true_delay_and_plane(name, l
     )
 
 
-def test_with_a_lag_too():
-    """The position sensor's delay is the motion's here, and less of the force's."""
+def test_contact_fit_is_exact_with_force_sensor_lag():
+    """The position sensor's delay is added to that of the motion and subtracted from that of the force."""
     lagging = problem("lagging", kelvin_voigt(), 0.0, (0.006, 0.012), 0, 0.0, 0.0016)
     inner = lagging.at(0.0037 - 0.0012, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=2e-4, atol=0.01)
     assert np.abs(lagging.force(0.0025, 0.0, inner.coefficients) - lagging.readings.force).max() < 0.06
 
 
-def test_a_lag_is_exact_on_a_parabola():
+def test_lag_weights_are_exact_for_parabola():
     rate = 0.7
     pole, weights = lag_weights(rate)
     t = np.linspace(0.0, 1.0, 200_001)
@@ -71,38 +71,38 @@ def test_a_lag_is_exact_on_a_parabola():
     assert pole == pytest.approx(np.exp(-rate)) and sum(weights) == pytest.approx(1.0 - pole)
 
 
-def test_a_lag_is_exact_where_contact_begins_within_the_period():
+def test_onset_weights_are_exact_for_contact_onset_within_a_period():
     rate, left = 0.7, np.array([0.03, 0.4, 1.0])
     after, end = onset_weights(rate, left)
-    for share, one, other in zip(left, after, end, strict=True):
+    for share, begin_weight, end_weight in zip(left, after, end, strict=True):
         t = np.linspace(1.0 - share, 1.0, 200_001)
         line = 3.0 + 2.0 * (t - t[0]) / share
         exact = np.trapezoid(rate * np.exp(-(1.0 - t) * rate) * line, t)
-        assert one * 3.0 + other * 5.0 == pytest.approx(exact, rel=1e-9)
+        assert begin_weight * 3.0 + end_weight * 5.0 == pytest.approx(exact, rel=1e-9)
 
 
-def test_white_noise_and_its_sums_give_what_the_filtered_path_gives():
+def test_contact_fit_with_white_noise_equals_filtered_path():
     plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
     filtered = Problem(plain.motion, plain.readings, plain.law, None)
     filtered.plain, filtered.where = False, np.arange(plain.readings.counts.size)
     filtered.entry = plain.readings.entry.ravel()
     for delay in (0.0031, 0.0037):
-        one, other = plain.at(delay, 2e-4), filtered.at(delay, 2e-4)
-        np.testing.assert_allclose(one.coefficients, other.coefficients, rtol=1e-8, atol=1e-9)
+        direct, reference = plain.at(delay, 2e-4), filtered.at(delay, 2e-4)
+        np.testing.assert_allclose(direct.coefficients, reference.coefficients, rtol=1e-8, atol=1e-9)
         for name in ("misfit", "evidence", "slope", "curvature"):
-            assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6), name
+            assert getattr(direct, name) == pytest.approx(getattr(reference, name), rel=1e-6), name
 
 
-def test_the_exponential_is_that_of_scipy():
+def test_matrix_exponential_matches_scipy():
     matrix = np.random.default_rng(0).standard_normal((5, 5)) * 3.0
     np.testing.assert_allclose(exponential(matrix), expm(matrix), rtol=1e-11)
 
 
-def test_the_posterior_covers_the_truth_and_knows_the_apparent_damping_best():
-    found = profile(problem("clean", kelvin_voigt(), seed=4))
-    values = dict(zip(found.names, found.draws.T, strict=True))
+def test_contact_posterior_covers_truth_and_apparent_damping_is_most_precise():
+    posterior = profile(problem("clean", kelvin_voigt(), seed=4))
+    values = dict(zip(posterior.names, posterior.draws.T, strict=True))
     for name, truth in (("delay", 0.0037), ("plane", 0.0), ("stiffness.0", 1.2e5), ("damping", 650.0)):
-        # 99.99 % of a normal number's draws.
+        # 99.99 % of normal draws lie within 4 standard deviations.
         assert abs(values[name].mean() - truth) < 4.0 * values[name].std(), name
     apparent = values["damping"] - values["stiffness.0"] * values["delay"]
     assert abs(apparent.mean() - (650.0 - 1.2e5 * 0.0037)) < 4.0 * apparent.std()
@@ -111,7 +111,7 @@ def test_the_posterior_covers_the_truth_and_knows_the_apparent_damping_best():
     assert np.corrcoef(values["delay"], values["damping"])[0, 1] > 0.5
 
 
-def test_a_long_press_is_fitted_in_pieces_as_exactly():
+def test_contact_fit_of_press_in_chunks_is_exact():
     kind = campaigns.KINDS["clean"]
     silent = {
         sensor: {**kind.rig[sensor], "noise_std": 0.0} for sensor in ("force_sensor", "position_sensor")
@@ -125,8 +125,8 @@ def test_a_long_press_is_fitted_in_pieces_as_exactly():
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
 
 
-def test_a_contact_cut_by_lost_rows_counts_once_the_motion_has_forgotten_them():
-    """30 rows lost as the touches turn: what was commanded there is in the motion that follows."""
+def test_contact_fit_skips_rows_until_motion_forgets_a_gap():
+    """Lose 30 rows at the turning point of the touches: the commands there affect the later motion."""
     kind = campaigns.KINDS["clean"]
     silent = {"force_sensor": {**kind.rig["force_sensor"], "noise_std": 0.0}}
     runs = campaigns._touch_runs(
@@ -140,52 +140,54 @@ def test_a_contact_cut_by_lost_rows_counts_once_the_motion_has_forgotten_them():
         for run in runs
         for part in (slice(0, 120), slice(150, None))
     ]
-    known = after_gaps(halves, SECOND, 0.001)
-    assert [int(run.valid.sum()) for run in known] == [120, 79, 120, 79]
+    usable = after_gaps(halves, SECOND, 0.001)
+    assert [int(run.valid.sum()) for run in usable] == [120, 79, 120, 79]
     assert after_gaps(runs, SECOND, 0.001)[0].valid.all()
     worst = []
-    for cut in (known, halves):
+    for cut in (usable, halves):
         motion = Motion(SECOND, cut, timing, 0.022)
         inner = Problem(motion, Readings.of(cut, 0.5), kelvin_voigt(), 0.0).at(0.0037, 0.0)
         worst.append(np.max(np.abs(inner.coefficients - [1.2e5, 650.0, 0.0]) / [1.2e5, 650.0, 1.0]))
     assert worst[0] < 1e-3 < 1e-2 < worst[1]
 
 
-def test_undamped_contact_has_no_negative_damping():
+def test_contact_fit_of_undamped_contact_has_no_negative_damping():
     kind = campaigns.KINDS["clean"]
     soft = replace(kind, contact={**kind.contact, "damping": [0.0]})
     runs = campaigns._touch_runs(soft, np.random.default_rng(0), (0.003, 0.006, 0.012))
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
-    one = Problem(Motion(SECOND, runs, timing, 0.022), Readings.of(runs, 0.5), kelvin_voigt(), 0.0)
-    found = profile(one, size=(21, 5))
-    damping = found.draws[:, found.names.index("damping")]
+    undamped = Problem(Motion(SECOND, runs, timing, 0.022), Readings.of(runs, 0.5), kelvin_voigt(), 0.0)
+    posterior = profile(undamped, size=(21, 5))
+    damping = posterior.draws[:, posterior.names.index("damping")]
     assert damping.min() >= 0.0 and damping.mean() < 4.0 * damping.std()
-    assert found.mean[0] == pytest.approx(0.0037, abs=4.0 * found.draws[:, 0].std())
+    assert posterior.mean[0] == pytest.approx(0.0037, abs=4.0 * posterior.draws[:, 0].std())
 
 
 @pytest.mark.parametrize("name, law", (("clean", "kelvin_voigt"), ("hertz", "hunt_crossley")))
-def test_the_law_is_named(name, law):
-    one = problem(name, kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
-    judged = judge(one.motion, one.readings, None, ("linear", "kelvin_voigt", "hunt_crossley"))
-    assert judged[0].law.name == law and not judged[0].law.pulls
-    assert all(other.short[0] > 2.0 * other.short[1] for other in judged[1:] if other.law.name != law)
+def test_contact_law_selection_finds_the_true_law(name, law):
+    readings_problem = problem(name, kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
+    candidates = judge(
+        readings_problem.motion, readings_problem.readings, None, ("linear", "kelvin_voigt", "hunt_crossley")
+    )
+    assert candidates[0].law.name == law and not candidates[0].law.pulls
+    assert all(other.short[0] > 2.0 * other.short[1] for other in candidates[1:] if other.law.name != law)
     if name == "hertz":
-        assert judged[0].law.shape == {"exponent": 1.5}
+        assert candidates[0].law.shape == {"exponent": 1.5}
 
 
-def test_cells_have_their_edges_where_rows_come_into_contact():
+def test_contact_profile_cells_are_cut_at_contact_onsets():
     at = np.array([0.1, 0.15, 0.7])
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0])
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 3), [0.0, 0.15, 0.7, 1.0])
     np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at[:0], 4), [0.0, 0.25, 0.5, 0.75, 1.0])
     exact = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012, 0.003), seed=3)
     (plane, *_) = exact.onsets_between(0.0037, -3e-6, 3e-6)
-    inside = [exact.motion.at(0.0037)[0] > place for place in (plane - 1e-9, plane + 1e-9)]
+    inside = [exact.motion.at(0.0037)[0] > surface for surface in (plane - 1e-9, plane + 1e-9)]
     assert np.sum(inside[0] != inside[1]) == 1
 
 
-def test_a_search_about_a_delay_beyond_the_longest_stays_within_it():
-    """Stay within the longest delay: beyond it the grid about the delay had one place."""
+def test_quick_search_stays_within_longest_delay():
+    """Beyond the longest delay, the grid about the delay had a single point."""
     clean = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
     late = Problem(clean.motion, late, clean.law, clean.plane)

@@ -1,4 +1,4 @@
-"""Excitations: least errors within the limits, low peaks, and predictions that campaigns of them bear out."""
+"""Excitation design: least errors within the limits, low crest factors, correct predictions."""
 
 from functools import partial
 
@@ -19,12 +19,14 @@ from tuning.identification.estimate import SHORTEST_REST
 from tuning.identification.noise import at_rest
 from tuning.identification.records import Timing
 
-# d(e - e*) by the numbers of "clean", as the slow test has them of the loop.
+# Derivatives of e - e* by the parameters of "clean", as the slow test computes them.
 SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
 
 
-def test_a_slope_is_best_found_at_both_ends():
-    """Elfving 1952: of y = a + b x on -1 <= x <= 1, b is best found with half the readings at either end."""
+def test_best_powers_of_slope_lie_at_both_ends():
+    """Elfving 1952: for y = a + b x on -1 <= x <= 1, b is best estimated with half the readings at either
+    end.
+    """
     x = np.linspace(-1.0, 1.0, 21)
     rows = np.stack([np.ones_like(x), x])
     group = powers.Group(np.einsum("il,jl->lij", rows, rows), np.ones((1, 21)))
@@ -34,7 +36,7 @@ def test_a_slope_is_best_found_at_both_ends():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_powers_within_several_limits_are_those_of_a_general_solver(seed):
+def test_best_powers_within_limits_match_general_solver(seed):
     random = np.random.default_rng(seed)
     rows = random.standard_normal((2, 7))
     use = random.uniform(0.1, 1.0, (2, 7))
@@ -43,16 +45,16 @@ def test_powers_within_several_limits_are_those_of_a_general_solver(seed):
     def error(power):
         return np.trace(weight @ np.linalg.inv(powers.information([group], [power])))
 
-    limits = [{"type": "ineq", "fun": lambda p, one=one: 1.0 - one @ p} for one in use]
+    limits = [{"type": "ineq", "fun": lambda p, row=row: 1.0 - row @ p} for row in use]
     start = powers.flat_powers(group)
-    found = optimize.minimize(error, start, method="SLSQP", bounds=[(1e-9, None)] * 7, constraints=limits,
+    result = optimize.minimize(error, start, method="SLSQP", bounds=[(1e-9, None)] * 7, constraints=limits,
                               options={"ftol": 1e-10, "maxiter": 500})  # fmt: skip
     (power,) = powers.best_powers([group], weight)
     assert np.all(use @ power <= 1.0 + 1e-9)
-    assert error(power) == pytest.approx(found.fun, rel=5e-3) and error(power) < error(start)
+    assert error(power) == pytest.approx(result.fun, rel=5e-3) and error(power) < error(start)
 
 
-def test_peaks_are_low_and_amplitudes_as_asked_for():
+def test_multisine_has_low_crest_factor_and_given_amplitudes():
     lines, rows = np.arange(1, 200, 2), 2000
     amplitude = np.random.default_rng(0).uniform(0.1, 1.0, len(lines))
     made = waveform.wave(amplitude, lines, rows, waveform.phases(amplitude, lines, rows))
@@ -71,49 +73,49 @@ def planned():
     return design(mechanism, 0.002, lambda keys: SLOPES)
 
 
-def test_the_limits_are_kept_and_used(planned):
+def test_design_keeps_and_uses_the_limits(planned):
     free, press = planned.free.position, planned.press.position
     assert np.abs(free).max() == pytest.approx(0.002, rel=1e-6) or np.abs(free).max() < 0.002
     speed, acceleration = np.diff(free) / 1e-3, np.diff(free, 2) / 1e-6
     assert np.abs(speed).max() < 0.3 and np.abs(acceleration).max() < 20.0
     assert np.abs(free).max() > 0.0017 or np.abs(acceleration).max() > 0.85 * 18.0
-    # With speed and acceleration limited beside the stroke no wave is low in all three.
+    # With limits on stroke, speed and acceleration, no wave has a low crest factor in all three.
     assert max(planned.free.crest, planned.press.crest) < 2.1
-    # Never off the mechanism while pressed, and within the force of an approach.
+    # The press never leaves the mechanism, and its force stays within that of an approach.
     force = campaign_rigs.commanded("clean", "press", press, 0, noise=False).force_measured
     greatest = 0.006 * np.sqrt(1.2e5 * 350.0)
-    held = slice(3000, 3000 + 12 * 5000)
-    assert 0.03 * greatest < force[held].min() and force.max() < 0.9 * greatest
+    pressed = slice(3000, 3000 + 12 * 5000)
+    assert 0.03 * greatest < force[pressed].min() and force.max() < 0.9 * greatest
     assert press[0] == press[-1] == pytest.approx(-0.001, abs=1e-6)
 
 
-def test_it_tells_more_of_the_error_than_a_flat_spectrum_does(planned):
+def test_design_is_more_informative_than_flat_spectrum(planned):
     assert planned.flat > 1.5
 
 
 def spread(planned, repeats):
-    """Standard deviations of the motion's numbers over campaigns, over those predicted."""
-    timing, found = Timing(1e-3, "linear", 0, "tick"), []
+    """Return the standard deviations of the motion parameters over campaigns, relative to those predicted."""
+    timing, rows = Timing(1e-3, "linear", 0, "tick"), []
     for seed in range(repeats):
         run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, seed)
-        one = free_motion.estimate([run], timing, 2)
-        assert one is not None and one.spectra[0].periods == PERIODS - 1
-        w, zeta, delay = one.model.parameters
-        found.append([np.exp(w) / (2.0 * np.pi), np.exp(zeta), delay])
-    return np.std(found, axis=0, ddof=1) / planned.std[:3], np.mean(found, axis=0)
+        fit = free_motion.estimate([run], timing, 2)
+        assert fit is not None and fit.spectra[0].periods == PERIODS - 1
+        w, zeta, delay = fit.model.parameters
+        rows.append([np.exp(w) / (2.0 * np.pi), np.exp(zeta), delay])
+    return np.std(rows, axis=0, ddof=1) / planned.std[:3], np.mean(rows, axis=0)
 
 
-def test_a_fit_to_it_knows_the_numbers_as_well_as_predicted(planned):
+def test_design_predicts_standard_deviations_of_fit(planned):
     run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0)
-    one = free_motion.estimate([run], Timing(1e-3, "linear", 0, "tick"), 2)
-    assert one is not None and one.spectra[0].periods == PERIODS - 1
-    values, std = one.model.parameters, np.sqrt(np.diag(one.covariance))
+    fit = free_motion.estimate([run], Timing(1e-3, "linear", 0, "tick"), 2)
+    assert fit is not None and fit.spectra[0].periods == PERIODS - 1
+    values, std = fit.model.parameters, np.sqrt(np.diag(fit.covariance))
     scale = np.array([np.exp(values[0]) / (2.0 * np.pi), np.exp(values[1]), 1.0])
     np.testing.assert_allclose(scale * std, planned.std[:3], rtol=0.1)
 
 
 @pytest.mark.slow
-def test_estimates_of_many_campaigns_scatter_as_predicted():
+def test_design_predicts_scatter_over_many_campaigns():
     mechanism = campaign_rigs.mechanism("clean")
     gains = choose_gains(mechanism, "response_error", None)[1]
     planned = design(mechanism, 0.002, partial(error_slopes, mechanism, "response_error", gains))
@@ -126,22 +128,22 @@ def test_estimates_of_many_campaigns_scatter_as_predicted():
     timing, kind = Timing(1e-3, "linear", 0, "tick"), campaigns.KINDS["clean"]
     noise = at_rest(0.5 * np.random.default_rng(0).standard_normal(10 * SHORTEST_REST))
     free = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0, noise=False)
-    model, found = free_motion.estimate([free], timing, 2).model, []
+    model, rows = free_motion.estimate([free], timing, 2).model, []
     for seed in range(16):
         run = campaign_rigs.commanded("clean", "press", planned.press.position, seed)
         fit = contact.estimate(contact.pieces(run, 1e-3), model, timing, noise, "kelvin_voigt")
-        own = dict(zip(fit.posterior.names, fit.posterior.mean, strict=True))
-        found.append([own["delay"], own["stiffness.0"], own["damping"]])
-    ratio = np.std(found, axis=0, ddof=1) / planned.std[3:]
-    print("press: std over predicted", ratio, "mean", np.mean(found, axis=0), "of", kind.contact)
-    # Chi-squared of 15: 99.9 % are between 0.45 and 1.58.
+        estimates = dict(zip(fit.posterior.names, fit.posterior.mean, strict=True))
+        rows.append([estimates["delay"], estimates["stiffness.0"], estimates["damping"]])
+    ratio = np.std(rows, axis=0, ddof=1) / planned.std[3:]
+    print("press: std over predicted", ratio, "mean", np.mean(rows, axis=0), "of", kind.contact)
+    # With 15 degrees of freedom, 99.9 % of the ratios are between 0.45 and 1.58.
     assert np.all(ratio < 1.6) and np.all(ratio > 0.45)
 
 
 PLASTIC = "elastoplastic", 2.0, [0.0]
 
 
-def test_what_cannot_be_designed_for_is_refused():
+def test_design_rejects_unsupported_mechanism():
     for changed, reason in (
         (dict(zip(("contact__law", "contact__unloading_ratio", "contact__damping"), PLASTIC, strict=True)),
          r"contact\.law: found 'elastoplastic'"),
@@ -152,13 +154,13 @@ def test_what_cannot_be_designed_for_is_refused():
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_a_rig_can_be_driven_by(jaxhil, tmp_path):
+def test_identify_design_command_writes_excitation_files(jaxhil, tmp_path):
     ran = jaxhil("identify", "--design", "rig-300kg", "--stroke", "0.003", "-o", tmp_path, "--json")
     assert ran.code == 0 and digest(ran.document) == ran.document["sha256"]
     for name in ("free", "press"):
         times, x = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1).T
         assert len(x) == ran.document["runs"][name]["rows"] and np.abs(x).max() <= 0.003
         np.testing.assert_allclose(np.diff(times), np.diff(times)[0], rtol=1e-6)
-    assert all(one["std"] > 0.0 for one in ran.document["predicted"])
+    assert all(item["std"] > 0.0 for item in ran.document["predicted"])
     ran = jaxhil("identify", "--design", "--prior", "rig-300kg", "--stroke", "0.003", "-o", tmp_path)
     assert ran.code == 0 and "rig.force_sensor.delay" in ran.out and "crest factors" in ran.out

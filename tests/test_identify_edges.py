@@ -1,4 +1,4 @@
-"""Edges of contact show a filter that the model lacks; forces are taken at the times they were read."""
+"""Edges of contact reveal a filter that the model lacks; forces are used at the times of their reading."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from tuning.identification.rational import STRUCTURES, Model
 
 
 def checked(monkeypatch, lag):
-    """Return the check of the edges of a file that has the true lag [s], or has it as a longer delay."""
+    """Return the check of the edges for a file with the true lag [s], or with it as a longer delay."""
     campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
     raw: dict[str, Any] = to_builtins(ambiguous.truth("lag")) | {"source": "identified from logs"}
     sensor = raw["rig"]["force_sensor"]
@@ -29,13 +29,13 @@ def checked(monkeypatch, lag):
 
 
 @pytest.mark.parametrize(("lag", "there"), [(0.0016, False), (0.0, True)])
-def test_edges_show_a_lag_that_the_file_lacks(monkeypatch, lag, there):
+def test_check_detects_missing_force_lag_at_contact_edges(monkeypatch, lag, there):
     line = checked(monkeypatch, lag)
     assert line.there == there
     assert not there or line.counted_error > 0.01
 
 
-def test_noise_beyond_a_dead_zone_tells_it():
+def test_at_rest_estimates_dead_zone_from_noise():
     signal = np.random.default_rng(1).standard_normal(20_000)
     noise = at_rest(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
     assert noise.silent and noise.dead_zone is not None
@@ -46,7 +46,7 @@ def test_noise_beyond_a_dead_zone_tells_it():
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
-def test_dead_zone_that_cuts_is_a_defect(monkeypatch, tmp_path, is_cut):
+def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_cut):
     campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
     runs = []
     for run in campaign.runs:
@@ -57,16 +57,18 @@ def test_dead_zone_that_cuts_is_a_defect(monkeypatch, tmp_path, is_cut):
     prior: dict[str, Any] = to_builtins(ambiguous.prior("plain"))
     prior["rig"]["force_sensor"]["dead_zone"] = 3.0
     result = identify(campaign, from_builtins(prior, "prior"))
-    found = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
-    assert found == (["no reading lies between 0 and 3 N, as behind a dead zone that cuts"] if is_cut else [])
+    findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
+    assert findings == (
+        ["no reading lies between 0 and 3 N, as behind a dead zone that cuts"] if is_cut else []
+    )
     assert not (is_cut and result.good)
 
 
-def test_motion_is_that_of_the_time_at_which_forces_were_read():
+def test_motion_is_evaluated_at_the_time_of_the_force_readings():
     campaign = campaigns.campaign("clean", 0, speeds=(0.006, 0.012), seconds=0, rest=0)
     model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     late = [replace(run, force_late=np.full(len(run.tick), 3e-4)) for run in campaign.runs]
-    motion, own = (Motion(model, runs, campaign.timing, 0.022) for runs in (late, campaign.runs))
-    for one, other in zip(motion.at(0.004), own.at(0.0037), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(motion.of_positions().at(0.004)[0], own.at(0.004)[0])
+    motion, undelayed = (Motion(model, runs, campaign.timing, 0.022) for runs in (late, campaign.runs))
+    for late_values, values in zip(motion.at(0.004), undelayed.at(0.0037), strict=True):
+        np.testing.assert_allclose(late_values, values, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(motion.of_positions().at(0.004)[0], undelayed.at(0.004)[0])

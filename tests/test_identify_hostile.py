@@ -1,4 +1,4 @@
-"""Logs of a good rig that somebody spoilt: refused in one line, or called bad, or right all the same."""
+"""Spoilt logs of a good rig: rejected in one line, or with a bad verdict, or identified correctly."""
 
 import campaign_rigs
 import campaigns
@@ -22,28 +22,28 @@ def _undrawn(monkeypatch):
 
 @pytest.fixture(scope="module")
 def day():
-    """Columns of a clean rig's logs by file."""
+    """Return the columns of a clean rig's logs by file."""
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 3, seconds=20.0, rest=2.0)
-    return {f"{run.kind}_{place:02}.csv": columns(run) for place, run in enumerate(campaign.runs)}
+    return {f"{run.kind}_{index:02}.csv": columns(run) for index, run in enumerate(campaign.runs)}
 
 
-def identified(jaxhil, folder, files, mapping=MAPPING, *given):
-    """The command on these files, the law told."""
+def identified(jaxhil, folder, files, mapping=MAPPING, *options):
+    """Run the command on these files with the contact law specified."""
     runs = "".join(f'\n[[runs]]\nfiles = "{kind}_*.csv"\nkind = "{kind}"\n' for kind in KINDS)
     (folder / "map.toml").write_text(mapping + runs)
     for name, table in files.items():
         write_columns(folder / name, table)
-    whole = "--law", "kelvin_voigt", "--map", folder / "map.toml", "-o", folder / "out", "--json", *given
+    whole = "--law", "kelvin_voigt", "--map", folder / "map.toml", "-o", folder / "out", "--json", *options
     return jaxhil("identify", *logs(folder), *whole)
 
 
-def changed(day, column, change, kinds=KINDS, told=False):
-    """All files with a column changed; without what tells that it was, unless `told`."""
+def changed(day, column, change, kinds=KINDS, reveals=False):
+    """Return all files with one column changed; drop the columns that reveal it, unless `reveals`."""
     files = {}
     for name, table in day.items():
-        kept = {key: one for key, one in table.items() if told or key not in TOLD}
-        here = column in kept and name.split("_")[0] in kinds
-        files[name] = {**kept, column: change(kept[column])} if here else kept
+        remaining = {key: values for key, values in table.items() if reveals or key not in TOLD}
+        here = column in remaining and name.split("_")[0] in kinds
+        files[name] = {**remaining, column: change(remaining[column])} if here else remaining
     return files
 
 
@@ -52,7 +52,7 @@ def held(every):
 
 
 def joined(every):
-    """Logged every so many rows, and lines in between."""
+    """Keep every n-th row and interpolate linearly in between."""
     return lambda values: np.interp(np.arange(len(values)), np.arange(0, len(values), every), values[::every])
 
 
@@ -60,34 +60,36 @@ def noise(size):
     return lambda values: values + size * np.random.default_rng(0).standard_normal(len(values))
 
 
-def swapped(one, other):
-    return lambda day: {name: {**table, one: table[other], other: table[one]}
+def swapped(first, second):
+    return lambda day: {name: {**table, first: table[second], second: table[first]}
                         for name, table in changed(day, "", None).items()}  # fmt: skip
 
 
 def only(kind, number=99):
-    return lambda day: {name: day[name] for name in [one for one in day if one.startswith(kind)][:number]}
+    return lambda day: {name: day[name] for name in [file for file in day if file.startswith(kind)][:number]}
 
 
 REFUSED = {
     "the force's sign": (lambda day: changed(day, FORCE, np.negative), "allowed the other sign"),
-    "N for kN": (lambda day: changed(day, FORCE, lambda one: 1e3 * one), "is its unit right?"),
-    "m for mm": (lambda day: changed(day, COMMAND, lambda one: 1e-3 * one), "is its unit right?"),
+    "N for kN": (lambda day: changed(day, FORCE, lambda values: 1e3 * values), "is its unit right?"),
+    "m for mm": (lambda day: changed(day, COMMAND, lambda values: 1e-3 * values), "is its unit right?"),
     "position and command": (swapped(COMMAND, POSITION), "are the two swapped?"),
     "force and position": (swapped(FORCE, POSITION), "is its unit right?"),
     "commands held for 2 rows": (lambda day: changed(day, COMMAND, held(2)), "changes every 2 rows"),
     "commands held for 4 rows": (lambda day: changed(day, COMMAND, held(4)), "changes every 4 rows"),
     "commands against forces": (
-        lambda day: changed(day, COMMAND, held(4), ("contact",), told=True), "changes every 4 rows",
+        lambda day: changed(day, COMMAND, held(4), ("contact",), reveals=True), "changes every 4 rows",
     ),
-    "time backwards": (lambda day: changed(day, TIME, lambda one: one[::-1]), "allowed time that increases"),
+    "time backwards": (
+        lambda day: changed(day, TIME, lambda values: values[::-1]), "allowed time that increases",
+    ),
     "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact where there is"),
     "a force range of 5 N": (
-        lambda day: changed(day, FORCE, lambda one: np.clip(one, -5e-3, 5e-3)), "is its unit right?",
+        lambda day: changed(day, FORCE, lambda values: np.clip(values, -5e-3, 5e-3)), "is its unit right?",
     ),
     "no force": (
         lambda day: {
-            name: {key: one for key, one in table.items() if key not in (FORCE, *TOLD)}
+            name: {key: values for key, values in table.items() if key not in (FORCE, *TOLD)}
             for name, table in day.items()
         },
         "found no such channel",
@@ -96,7 +98,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_in_one_line(jaxhil, day, tmp_path, case):
+def test_identify_command_rejects_spoilt_logs_in_one_line(jaxhil, day, tmp_path, case):
     spoil, words = REFUSED[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and "internal" not in ran.err
@@ -104,7 +106,7 @@ def test_refused_in_one_line(jaxhil, day, tmp_path, case):
 
 
 def late(day):
-    """A second free run whose readings are late by 3 ms."""
+    """Add a second free run whose readings are late by 3 ms."""
     run = day["free_01.csv"]
     return {**day, "free_99.csv": {**run, POSITION: np.roll(run[POSITION], 3)}}
 
@@ -113,14 +115,14 @@ BAD = {
     "commands joined over 10 rows": (lambda day: changed(day, COMMAND, joined(10)), "motion model"),
     "forces held for 4 rows": (lambda day: changed(day, FORCE, held(4)), "does not explain"),
     "a force range of 30 N": (
-        lambda day: changed(day, FORCE, lambda one: np.clip(one, -0.03, 0.03)), "contact law",
+        lambda day: changed(day, FORCE, lambda values: np.clip(values, -0.03, 0.03)), "contact law",
     ),
     "a position range of 1 mm": (
-        lambda day: changed(day, POSITION, lambda one: np.clip(one, -51.0, -49.0), ("free",)),
+        lambda day: changed(day, POSITION, lambda values: np.clip(values, -51.0, -49.0), ("free",)),
         "odd nonlinearity",
     ),
     "a force sensor that drifts": (
-        lambda day: changed(day, FORCE, lambda one: one + 1e-2 * np.arange(len(one)) / 400.0),
+        lambda day: changed(day, FORCE, lambda values: values + 1e-2 * np.arange(len(values)) / 400.0),
         "does not explain",
     ),
     "two rigs": (late, "motion model"),
@@ -131,24 +133,24 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_called_bad(jaxhil, day, tmp_path, case):
+def test_identify_command_verdict_is_bad_for_spoilt_logs(jaxhil, day, tmp_path, case):
     spoil, words = BAD[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
     assert ran.code == 1 and ran.document["verdict"] == "bad" and words in ran.document["reason"]
 
 
-def test_rest_alone_shows_nothing_even_with_a_prior(jaxhil, day, tmp_path):
+def test_identify_command_verdict_is_bad_for_rest_alone_despite_prior(jaxhil, day, tmp_path):
     ran = identified(jaxhil, tmp_path, only("rest")(day), MAPPING, *PRIOR)
     assert ran.code == 1 and "nothing shows that the file is right" in ran.document["reason"]
 
 
 def gaps(day):
-    """16 rows lost in the middle of every contact."""
+    """Lose 16 rows in the middle of every contact."""
     files = {}
     for name, table in day.items():
         deep = int(np.argmax(table[FORCE]))
         lost = slice(deep - 8, deep + 8) if name.startswith("contact") else slice(0)
-        files[name] = {key: np.delete(one, lost) for key, one in table.items()}
+        files[name] = {key: np.delete(values, lost) for key, values in table.items()}
     return files
 
 
@@ -157,7 +159,7 @@ FAIR = {
     "a gap in every contact": (gaps, ()),
     "two contacts": (only("contact", 2), PRIOR),
     "a force only in contact": (
-        lambda day: changed(day, FORCE, lambda one: 0.0 * one, ("rest", "free"), told=True), (),
+        lambda day: changed(day, FORCE, lambda values: 0.0 * values, ("rest", "free"), reveals=True), (),
     ),
     "noise of 0.1 mm": (lambda day: changed(day, POSITION, noise(0.1)), ()),
 }  # fmt: skip
@@ -171,28 +173,28 @@ TRUE = {
 
 
 @pytest.mark.parametrize("case", FAIR)
-def test_right_all_the_same(jaxhil, day, tmp_path, case):
-    spoil, given = FAIR[case]
-    ran = identified(jaxhil, tmp_path, spoil(day), MAPPING, *given)
-    # Fewer readings tell the force delay from damping less well: only that may be wanting.
+def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_path, case):
+    spoil, options = FAIR[case]
+    ran = identified(jaxhil, tmp_path, spoil(day), MAPPING, *options)
+    # Fewer readings separate force delay and damping less well: only that may make the verdict bad.
     uncertain = ran.document["reason"].startswith("Bad: the numbers are too uncertain")
     assert ran.code == 0 or (uncertain and case in ("a gap in every contact", "two contacts"))
-    off = {one["key"]: (one["value"] - TRUE[one["key"]]) / one["std"]
-           for one in ran.document["estimates"] if one["key"] in TRUE}  # fmt: skip
+    off = {item["key"]: (item["value"] - TRUE[item["key"]]) / item["std"]
+           for item in ran.document["estimates"] if item["key"] in TRUE}  # fmt: skip
     assert "contact.stiffness.0" in off and "contact.stiffness.1" not in str(ran.document["estimates"])
-    if not given:
+    if not options:
         assert max(map(abs, off.values())) < 4.0
 
 
-def test_what_is_called_good_predicts_the_rig(jaxhil, day, tmp_path):
-    """Commands joined over 4 rows lose what is fast in them: another model may fit, of the same contacts."""
+def test_identify_command_file_with_good_verdict_predicts_the_rig(jaxhil, day, tmp_path):
+    """Commands interpolated over 4 rows lose fast content: another model of the same contacts may fit."""
     ran = identified(jaxhil, tmp_path, changed(day, COMMAND, joined(4)))
     noise_free = {"force_sensor__noise_std": 0.0, "position_sensor__noise_std": 0.0}
     truth = package.simulate(campaign_rigs.mechanism("clean", **noise_free), "response_error")
     again = {f"rig.{key.replace('__', '.')}": value for key, value in noise_free.items()}
     again["approach.velocity"] = truth.mechanism.approach.velocity
-    found = package.load(tmp_path / "out" / "mechanism.toml", again)
-    found = package.simulate(found, "response_error", truth.gains)
-    off = abs(found.contacts[0].restitution - truth.contacts[0].restitution)
+    result = package.load(tmp_path / "out" / "mechanism.toml", again)
+    result = package.simulate(result, "response_error", truth.gains)
+    off = abs(result.contacts[0].restitution - truth.contacts[0].restitution)
     print(f"e is off by {off:.4f}: {ran.document['reason']}")
     assert ran.code == 1 or off < 0.01

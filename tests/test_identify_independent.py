@@ -10,7 +10,7 @@ from independent_rig import Rig, drive, ideal_restitution, restitution, touch
 from independent_study import LIMIT, errors_of, judge, summary
 
 CAMPAIGNS = 100  # of each kind in the study
-WRONG = 0.01  # share of campaigns that may be called good although the file is wrong
+WRONG = 0.01  # share of campaigns that may get a good verdict for a wrong file
 
 
 def pass_on(force, position, velocity, measured):
@@ -27,7 +27,7 @@ def test_independent_rig_has_the_ideal_restitution_of_damped_springs():
 
 
 def test_independent_rig_without_delays_keeps_energy_for_half_a_period():
-    # A moving average over an instant is a drive that follows at once.
+    # A moving average over an instant is a drive without lag.
     rig = Rig(period=0.0005, mass=300.0, stiffness=1.1e5, window=1e-9)
     real, *_ = touch(rig, np.array([-0.001]), np.array([0.005]), pass_on, 1200)[:, :, 0]
     duration = np.count_nonzero(real) * rig.period
@@ -36,14 +36,14 @@ def test_independent_rig_without_delays_keeps_energy_for_half_a_period():
 
 
 @pytest.mark.parametrize(("phase", "expected"), [(0.1, 1.169561985550), (0.4, 1.827809059189)])
-def test_independent_rig_gains_energy_by_a_force_delay(phase, expected):
+def test_independent_rig_gains_energy_from_force_delay(phase, expected):
     rig = Rig(period=0.00025, mass=300.0, stiffness=1.1e5, window=1e-9)
     delay = phase * np.sqrt(rig.mass / rig.stiffness)
     late = Rig(period=0.00025, mass=300.0, stiffness=1.1e5, window=1e-9, force_delay=delay)
     assert restitution(late, 0.005, pass_on) == pytest.approx(expected, rel=1e-3)
 
 
-def test_independent_rig_loses_the_work_of_friction():
+def test_independent_rig_loses_work_of_friction():
     rig = Rig(mass=300.0, stiffness=1.1e5, friction=2.0)
     omega, speed, offset = np.sqrt(rig.stiffness / rig.mass), 0.005, rig.friction / rig.stiffness
     depth = np.hypot(offset, speed / omega) - offset
@@ -51,7 +51,7 @@ def test_independent_rig_loses_the_work_of_friction():
     assert ideal_restitution(rig, speed) == pytest.approx(omega * (depth - offset) / speed, abs=1e-4)
 
 
-def test_independent_rig_with_a_stiff_structure_is_that_without():
+def test_independent_rig_with_stiff_structure_equals_rigid_rig():
     rig = Rig(damping=400.0, drive_delay=0.002, force_delay=0.002)
     soft, stiff = replace(rig, mode=40.0), replace(rig, mode=400.0)
     assert ideal_restitution(stiff, 0.005) == pytest.approx(ideal_restitution(rig, 0.005), abs=1e-3)
@@ -77,7 +77,7 @@ def test_independent_drive_has_the_response_of_its_transfer_function(window, res
     assert position[2000:] == pytest.approx(np.imag(late)[2000:], abs=1e-3)
 
 
-def test_independent_truth_is_that_of_the_true_file_and_of_no_other(tmp_path):
+def test_independent_errors_are_zero_only_for_the_true_file(tmp_path):
     campaign = write_campaign("plain", 0, tmp_path)
     rig, file = campaign.rig, tmp_path / "truth.toml"
     text = mechanism_file(rig, campaign.speed, KINDS["plain"], np.ones(6))
@@ -96,7 +96,7 @@ def test_identify_explains_an_independent_campaign(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_identify_calls_no_wrong_file_good(kind, tmp_path):
+def test_identify_gives_no_good_verdict_for_wrong_independent_file(kind, tmp_path):
     outcomes = []
     for seed in range(CAMPAIGNS):
         outcomes.append(judge(kind, seed, tmp_path / str(seed)))

@@ -1,4 +1,4 @@
-"""What is known beside the logs: told numbers and a prior's marginals, against weighted least squares."""
+"""Knowledge beside the logs: fixed values and a prior's marginals, compared with weighted least squares."""
 
 from dataclasses import replace
 
@@ -26,17 +26,17 @@ NUMBER = 4000
 
 
 def logs_say(keys, seed=0):
-    """Draws with exactly these means and covariances."""
-    places = [KEYS.index(key) for key in keys]
+    """Return draws with exactly these means and covariances."""
+    indices = [KEYS.index(key) for key in keys]
     white = np.random.default_rng(seed).standard_normal((len(keys), NUMBER))
     white -= white.mean(axis=1, keepdims=True)
     white = np.linalg.solve(np.linalg.cholesky(np.cov(white)), white)
-    own = COVARIANCE[np.ix_(places, places)]
-    return dict(zip(keys, MEAN[places, None] + np.linalg.cholesky(own) @ white, strict=True))
+    covariance = COVARIANCE[np.ix_(indices, indices)]
+    return dict(zip(keys, MEAN[indices, None] + np.linalg.cholesky(covariance) @ white, strict=True))
 
 
 def prior(shift=1.0, scale=1.5):
-    """A mechanism whose marginals are off by so many standard deviations."""
+    """Return a mechanism whose marginals are off by so many standard deviations."""
     mean = MEAN + shift * STD * np.array([1, -1, 1, -1])
     document = to_builtins(campaign_rigs.mechanism("clean", simulator__natural_frequency=mean[0],
                            force_sensor__delay=mean[1], contact__stiffness=[mean[2]],
@@ -46,7 +46,7 @@ def prior(shift=1.0, scale=1.5):
         name: {"distribution": "normal", "std": float(scale * std)}
         for name, std in zip(names, STD, strict=True)
     }
-    rows = [[float(one) for one in CORRELATION[i, : i + 1]] for i in range(4)]
+    rows = [[float(value) for value in CORRELATION[i, : i + 1]] for i in range(4)]
     document["correlation"] = {"keys": names, "matrix": rows}
     return from_builtins(document, "prior"), mean, scale**2 * COVARIANCE
 
@@ -56,63 +56,64 @@ def summary(draws, keys=KEYS):
     return table.mean(axis=1), np.cov(table)
 
 
-def close(found, expected, share=0.06):
-    """Within the scatter of 4000 draws."""
-    (mean, covariance), (wanted, spread) = found, expected
+def close(actual, expected, share=0.06):
+    """Check agreement within the scatter of 4000 draws."""
+    (mean, covariance), (wanted, spread) = actual, expected
     std = np.sqrt(np.diag(spread))
     np.testing.assert_allclose((mean - wanted) / std, 0.0, atol=share)
     np.testing.assert_allclose((covariance - spread) / np.outer(std, std), 0.0, atol=share)
 
 
-def test_logs_and_prior_together_are_weighted_least_squares():
+def test_with_prior_equals_weighted_least_squares():
     mechanism, mean, spread = prior()
-    found = knowledge.with_prior(logs_say(KEYS), mechanism, 3.0)
+    result = knowledge.with_prior(logs_say(KEYS), mechanism, 3.0)
     both = np.linalg.inv(np.linalg.inv(COVARIANCE) + np.linalg.inv(spread))
     wanted = both @ (np.linalg.solve(COVARIANCE, MEAN) + np.linalg.solve(spread, mean))
-    close(summary(found), (wanted, both))
+    close(summary(result), (wanted, both))
 
 
-def test_numbers_of_the_prior_alone_go_along_with_those_that_the_logs_tell():
-    """Logs without free motion: the force delay found is that for the simulator as told, and so holds the
-    sum of both lags."""
+def test_with_prior_moves_values_known_only_from_the_prior():
+    """Without free motion, the force delay is estimated for the given simulator, so it holds the sum of both
+    lags.
+    """
     mechanism, mean, spread = prior()
-    found = knowledge.with_prior(logs_say(KEYS[1:]), mechanism, 3.0)
+    draws = knowledge.with_prior(logs_say(KEYS[1:]), mechanism, 3.0)
     slope = knowledge._lag_slopes(mechanism, KEYS[:1], 3.0)[KEYS[0]]
-    # Second order: the lag is 2 zeta/w at low frequencies, so it falls by a share of 1/12 per Hz.
+    # Second order: the lag is 2 zeta/w at low frequencies, so its relative slope is -1/12 per Hz.
     assert slope == pytest.approx(-2 * 0.8 / (2 * np.pi * 12.0) / 12.0, rel=0.1)
     reading = np.array([[slope, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    told = np.linalg.inv(COVARIANCE[1:, 1:])
-    both = np.linalg.inv(np.linalg.inv(spread) + reading.T @ told @ reading)
-    said = MEAN[1:] + np.array([slope * mean[0], 0, 0])
-    wanted = both @ (np.linalg.solve(spread, mean) + reading.T @ told @ said)
-    close(summary(found), (wanted, both))
+    logs_information = np.linalg.inv(COVARIANCE[1:, 1:])
+    both = np.linalg.inv(np.linalg.inv(spread) + reading.T @ logs_information @ reading)
+    logs_mean = MEAN[1:] + np.array([slope * mean[0], 0, 0])
+    wanted = both @ (np.linalg.solve(spread, mean) + reading.T @ logs_information @ logs_mean)
+    close(summary(draws), (wanted, both))
 
 
-def test_told_numbers_move_the_others_by_regression_and_are_denied_where_they_are_far_off():
-    found, notes = knowledge.with_told(logs_say(KEYS), {"contact.damping.0": 660.0})
-    assert KEYS[3] not in found and notes == []
+def test_fixed_values_condition_draws_and_note_contradictions():
+    result, notes = knowledge.with_told(logs_say(KEYS), {"contact.damping.0": 660.0})
+    assert KEYS[3] not in result and notes == []
     regression = COVARIANCE[:3, 3] / COVARIANCE[3, 3]
     rest = COVARIANCE[:3, :3] - np.outer(regression, COVARIANCE[3, :3])
-    close(summary(found, KEYS[:3]), (MEAN[:3] + 10.0 * regression, rest), 1e-6)
+    close(summary(result, KEYS[:3]), (MEAN[:3] + 10.0 * regression, rest), 1e-6)
     _, notes = knowledge.with_told(logs_say(KEYS), {"contact.damping.0": 0.0})
     assert notes == ["contact.damping.0: 0 was told, the logs say 650 +- 12"]
 
 
-def test_told_lists_are_told_entry_by_entry():
-    found = ["contact.stiffness.0", "contact.stiffness.1", "contact.damping.0"]
-    assert knowledge.spread_out({"contact.stiffness": [1.0, 2.0]}, found) == {found[0]: 1.0, found[1]: 2.0}
-    assert knowledge.spread_out({"contact.stiffness": 3.0}, found) == {found[0]: 3.0, found[1]: 3.0}
-    assert knowledge.spread_out({"contact.stiffness.1": 3.0}, found) == {found[1]: 3.0}
+def test_spread_out_assigns_list_values_entry_by_entry():
+    result = ["contact.stiffness.0", "contact.stiffness.1", "contact.damping.0"]
+    assert knowledge.spread_out({"contact.stiffness": [1.0, 2.0]}, result) == {result[0]: 1.0, result[1]: 2.0}
+    assert knowledge.spread_out({"contact.stiffness": 3.0}, result) == {result[0]: 3.0, result[1]: 3.0}
+    assert knowledge.spread_out({"contact.stiffness.1": 3.0}, result) == {result[1]: 3.0}
     for key, value in (
         ("rig.range", 1.0),
         ("contact.stiffness", [1.0, 2.0, 3.0]),
         ("contact.damping", [[1.0]]),
     ):
         with pytest.raises(InputError, match=f"fix: found {key}.*, allowed contact.stiffness.0, "):
-            knowledge.spread_out({key: value}, found)
+            knowledge.spread_out({key: value}, result)
 
 
-def test_a_prior_that_knows_nothing_of_it_is_refused():
+def test_with_prior_rejects_prior_without_uncertainty():
     with pytest.raises(InputError, match=r"prior: \[uncertainty\]: found no entry of what the logs tell"):
         knowledge.with_prior(logs_say(KEYS), campaign_rigs.mechanism("clean"), 3.0)
     with pytest.raises(InputError, match="bayes: found no prior"):
@@ -122,26 +123,30 @@ def test_a_prior_that_knows_nothing_of_it_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ("clean", "noisy"))
 @pytest.mark.parametrize("seed", (0, 1))
-def test_a_second_campaign_after_the_first_says_what_both_say_at_once(name, seed):
+def test_sequential_campaigns_equal_joint_identification(name, seed):
     speeds = (0.003, 0.003, 0.006, 0.006, 0.012, 0.012) * 2
     whole = campaigns.campaign(name, seed, speeds=speeds, seconds=30.0)
     rest, free, *touches = whole.runs
     *_, other = campaigns.campaign(name, seed + 50, speeds=(), seconds=30.0).runs
     options = Options(law="kelvin_voigt", order=2, hold_out=0.0, calibration=0.0, clock=0.0)
 
-    def said(*runs, **kept):
-        return identify(replace(whole, runs=runs), kept.pop("prior", None), replace(options, **kept))
+    def identify_runs(*runs, **changes):
+        return identify(replace(whole, runs=runs), changes.pop("prior", None), replace(options, **changes))
 
-    first = said(rest, free, *touches[::2])
-    second = said(rest, other, *touches[1::2], prior=from_builtins(first.mechanism, "first"), bayes=True)
-    once = said(rest, free, other, *touches)
+    first = identify_runs(rest, free, *touches[::2])
+    second = identify_runs(
+        rest, other, *touches[1::2], prior=from_builtins(first.mechanism, "first"), bayes=True
+    )
+    once = identify_runs(rest, free, other, *touches)
     keys = [key for key in second.mechanism["correlation"]["keys"]]
     assert len(keys) == 7
-    for one in (*once.estimates, *once.combinations):
-        again = second[one.key]
-        if one.key.startswith("rig.position_sensor") or one.key.endswith(("noise_std", "bias", "quantum")):
+    for joint in (*once.estimates, *once.combinations):
+        again = second[joint.key]
+        if joint.key.startswith("rig.position_sensor") or joint.key.endswith(
+            ("noise_std", "bias", "quantum")
+        ):
             continue
-        off, ratio = (again.value - one.value) / one.std, again.std / one.std
-        print(f"{name} {seed} {one.key:36s} off {off:+.2f} of its std, std {ratio:.2f} times")
-        # The posterior of the force delay is normal but roughly where noise is large.
+        off, ratio = (again.value - joint.value) / joint.std, again.std / joint.std
+        print(f"{name} {seed} {joint.key:36s} off {off:+.2f} of its std, std {ratio:.2f} times")
+        # With large noise the posterior of the force delay is only roughly normal.
         assert abs(off) < 0.7 and 0.6 < ratio < 1.5

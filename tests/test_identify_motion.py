@@ -1,4 +1,4 @@
-"""The motion simulator from free motion: spectra, hold, orders, and errors against the Cramer-Rao bound."""
+"""Motion simulator from free motion: spectra, hold, orders, and errors against the Cramer-Rao bound."""
 
 import campaigns
 import numpy as np
@@ -14,7 +14,7 @@ THIRD = Model(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np
 
 
 def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
-    """Exact spectra at 85 lines to 45 Hz."""
+    """Return exact spectra at 85 lines up to 45 Hz."""
     frequency = np.delete(np.arange(1, 226, 2), np.s_[3::4]) / 5.0
     rng = np.random.default_rng(0)
     command = 1e-4 * np.exp(2j * np.pi * rng.uniform(size=len(frequency)))
@@ -23,30 +23,30 @@ def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
 
 
 @pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
-def test_the_model_gives_what_the_exactly_sampled_simulator_gives(name):
-    """One period of the multisine in the steady state, by the oracle's matrices and by the lines."""
+def test_motion_model_matches_exactly_sampled_simulator(name):
+    """Compare one steady-state period of the multisine, by the oracle's matrices and by the lines."""
     kind = campaigns.KINDS[name]
     T = kind.rig["control_period"]
-    one = campaigns.multisine(T)
+    wave = campaigns.multisine(T)
     plant = campaigns.Plant(kind.rig)
-    command = np.tile(one, 3)
-    response = campaigns._position(plant, command, kind.rig["simulator"]["delay"] / T)[-len(one) :]
-    U, Y = np.fft.rfft(one), np.fft.rfft(response)
+    command = np.tile(wave, 3)
+    response = campaigns._position(plant, command, kind.rig["simulator"]["delay"] / T)[-len(wave) :]
+    U, Y = np.fft.rfft(wave), np.fft.rfft(response)
     number = np.flatnonzero(np.abs(U) > 1e-6 * np.abs(U).max())
     hold_of = kind.rig.get("command_hold", "linear"), kind.rig.get("command_latency", 0)
-    lines = Lines(number / (len(one) * T), U[number], Y[number], np.ones(len(number)), T, *hold_of)
-    found = fit(BY_NAME[{"clean": "second_order"}.get(name, name)], lines)
-    np.testing.assert_allclose(found.model.predict(lines), Y[number], rtol=2e-6)
-    assert found.model.delay == pytest.approx(kind.rig["simulator"]["delay"], abs=2e-9)
+    lines = Lines(number / (len(wave) * T), U[number], Y[number], np.ones(len(number)), T, *hold_of)
+    result = fit(BY_NAME[{"clean": "second_order"}.get(name, name)], lines)
+    np.testing.assert_allclose(result.model.predict(lines), Y[number], rtol=2e-6)
+    assert result.model.delay == pytest.approx(kind.rig["simulator"]["delay"], abs=2e-9)
     if name == "clean":
-        np.testing.assert_allclose(np.exp(found.model.parameters[:2]), [2 * np.pi * 12.0, 0.8], rtol=1e-6)
+        np.testing.assert_allclose(np.exp(result.model.parameters[:2]), [2 * np.pi * 12.0, 0.8], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind, latency, shift, periods", (
     ("linear", 0, 0, 0.0), ("zoh", 0, 0, -0.5), ("zoh", 1, 0, 0.5), ("linear", 1, 1, 2.0),
     ("linear", 0, -1, -1.0),
 ))  # fmt: skip
-def test_hold_latency_and_row_are_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
+def test_hold_response_is_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
     frequency = np.array([0.1, 1.0, 10.0])
     response = hold.response(frequency, 0.002, kind, latency, shift)
     np.testing.assert_allclose(np.angle(response), -2.0 * np.pi * frequency * periods * 0.002, atol=1e-12)
@@ -54,7 +54,7 @@ def test_hold_latency_and_row_are_a_delay_of_whole_and_half_periods(kind, latenc
 
 
 @pytest.mark.parametrize("model", (SECOND, THIRD), ids=("second", "third"))
-def test_slopes_are_those_of_differences(model):
+def test_motion_model_slopes_match_finite_differences(model):
     s = 2j * np.pi * np.array([0.3, 3.0, 30.0])
     for i, slope in enumerate(model.slopes(s)):
         step = np.zeros(len(model.parameters))
@@ -63,7 +63,7 @@ def test_slopes_are_those_of_differences(model):
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-8)
 
 
-def test_the_bandwidth_is_that_of_the_closed_form():
+def test_motion_model_bandwidth_matches_closed_form():
     zeta = 0.8
     ratio = np.sqrt(1.0 - 2.0 * zeta**2 + np.sqrt((1.0 - 2.0 * zeta**2) ** 2 + 1.0))
     assert SECOND.bandwidth() == pytest.approx(12.0 * ratio, rel=1e-9)
@@ -71,7 +71,7 @@ def test_the_bandwidth_is_that_of_the_closed_form():
 
 
 @pytest.mark.parametrize("name", ("ideal", "first_order", "second_order", "third_order"))
-def test_the_smallest_order_that_explains_the_lines_is_taken(name):
+def test_choose_takes_the_smallest_sufficient_order(name):
     numbers = {"ideal": [], "first_order": [np.log(0.022)], "second_order": [np.log(75.0), np.log(0.8)],
                "third_order": [np.log(0.008), np.log(110.0), np.log(0.5)]}[name]  # fmt: skip
     exact = lines_of(Model(BY_NAME[name], np.array([*numbers, 0.0044])))
@@ -87,72 +87,72 @@ def test_the_smallest_order_that_explains_the_lines_is_taken(name):
 
 
 def errors(repeats):
-    """Errors over their standard deviations of frequency, damping ratio and delay; the share covered."""
+    """Return normalised errors of frequency, damping ratio and delay, and the share covered."""
     kind, T, scores = campaigns.KINDS["clean"], 0.001, []
-    one = campaigns.multisine(T)
-    steady = campaigns._position(campaigns.Plant(kind.rig), np.tile(one, 2), 4.3)[-len(one) :]
-    shape = 11, len(one)
+    wave = campaigns.multisine(T)
+    steady = campaigns._position(campaigns.Plant(kind.rig), np.tile(wave, 2), 4.3)[-len(wave) :]
+    shape = 11, len(wave)
     for seed in range(repeats):
         noisy = steady + 5e-6 * np.random.default_rng(seed).standard_normal(shape)
-        found = frf.periodic(np.broadcast_to(one, shape), noisy, np.ones(shape, bool), T)
-        lines = Lines(found.frequency, found.command, found.output, found.std, T, "linear", 0)
+        spectrum = frf.periodic(np.broadcast_to(wave, shape), noisy, np.ones(shape, bool), T)
+        lines = Lines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
         best = fit(SECOND.structure, lines)
         scores.append((best.model.parameters - SECOND.parameters) / best.std)
     return np.sqrt(np.mean(np.square(scores), axis=0)), np.mean(np.abs(scores) < 1.96, axis=0)
 
 
-def test_errors_are_those_of_the_cramer_rao_bound():
+def test_motion_fit_errors_reach_cramer_rao_bound():
     ratio, covered = errors(30)
-    # Of 30 draws the rms of a standard normal number is below 1.4 in 999 of 1000 cases.
+    # The rms of 30 standard normal draws is below 1.4 in 999 of 1000 cases.
     assert np.all(ratio < 1.4) and np.all(ratio > 0.6) and np.all(covered > 0.8)
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_the_cramer_rao_bound_over_400_repeats():
+def test_motion_fit_errors_reach_cramer_rao_bound_over_400_repeats():
     ratio, covered = errors(400)
     print("rms error / bound", ratio, "covered", covered)
     assert np.all(ratio < 1.1) and np.all(np.abs(covered - 0.95) < 0.03)
 
 
-def test_a_local_polynomial_finds_the_response_from_a_chirp():
+def test_local_polynomial_spectrum_estimates_response_from_chirp():
     kind, T = campaigns.KINDS["clean"], 0.001
     time = np.arange(20_000) * T
     command = 1e-3 * np.sin(2.0 * np.pi * (0.3 * time + (20.0 - 0.3) * time**2 / (2.0 * time[-1])))
     actual = campaigns._position(campaigns.Plant(kind.rig), command, 4.3)
     noisy = actual + 1e-6 * np.random.default_rng(0).standard_normal(len(actual))
-    found = frf.spectrum(command, noisy, np.ones(len(command), bool), T, 500)
-    assert found.periods == 0 and found.frequency.min() < 3.0 and found.frequency.max() > 17.0
-    lines = Lines(found.frequency, found.command, found.output, found.std, T, "linear", 0)
-    assert np.sqrt(np.mean(np.abs(SECOND.predict(lines) / found.output - 1.0) ** 2)) < 4e-3
+    spectrum = frf.spectrum(command, noisy, np.ones(len(command), bool), T, 500)
+    assert spectrum.periods == 0 and spectrum.frequency.min() < 3.0 and spectrum.frequency.max() > 17.0
+    lines = Lines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
+    assert np.sqrt(np.mean(np.abs(SECOND.predict(lines) / spectrum.output - 1.0) ** 2)) < 4e-3
     best = fit(BY_NAME["second_order"], lines).model
     assert best.delay == pytest.approx(0.0043, abs=2e-5)
     assert np.exp(best.parameters[0]) / (2.0 * np.pi) == pytest.approx(12.0, rel=3e-3)
 
 
-def test_rows_lost_here_and_there_and_in_a_block_change_nothing_but_the_noise():
+def test_motion_fit_is_unbiased_with_lost_rows():
     campaign = campaigns.campaign("jitter", 2, speeds=(), rest=0)
     (run,) = campaign.runs
     assert 0.98 < run.valid.mean() < 1.0
-    found = free_motion.estimate([run], campaign.timing)
-    assert found.model.structure.name == "second_order" and found.left < 1.5
-    assert abs(found.model.delay - 0.0043) < 2e-5
-    assert found.noise_std == pytest.approx(5e-6, rel=0.02)
+    result = free_motion.estimate([run], campaign.timing)
+    assert result.model.structure.name == "second_order" and result.left < 1.5
+    assert abs(result.model.delay - 0.0043) < 2e-5
+    assert result.noise_std == pytest.approx(5e-6, rel=0.02)
 
 
-def test_nonlinearity_shows_at_lines_that_were_not_excited():
+def test_spectrum_detects_nonlinearity_at_unexcited_lines():
     campaign = campaigns.campaign("clean", 3, speeds=(), rest=0)
     (run,) = campaign.runs
     depth = run.position_measured - run.position_measured.mean()
     for power, which in ((3, "odd"), (2, "even")):
         bent = run.position_measured + 0.02 * depth**power / np.std(depth) ** (power - 1)
-        found = frf.spectrum(run.position_desired, bent, run.valid, 0.001, 500)
-        flagged, other = (found.excess[0], found.excess[1]) if which == "odd" else found.excess[::-1]
+        spectrum = frf.spectrum(run.position_desired, bent, run.valid, 0.001, 500)
+        flagged, other = (spectrum.excess[0], spectrum.excess[1]) if which == "odd" else spectrum.excess[::-1]
         assert flagged > 20.0 and other < 2.0
 
 
 @pytest.mark.parametrize("logarithms", [(4.3, -0.2), (4.3, 1.1), (156.8, 153.0)])
-def test_poles_beyond_all_lines_are_moved_to_the_fastest_one(logarithms):
-    """A pole of 1e134 rad/s made the motion overflow; at frequencies of lines nothing changes."""
+def test_motion_model_limits_poles_beyond_all_lines(logarithms):
+    """A pole of 1e134 rad/s made the motion overflow; at the frequencies of the lines nothing changes."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])
     bounded = rational._with_slow_poles(structure, asked)

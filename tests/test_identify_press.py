@@ -1,4 +1,4 @@
-"""A real servo-hydraulic press (`data/press_0A.md`): order, lag and delay, and that it is not linear."""
+"""A real servo-hydraulic press (`data/press_0A.md`): order, lag, delay, and its nonlinearity."""
 
 from pathlib import Path
 
@@ -23,27 +23,27 @@ def press():
 
 
 def error(press, response):
-    """Relative error of a response over 0.3 to 19.5 Hz, averaged over 0.4 Hz: noise is not the model's."""
+    """Return the relative error of a response over 0.3 to 19.5 Hz, averaged over 0.4 Hz to reduce noise."""
     (spectrum,) = press.spectra
     band = (spectrum.frequency > 0.3) & (spectrum.frequency < 19.5)
     frequency = spectrum.frequency[band]
-    held = response(2j * np.pi * frequency) * np.sinc(frequency * PERIOD) ** 2
-    averaged = np.convolve(held / spectrum.response[band] - 1.0, np.ones(25) / 25.0, "valid")
+    model_response = response(2j * np.pi * frequency) * np.sinc(frequency * PERIOD) ** 2
+    averaged = np.convolve(model_response / spectrum.response[band] - 1.0, np.ones(25) / 25.0, "valid")
     return np.sqrt(np.mean(np.abs(averaged) ** 2))
 
 
-def test_a_first_order_lag_with_a_delay_explains_it_to_a_percent(press):
+def test_press_data_are_explained_by_first_order_lag_with_delay(press):
     assert press.model.structure.name == "first_order"
     lag, delay = np.exp(press.model.parameters[0]), press.model.delay
     assert lag == pytest.approx(0.0222, abs=4e-4) and delay == pytest.approx(0.00445, abs=1e-4)
     assert error(press, press.model.response) < 0.012
 
 
-def test_the_published_model_without_a_delay_is_off_by_four_times_as_much(press):
+def test_press_data_error_of_published_model_without_delay_is_four_times_larger(press):
     fast, slow = PUBLISHED
     assert error(press, lambda s: 1.0 / ((1.0 + s / fast) * (1.0 + s / slow))) > 0.044
 
 
-def test_its_friction_is_noticed(press):
+def test_press_data_friction_is_detected(press):
     misfit = validation.of_motion(press, 3.0)[0]
     assert misfit.name == "motion model" and misfit.there and misfit.effect > 0.01

@@ -1,4 +1,4 @@
-"""Surface of a contact that a press never leaves: told by the bias at rest, or refused by name."""
+"""Surface of a contact that a press never leaves: estimated with the bias at rest, or rejected by name."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def multisine(seed=3, depth=0.0008, noise=1.0):
 
 
 def ramp(begin, deepest=0.001, seconds=4.0):
-    """A slow push from one position to another and back."""
+    """Return a slow push from one position to another and back."""
     up = np.linspace(begin, deepest, round(500 * seconds))
     return commanded("clean", "press", np.concatenate([np.full(500, begin), up, up[::-1]]), 1)
 
@@ -50,40 +50,40 @@ def fit(run, noise):
     ],
     ids=["multisine", "biased", "ten times the noise", "slow"],
 )
-def test_press_that_stays_inside_finds_the_surface_by_the_bias_at_rest(run, noise, bias):
-    found = fit(replace(run, force_measured=run.force_measured + bias), rest(noise, bias)).posterior
-    plane, stiffness = (found.names.index(name) for name in ("plane", "stiffness.0"))
-    assert abs(found.mean[plane]) < 4.0 * np.std(found.draws[:, plane]) < 1e-4
-    assert abs(found.mean[plane]) < 4e-6 * noise
-    assert found.mean[stiffness] == pytest.approx(1.2e5, rel=0.01 * noise)
+def test_press_inside_contact_estimates_surface_from_bias_at_rest(run, noise, bias):
+    result = fit(replace(run, force_measured=run.force_measured + bias), rest(noise, bias)).posterior
+    plane, stiffness = (result.names.index(name) for name in ("plane", "stiffness.0"))
+    assert abs(result.mean[plane]) < 4.0 * np.std(result.draws[:, plane]) < 1e-4
+    assert abs(result.mean[plane]) < 4e-6 * noise
+    assert result.mean[stiffness] == pytest.approx(1.2e5, rel=0.01 * noise)
 
 
-def test_press_that_stays_inside_is_refused_where_nothing_tells_the_bias():
+def test_press_inside_contact_is_rejected_without_bias():
     for run in (multisine(), ramp(2e-4), multisine(noise=10.0)):
         with pytest.raises(InputError, match=r"^press.csv: force_measured: found a press that never leaves"):
             fit(run, None)
 
 
-def test_press_from_outside_tells_its_own_bias():
-    """A bias that changed since the run at rest does no harm."""
+def test_press_from_outside_estimates_its_own_bias():
+    """A bias that changed since the run at rest has no effect."""
     run = ramp(-1e-3)
     run = replace(run, force_measured=run.force_measured + 5.0)
     for noise in (rest(bias=0.0), None):
-        found = fit(run, noise).posterior
-        assert found.mean[found.names.index("bias")] == pytest.approx(5.0, abs=0.1)
-        assert found.mean[found.names.index("plane")] == pytest.approx(0.0, abs=2e-6)
+        result = fit(run, noise).posterior
+        assert result.mean[result.names.index("bias")] == pytest.approx(5.0, abs=0.1)
+        assert result.mean[result.names.index("plane")] == pytest.approx(0.0, abs=2e-6)
 
 
-def told(runs, noise=None, plane=None):
+def bias_of(runs, noise=None, plane=None):
     return known_bias(runs, Motion(MODEL, runs, TIMING, 0.022), noise, plane)
 
 
-def test_bias_is_needed_only_where_the_surface_is_not_told():
+def test_press_needs_bias_only_for_unknown_surface():
     inside, outside = multisine(), ramp(-1e-3)
-    mean, std = told([inside], rest(bias=2.0))
+    mean, std = bias_of([inside], rest(bias=2.0))
     assert mean == pytest.approx(2.0, abs=4 * std) and std > 0.04
-    assert told([inside], plane=0.0) is None
-    assert told([outside]) is None and told([inside, outside]) is None
-    assert told([inside, replace(inside, kind="contact")]) is None
+    assert bias_of([inside], plane=0.0) is None
+    assert bias_of([outside]) is None and bias_of([inside, outside]) is None
+    assert bias_of([inside, replace(inside, kind="contact")]) is None
     lost = np.where(np.arange(len(inside.tick)) % 7 == 0, np.nan, inside.force_measured)
-    assert told([replace(inside, force_measured=lost)], rest()) is not None
+    assert bias_of([replace(inside, force_measured=lost)], rest()) is not None

@@ -1,7 +1,7 @@
-"""Fitting stage by stage beside all at once: how much more the information of all runs together would tell.
+"""Stage-by-stage fit compared with a joint fit: how much more information all runs together contain.
 
-The force delay is profiled either way, so all other numbers have a Cramer-Rao bound at each delay. Print it
-with `pytest -m "slow or not slow" -s tests/test_identify_stages.py`.
+The force delay is profiled either way, so the other parameters have a Cramer-Rao bound at each delay. Print
+it with `pytest -m "slow or not slow" -s tests/test_identify_stages.py`.
 """
 
 import campaigns
@@ -28,7 +28,7 @@ MOTION, PROFILED = slice(0, 3), 3
 
 
 def readings(runs, timing, numbers, noise, touching=None):
-    """Positions and forces of the touches over their noise, and which rows are in contact."""
+    """Return positions and forces of the touches over their noise, and the rows in contact."""
     motion = Motion(Model(STRUCTURES[2], numbers[MOTION]), runs, timing, 0.022)
     position, velocity = motion.at(numbers[3])
     force = numbers[5] * (position - numbers[4]) + numbers[6] * velocity
@@ -38,11 +38,11 @@ def readings(runs, timing, numbers, noise, touching=None):
     return np.concatenate([motion.at(0.0)[0].ravel() / 5e-6, force.ravel() / noise]), touching
 
 
-OTHERS = (pytest.param(*one, marks=pytest.mark.slow) for one in (("noisy", 60.0), ("clean", 10.0)))
+OTHERS = (pytest.param(*kind, marks=pytest.mark.slow) for kind in (("noisy", 60.0), ("clean", 10.0)))
 
 
 @pytest.mark.parametrize("name, seconds", (("clean", 60.0), *OTHERS))
-def test_all_at_once_tells_no_number_much_better(name, seconds):
+def test_joint_fit_is_not_much_more_precise_than_stages(name, seconds):
     kind = campaigns.KINDS[name]
     campaign = campaigns.campaign(name, 0, speeds=(), seconds=seconds, rest=0)
     timing, noise = campaign.timing, kind.rig["force_sensor"]["noise_std"]
@@ -55,21 +55,23 @@ def test_all_at_once_tells_no_number_much_better(name, seconds):
          - readings(runs, timing, TRUE - step, noise, touching)[0]) / (2.0 * step.sum())
         for step in np.diag(STEPS)
     ])  # fmt: skip
-    kept = np.delete(np.arange(8), PROFILED)
+    free_indices = np.delete(np.arange(8), PROFILED)
     together = np.zeros(8)
-    together[kept] = np.sqrt(np.diag(np.linalg.inv((slopes @ slopes.T + free)[np.ix_(kept, kept)])))
-    # Stage by stage: the motion by free runs alone, the contact by the force with the motion as it was found.
+    together[free_indices] = np.sqrt(
+        np.diag(np.linalg.inv((slopes @ slopes.T + free)[np.ix_(free_indices, free_indices)]))
+    )
+    # Stage by stage: the motion from free runs alone, then the contact from the force with that motion fixed.
     force = slopes[:, slopes.shape[1] // 2 :]
-    information, contact = force @ force.T, kept[3:]
-    own = np.linalg.inv(information[np.ix_(contact, contact)])
-    moved = own @ information[contact, MOTION]
+    information, contact = force @ force.T, free_indices[3:]
+    contact_covariance = np.linalg.inv(information[np.ix_(contact, contact)])
+    moved = contact_covariance @ information[contact, MOTION]
     motion = np.linalg.inv(free[MOTION, MOTION])
     staged = np.zeros(8)
     staged[MOTION] = np.sqrt(np.diag(motion))
-    staged[contact] = np.sqrt(np.diag(own + moved @ motion @ moved.T))
-    ratio = staged[kept] / together[kept]
+    staged[contact] = np.sqrt(np.diag(contact_covariance + moved @ motion @ moved.T))
+    ratio = staged[free_indices] / together[free_indices]
     print(
         f"\n{name}, {seconds:g} s of free motion: standard deviations stage by stage over those all at once:"
     )
-    print(", ".join(f"{NAMES[i]} {value:.3f}" for i, value in zip(kept, ratio, strict=True)))
+    print(", ".join(f"{NAMES[i]} {value:.3f}" for i, value in zip(free_indices, ratio, strict=True)))
     assert np.all(ratio > 0.999) and np.all(ratio < (1.05 if seconds == 60.0 else 1.2))

@@ -1,6 +1,6 @@
-"""From logs to gains: what gains tuned on the identified file lose on the rig as it is.
+"""From logs to gains: the loss on the true rig of gains tuned on the identified file.
 
-Print the figures with `pytest -m slow -s tests/test_identify_tuning.py`.
+Print the results with `pytest -m slow -s tests/test_identify_tuning.py`.
 """
 
 import math
@@ -24,18 +24,21 @@ LEAST_DEVIATION = 1.02e-4  # s, of the force's age on the lagging rig, without a
 
 
 def error(mechanism, compensator, gains):
-    """rms of e - e* on the true rig over phases of its contacts."""
+    """Return the rms of e - e* on the true rig over phases of its contacts."""
     scenarios = build_scenarios(mechanism, {"approach.phase": np.arange(PHASES) / PHASES}, 0)
-    found = evaluate(build_loop(mechanism, compensator, scenarios), gains, scenarios)
-    assert np.array_equal(found.good, found.wanted)
-    return float(np.sqrt(np.mean(found.error[found.wanted] ** 2)))
+    result = evaluate(build_loop(mechanism, compensator, scenarios), gains, scenarios)
+    assert np.array_equal(result.good, result.wanted)
+    return float(np.sqrt(np.mean(result.error[result.wanted] ** 2)))
 
 
-def as_well_as_can_be_known(truth, identified):
-    """The truth with a force that is older, or newer, by 1.2 times what no estimator undercuts (the bound of
-    `test_identify_campaigns.py`), on the side where the identified one lies. Contact alone tells of delay and
-    lag through B - K (tau_f + T_s): what the delay is off by, the damping makes up for."""
-    off = found_age(identified) - found_age(truth)
+def truth_within_bound(truth, identified):
+    """Return the truth with the force's age off by 1.2 times the least standard deviation.
+
+    The bound is that of `test_identify_campaigns.py`; the shift is to the side of the identified age. Contact
+    alone determines delay and lag through B - K (tau_f + T_s): the damping compensates for the error of the
+    delay.
+    """
+    off = force_age(identified) - force_age(truth)
     shift = math.copysign(1.2 * LEAST_DEVIATION, off)
     raw = to_builtins(truth)
     raw["rig"]["force_sensor"]["delay"] += shift
@@ -45,8 +48,8 @@ def as_well_as_can_be_known(truth, identified):
     return from_builtins(raw, "along the ridge")
 
 
-def found_age(mechanism):
-    """By how much a force of contact is older than the motion [s]."""
+def force_age(mechanism):
+    """Return by how much a force of contact is older than the motion [s]."""
     sensor, ahead = mechanism.rig.force_sensor, mechanism.rig.position_sensor.delay
     return sensor.delay + sensor.time_constant - ahead
 
@@ -56,21 +59,24 @@ def found_age(mechanism):
     ("stiffnesses", "response_error", False), ("lagging", "response_error", False),
     ("lagging", "response_error", True), ("clean", "impulse_ledger", False),
 ))  # fmt: skip
-def test_gains_tuned_on_the_identified_file_lose_little_on_the_true_rig(name, compensator, press):
+def test_gains_tuned_on_identified_file_lose_little_on_true_rig(name, compensator, press):
     truth = campaign_rigs.mechanism(name)
-    found = identify(campaigns.campaign(name, 70_000, press=press), options=Options(law="kelvin_voigt"))
-    identified = from_builtins(found.mechanism, "identified")
+    result = identify(campaigns.campaign(name, 70_000, press=press), options=Options(law="kelvin_voigt"))
+    identified = from_builtins(result.mechanism, "identified")
     asked = [truth, identified]
     if name == "lagging" and not press:
-        asked.append(as_well_as_can_be_known(truth, identified))
-    best, own, *known = (
-        error(truth, compensator, tuning.tune(one, compensator, validation=32).gains) for one in asked
+        asked.append(truth_within_bound(truth, identified))
+    best, actual, *near = (
+        error(truth, compensator, tuning.tune(mechanism, compensator, validation=32).gains)
+        for mechanism in asked
     )
     with_press = " with a press" if press else ""
-    print(f"{name}{with_press}, {compensator}: rms e - e* {own:.5f}, of gains tuned on the truth {best:.5f}")
-    if known:
-        print(f"  of gains tuned where it is off by 1.2 times the least standard deviation: {known[0]:.5f}")
-    assert own <= 1.10 * max([best, *known]) + 0.0005
+    print(
+        f"{name}{with_press}, {compensator}: rms e - e* {actual:.5f}, of gains tuned on the truth {best:.5f}"
+    )
+    if near:
+        print(f"  of gains tuned where it is off by 1.2 times the least standard deviation: {near[0]:.5f}")
+    assert actual <= 1.10 * max([best, *near]) + 0.0005
 
 
 def with_noise(name):
@@ -83,16 +89,17 @@ def with_noise(name):
 
 
 GOOD, TRIED = 40, 80
-LIMIT = 0.01  # error that gains on the file are tuned to
-HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds of which some files are called good
+LIMIT = 0.01  # error to which gains are tuned on the file
+HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds for which some files get a good verdict
 
 
-def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
+def test_gains_tuned_on_files_with_good_verdict_lose_little(monkeypatch):
     """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
 
-    The quietest gains within the limit on the file are taken. On the true rig they err by up to that limit,
-    where those tuned on the truth may err by less: these touches tell the force's age to 50 to 100 us at
-    best, which e - e* takes for 0.0015 to 0.003."""
+    The quietest gains within the limit on the file are taken. On the true rig they may err by up to that
+    limit, while those tuned on the truth err by less: these touches determine the force's age to 50 to 100 us
+    at best, which corresponds to 0.0015 to 0.003 in e - e*.
+    """
     best, losses = {}, []
     for number in range(TRIED):
         name = HARDLY_TOLD[number % len(HARDLY_TOLD)]
@@ -102,7 +109,7 @@ def test_gains_tuned_on_files_that_are_called_good_lose_little(monkeypatch):
             continue
         truth, written = ambiguous.truth(name), from_builtins(result.mechanism, "identified")
         if name not in best:
-            # Where there is noise, the quietest gains within the limit are taken: as on the file.
+            # With noise, tuning takes the quietest gains within the limit, as on the file.
             gains = tuning.tune(with_noise(name), "response_error", validation=32).gains
             best[name] = error(truth, "response_error", gains)
         gains = tuning.tune(written, "response_error", validation=32).gains

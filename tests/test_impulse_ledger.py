@@ -1,6 +1,6 @@
 """The impulse ledger: unknown force delay and status.
 
-`pytest -m slow -s tests/test_impulse_ledger.py` prints what an unknown delay leaves.
+`pytest -m slow -s tests/test_impulse_ledger.py` prints the errors that an unknown delay leaves.
 """
 
 import numpy as np
@@ -39,18 +39,18 @@ def fitted(delay: float, damping: float, delay_spread: float) -> ContactModel:
 
 
 @pytest.mark.parametrize("delay", [-1e-3, -2e-4, 5e-4, 1e-3])
-def test_elastic_contact_tells_the_delay(delay):
+def test_impulse_ledger_estimates_delay_from_elastic_contact(delay):
     mean, variance = fitted(delay, 0.0, 1e-3).estimate_delay(0.0, 0.1)
     assert mean == pytest.approx(delay, abs=1e-4)
     assert 0 < variance < (3e-4) ** 2
 
 
-def test_damper_is_not_taken_for_a_delay():
+def test_impulse_ledger_does_not_mistake_damper_for_delay():
     mean, variance = fitted(0.0, 3.0, 1e-3).estimate_delay(0.0, 0.1)
     assert abs(mean) < 5e-4 < 2 * np.sqrt(variance)
 
 
-def test_no_delay_spread_leaves_the_delay_alone():
+def test_impulse_ledger_keeps_delay_for_zero_delay_spread():
     model = fitted(1e-3, 0.0, 0.0)
     assert model.estimate_delay(0.0, 0.1) == (0.0, 0.0)
     model.conclude(0.0)
@@ -63,7 +63,7 @@ def restitution(mechanism, law, contact: int = 0) -> float:
     return abs(velocity[-1]) / velocity[0]
 
 
-def test_second_contact_knows_the_delay():
+def test_impulse_ledger_uses_estimated_delay_in_second_contact():
     changes = ["rig.force_sensor.noise_std=0.0"]
     mechanism = load("suite-noisy", changes).mechanism
     late = load("suite-noisy", [*changes, "rig.force_sensor.delay=0.009"]).mechanism
@@ -76,7 +76,7 @@ def test_second_contact_knows_the_delay():
     assert restitution(late, law, 1) == pytest.approx(1, abs=2e-3)
 
 
-def test_uncertain_delay_of_damped_contact_is_not_called_identified():
+def test_impulse_ledger_status_is_unexplained_for_damped_contact_with_delay():
     mechanism = load("suite-damped", ["contact.damping=[600.0]", UNCERTAIN]).mechanism
     gains = literature_gains(mechanism, LAW)
     assert gains["delay_spread"] == 1e-3
@@ -92,8 +92,8 @@ def test_uncertain_delay_of_damped_contact_is_not_called_identified():
     ("suite", "first", "eighth"),
     [("noisy", 0.8, 0.3), ("hertz", 1.5, 0.3), ("hardening", 2.0, 0.5), ("damped", 1.6, 1.8)],
 )
-def test_unknown_delay_on_the_standard_suites(suite, first, eighth, capsys):
-    """Eight contacts, each entered at the speed at which the one before was left."""
+def test_impulse_ledger_error_falls_over_contacts_with_unknown_delay(suite, first, eighth, capsys):
+    """Simulate eight contacts, each with the velocity at which the previous one was left."""
     mechanism = load(f"suite-{suite}", ["approach.contacts=8", UNCERTAIN]).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, 77), 77)
     outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)

@@ -1,4 +1,4 @@
-"""Intervals of a probability of failure: they cover what they state, and are no wider than they must be."""
+"""Confidence intervals of a failure probability: stated coverage without unnecessary width."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from tuning.statistics.intervals import (
     updated,
 )
 
-BAR = 0.935  # of repeated sweeps, for stated 95 %
+BAR = 0.935  # required coverage over repeated sweeps, for stated 95 %
 PROBABILITIES = (0.5, 0.2, 0.05, 0.01, 0.001)
 
 
@@ -26,25 +26,25 @@ def covered(interval, probability):
     return np.mean((interval.low <= probability) & (probability <= interval.high))
 
 
-def test_the_exact_interval_is_that_of_scipy():
+def test_binomial_interval_matches_scipy():
     for failures, number in ((0, 10), (10, 10), (1, 1), (3, 40), (500, 1000), (7, 10**6)):
         expected = stats.binomtest(failures, number).proportion_ci(0.95, method="exact")
-        found = binomial_interval(failures, number)
-        np.testing.assert_allclose([found.low, found.high], expected, rtol=1e-10)
-        assert found.value == failures / number
+        result = binomial_interval(failures, number)
+        np.testing.assert_allclose([result.low, result.high], expected, rtol=1e-10)
+        assert result.value == failures / number
     both = binomial_interval([0, 3], [10, 40], level=0.9)
     assert both.low.shape == (2,) and both.low[0] == 0.0
     assert both.high[1] == pytest.approx(stats.beta.ppf(0.95, 4, 37), rel=1e-12)
 
 
 @pytest.mark.parametrize("interval", (binomial_interval, confidence_sequence))
-def test_without_scenarios_nothing_is_known(interval):
+def test_interval_without_scenarios_is_zero_to_one(interval):
     none = interval(0, 0)
     assert np.isnan(none.value) and none.low == 0.0 and none.high == 1.0
 
 
 @pytest.mark.parametrize("number", (20, 200, 2000))
-def test_the_exact_interval_covers_for_every_probability(number):
+def test_binomial_interval_covers_for_every_probability(number):
     failures = np.arange(number + 1)
     interval = binomial_interval(failures, number)
     for probability in np.linspace(0.0005, 0.9995, 97):
@@ -54,8 +54,8 @@ def test_the_exact_interval_covers_for_every_probability(number):
 
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
-def test_repeated_sweeps_cover_the_truth(probability, capsys):
-    """1000 sweeps of scenarios that fail beyond a limit: P(|x| > limit), x standard normal."""
+def test_binomial_interval_covers_truth_over_repeated_sweeps(probability, capsys):
+    """Run 1000 sweeps of scenarios that fail beyond a limit: P(|x| > limit), x standard normal."""
     rng = np.random.default_rng(0)
     limit = stats.norm.isf(probability / 2)
     failures = np.array([np.sum(np.abs(rng.standard_normal(1000)) > limit) for _ in range(1000)])
@@ -67,13 +67,13 @@ def test_repeated_sweeps_cover_the_truth(probability, capsys):
     assert width < 2 * 1.96 * np.sqrt(probability / 1000) + 0.004
 
 
-def test_the_confidence_sequence_is_the_mixture():
-    """The martingale by its definition: the likelihood under the mixture over that under p, by quadrature."""
+def test_confidence_sequence_equals_mixture_martingale():
+    """Compute the martingale by definition: the mixture likelihood over that under p, by quadrature."""
     failures, number = 3, 50
-    found = confidence_sequence(failures, number)
+    result = confidence_sequence(failures, number)
     prior = stats.beta(0.5, 0.5)
     mixture, _ = integrate.quad(
-        # p = sin^2 takes the singularities of the prior away.
+        # The substitution p = sin^2 removes the singularities of the prior.
         lambda angle: (
             prior.pdf(np.sin(angle) ** 2)
             * 2
@@ -85,12 +85,12 @@ def test_the_confidence_sequence_is_the_mixture():
         np.pi / 2,
         epsabs=1e-14,
     )
-    for end in (found.low, found.high):
+    for end in (result.low, result.high):
         assert mixture / stats.binom.pmf(failures, number, end) == pytest.approx(20.0, rel=1e-6)
-    assert found.low < 3 / 50 < found.high
+    assert result.low < 3 / 50 < result.high
 
 
-def test_the_confidence_sequence_at_its_extremes():
+def test_confidence_sequence_is_correct_at_extreme_counts():
     number = np.array([1, 10, 10**6, 10**9])
     none, all_failed = confidence_sequence(0, number), confidence_sequence(number, number)
     assert np.all(none.low == 0.0) and np.all(all_failed.high == 1.0)
@@ -103,14 +103,14 @@ def test_the_confidence_sequence_at_its_extremes():
 
 
 def walks(probability, repeats=1000, looks=150, step=25):
-    """Failures at every look of many sweeps, (repeats, looks), and the scenarios until then."""
+    """Return the failures at every look of many sweeps, (repeats, looks), and the scenarios so far."""
     rng = np.random.default_rng(1)
     failures = np.cumsum(rng.binomial(step, probability, (repeats, looks)), axis=1)
     return failures, np.broadcast_to(step * np.arange(1, looks + 1), failures.shape)
 
 
 def of_each(interval, failures, number):
-    """The interval of many looks, computed once for looks that saw the same."""
+    """Return the interval of many looks, computed once for equal looks."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
     return Estimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
@@ -120,8 +120,8 @@ def ever_outside(interval, probability):
 
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
-def test_no_stopping_rule_breaks_the_coverage(probability, capsys):
-    """Whoever stops at the worst of 150 looks still finds the truth inside; with exact intervals not."""
+def test_confidence_sequence_covers_for_any_stopping_rule(probability, capsys):
+    """Stopping at the worst of 150 looks keeps the coverage; with exact intervals it does not."""
     failures, number = walks(probability)
     missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
     peeked = np.mean(ever_outside(of_each(binomial_interval, failures, number), probability))
@@ -132,13 +132,13 @@ def test_no_stopping_rule_breaks_the_coverage(probability, capsys):
 
 
 @pytest.mark.parametrize("probability, width", ((0.2, 0.1), (0.05, 0.03), (0.01, 0.01), (0.0, 0.01)))
-def test_stopping_at_a_width_covers(probability, width, capsys):
+def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, capsys):
     rng = np.random.default_rng(2)
     failures = np.cumsum(rng.binomial(100, probability, (1000, 150)), axis=1)
     number = np.broadcast_to(100 * np.arange(1, 151), failures.shape)
-    each = of_each(confidence_sequence, failures, number)
-    # What `updated` does look by look, of all sweeps at once.
-    low, high = np.maximum.accumulate(each.low, axis=1), np.minimum.accumulate(each.high, axis=1)
+    looks = of_each(confidence_sequence, failures, number)
+    # `updated` does this look by look; here for all sweeps at once.
+    low, high = np.maximum.accumulate(looks.low, axis=1), np.minimum.accumulate(looks.high, axis=1)
     assert np.mean(np.any(low > high, axis=1)) < 0.01
     narrow = (high - low <= width) & (low <= high)
     assert np.all(np.any(narrow, axis=1))
@@ -153,9 +153,9 @@ def test_stopping_at_a_width_covers(probability, width, capsys):
         )
     assert coverage >= BAR
     assert 0.7 * width < mean <= width
-    # The forecast is of the right size.
+    # The forecast has the right order of magnitude.
     assert 0.7 < needed / scenarios_needed(probability, width) < 1.4
-    # One of the sweeps, as a sweep would do it.
+    # Repeat one of the sweeps look by look.
     running = Running()
     for added in np.diff(failures[0], prepend=0):
         if enough(running, width):
@@ -164,22 +164,22 @@ def test_stopping_at_a_width_covers(probability, width, capsys):
     assert (running.number, running.low, running.high) == (number[stop][0], low[stop][0], high[stop][0])
 
 
-def test_looks_intersect_and_start_over_where_they_contradict():
+def test_updated_intersects_looks_and_restarts_on_contradiction():
     failures, number = walks(0.3, repeats=1, looks=50)
     running = Running()
     for added in np.diff(failures[0], prepend=0):
         running = updated(running, int(added), 25)
-    each = confidence_sequence(failures[0], number[0])
+    looks = confidence_sequence(failures[0], number[0])
     assert (running.failures, running.number) == (failures[0, -1], 1250)
-    assert (running.low, running.high) == (np.max(each.low), np.min(each.high))
-    # Nobody's Bernoulli trials: none fails, then all do.
+    assert (running.low, running.high) == (np.max(looks.low), np.min(looks.high))
+    # These cannot be Bernoulli trials: none fails, then all do.
     contradiction = updated(updated(Running(), 0, 1000), 1000, 1000)
     last = confidence_sequence(1000, 2000)
     assert (contradiction.low, contradiction.high) == (last.low, last.high)
     assert Running() == Running(0, 0, 0.0, 1.0, 0.95)
 
 
-def test_the_forecast_is_the_first_number_that_suffices():
+def test_scenarios_needed_is_the_smallest_sufficient_number():
     needed = scenarios_needed(0.01, 0.001)
     assert confidence_sequence(0.01 * needed, needed).width <= 0.001
     assert confidence_sequence(0.01 * 0.9 * needed, 0.9 * needed).width > 0.001
@@ -211,11 +211,11 @@ def replicated(name, probability, repeats, points=256, replicates=8):
 
 @pytest.mark.parametrize("name", REGIONS)
 @pytest.mark.parametrize("probability", (0.3, 0.001))
-def test_scrambled_sequences_cover(name, probability):
+def test_replicate_interval_covers_for_scrambled_sequences(name, probability):
     failures, interval = replicated(name, probability, 60)
     assert covered(interval, probability) >= BAR
     if probability == 0.3:
-        # Evenness pays: narrower than independent scenarios could be.
+        # Even points give a narrower interval than independent scenarios.
         exact = binomial_interval(np.sum(failures, axis=1), 8 * 256)
         assert np.mean(interval.width) < 0.7 * np.mean(exact.width)
 
@@ -223,7 +223,7 @@ def test_scrambled_sequences_cover(name, probability):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REGIONS)
 @pytest.mark.parametrize("probability", (0.3, 0.03, 0.001))
-def test_a_thousand_scrambled_sweeps_cover(name, probability, capsys):
+def test_replicate_interval_covers_over_a_thousand_scrambled_sweeps(name, probability, capsys):
     _, interval = replicated(name, probability, 1000)
     coverage, width = covered(interval, probability), np.mean(interval.width)
     with capsys.disabled():
@@ -232,8 +232,8 @@ def test_a_thousand_scrambled_sweeps_cover(name, probability, capsys):
 
 
 @pytest.mark.parametrize("probability", (*PROBABILITIES, 1e-4, 1e-5))
-def test_replicates_without_evenness_cover(probability, capsys):
-    """The least even there is: independent points."""
+def test_replicate_interval_covers_for_independent_points(probability, capsys):
+    """Use independent points, the least even ones."""
     failures = np.random.default_rng(4).binomial(1024, probability, (1000, 16))
     interval = replicate_interval(failures, 1024)
     with capsys.disabled():
@@ -248,16 +248,16 @@ def test_replicates_without_evenness_cover(probability, capsys):
 
 
 @pytest.mark.parametrize("part", (0.0, 0.1, 0.3, 0.5, 0.8))
-def test_replicates_of_perfect_evenness_cover(part):
-    """Each scrambling counts one of the whole numbers around n p, often all the same."""
+def test_replicate_interval_covers_for_perfectly_even_points(part):
+    """Each scrambling counts one of the integers around n p, often the same."""
     failures = 300 + (np.random.default_rng(5).random((2000, 8)) < part)
     assert covered(replicate_interval(failures, 1024), (300 + part) / 1024) >= BAR
 
 
-def test_replicates_that_all_agree():
+def test_replicate_interval_of_equal_replicates_has_nonzero_width():
     none, every = replicate_interval(np.zeros(16), 1000), replicate_interval(np.full(16, 1000), 1000)
     assert none.value == none.low == 0.0 and every.value == every.high == 1.0
-    # The largest p of which Cantelli's inequality lets none of 16 replicates show a failure.
+    # The largest p for which, by Cantelli's inequality, none of 16 replicates shows a failure.
     assert (1 + 1000 * none.high / (1 - none.high)) ** -16 == pytest.approx(0.025, rel=1e-9)
     assert none.high == pytest.approx(1 - every.low, rel=1e-12)
     assert none.high > binomial_interval(0, 16000).high
@@ -265,13 +265,13 @@ def test_replicates_that_all_agree():
 
 @pytest.mark.parametrize("variation", (0.1, 0.3, 0.6))
 @pytest.mark.parametrize("replicates", (5, 10, 20))
-def test_intervals_of_lognormal_estimates_cover_their_mean(variation, replicates):
+def test_lognormal_interval_covers_the_mean(variation, replicates):
     rng = np.random.default_rng(8)
     sigma = np.sqrt(np.log1p(variation**2))
     drawn = 1e-5 * np.exp(sigma * rng.standard_normal((4000, replicates)) - sigma**2 / 2)
     ends = np.array([lognormal_interval(row, row, np.zeros(replicates)) for row in drawn])
     assert np.mean((ends[:, 0] <= 1e-5) & (1e-5 <= ends[:, 1])) >= 0.94
-    # Estimates that agree by chance are not believed to be exact.
+    # Estimates that agree by chance still get an interval of nonzero width.
     low, high = lognormal_interval(np.full(10, 1e-5), np.ones(10), np.full(10, 0.3))
     assert low < 0.85e-5 and high > 1.15e-5
 
@@ -287,6 +287,6 @@ def test_intervals_of_lognormal_estimates_cover_their_mean(variation, replicates
         (lambda: scenarios_needed(0.1, 0.0), "width"),
     ),
 )
-def test_impossible_counts_are_refused(wrong, words):
+def test_intervals_reject_impossible_counts(wrong, words):
     with pytest.raises(ValueError, match=words):
         wrong()

@@ -74,8 +74,8 @@ class Toy(Compensator):
 # Agreement of JAX and runtime, derivatives, export with the bundle's self-test, of C, too.
 RUN = (
     "test_compensators.py::test_jax_and_runtime_agree_on_contacts_and_on_noise",
-    "test_compensators.py::test_derivatives_by_every_gain_are_those_of_differences",
-    "test_export.py::test_every_compensator_that_can_be_tuned_can_be_exported",
+    "test_compensators.py::test_compensator_gain_derivatives_match_finite_differences",
+    "test_export.py::test_export_builds_bundle_for_every_compensator",
 )
 
 
