@@ -1,5 +1,4 @@
-"""Compiled programs kept in files: the same bits, not traced again, remade when what they depend on
-changes."""
+"""Compiled programs cached in files: same bits, no second tracing, rebuilt if a dependency changes."""
 
 import dataclasses
 import errno
@@ -86,7 +85,7 @@ def check(result, total=31.0):
 
 
 @where_kept
-def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
+def test_program_is_traced_once_and_gives_same_numbers(tmp_path):
     check(run(None))
     assert len(traced) == 1
     for _ in range(3):
@@ -95,8 +94,8 @@ def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
 
 
 @where_kept
-def test_code_that_came_from_the_compile_cache_is_kept_as_well(tmp_path):
-    """Of that, jax itself writes what ends in an error."""
+def test_program_is_cached_if_its_code_came_from_compile_cache(tmp_path):
+    """Cover a limit of jax: what it writes of such code fails when it is loaded."""
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
@@ -107,7 +106,7 @@ def test_code_that_came_from_the_compile_cache_is_kept_as_well(tmp_path):
 
 @where_kept
 @pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-100], lambda c: b"no" + c])
-def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
+def test_damaged_program_file_is_rebuilt(tmp_path, spoil):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -118,7 +117,7 @@ def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
 
 @where_kept
 @pytest.mark.parametrize("number", [10, pytest.param(1000, marks=pytest.mark.slow)])
-def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path, number):
+def test_program_file_with_flipped_bit_costs_only_tracing_time(tmp_path, number):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -132,7 +131,7 @@ def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path, number):
 
 
 @where_kept
-def test_a_program_whose_code_is_gone_is_made_anew(tmp_path):
+def test_program_without_its_compiled_code_is_rebuilt(tmp_path):
     run(tmp_path)
     for file in Path(str(program_folder())).glob(f"jit_sums-*{ENDING}"):
         file.unlink()
@@ -143,7 +142,7 @@ def test_a_program_whose_code_is_gone_is_made_anew(tmp_path):
 
 
 @where_kept
-def test_whatever_a_program_follows_from_makes_it_another(tmp_path, monkeypatch):
+def test_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
     check(run(tmp_path))
     check(run(tmp_path, (HuntCrossley(), 1)), 46.0)
     check(run(tmp_path, (KelvinVoigt(), 2)), 32.0)
@@ -161,7 +160,7 @@ def test_whatever_a_program_follows_from_makes_it_another(tmp_path, monkeypatch)
 
 @where_kept
 @pytest.mark.parametrize("changed", ["jaxhil", "tuning"])
-def test_changed_sources_are_another_program(tmp_path, monkeypatch, changed):
+def test_program_is_rebuilt_if_sources_change(tmp_path, monkeypatch, changed):
     kept = tmp_path / "kept"
     kept.mkdir()
     importlib.import_module("tuning")
@@ -174,19 +173,19 @@ def test_changed_sources_are_another_program(tmp_path, monkeypatch, changed):
     assert len(traced) == 2
 
 
-def test_a_law_from_elsewhere_is_not_kept(tmp_path):
+def test_program_of_user_registered_law_is_not_cached(tmp_path):
     for _ in range(2):
         check(run(tmp_path, (Mine(), 1)))
     assert len(traced) == 2 and not list(tmp_path.iterdir())
 
 
-def test_what_calls_back_into_its_process_is_not_kept(tmp_path):
+def test_program_with_callback_into_python_is_not_cached(tmp_path):
     for _ in range(2):
         np.testing.assert_array_equal(run(tmp_path, function=calls_back), 2 * VALUES)
     assert len(traced) == 2 and not list(tmp_path.iterdir())
 
 
-def test_a_jax_that_does_not_tell_of_the_processor_keeps_nothing(tmp_path, monkeypatch):
+def test_program_is_not_cached_if_jax_does_not_name_the_processor(tmp_path, monkeypatch):
     def not_there(made_of):
         raise AttributeError
 
@@ -196,12 +195,12 @@ def test_a_jax_that_does_not_tell_of_the_processor_keeps_nothing(tmp_path, monke
     assert len(traced) == 2 and not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
+def test_program_cache_in_unwritable_folder_costs_no_result(tmp_path):
     check(run(tmp_path / "missing"))
 
 
-def test_settings_that_change_between_calls_make_another_program(tmp_path, monkeypatch):
-    """In one process, which keeps what it has read."""
+def test_program_is_rebuilt_if_settings_change_between_calls(tmp_path, monkeypatch):
+    """Use one process, which keeps what it has read from the cache."""
     monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
     again = partial(kept_programs.run, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})
     for precision in ("highest", "default"):
@@ -217,8 +216,8 @@ def phases(static, scenarios):
 
 
 @pytest.mark.parametrize("law", [Mine(), pytest.param(HuntCrossley(), marks=where_kept)])
-def test_a_law_from_elsewhere_that_arguments_carry_is_not_kept(tmp_path, monkeypatch, law):
-    """As those of scenarios in six axes do."""
+def test_program_with_user_registered_law_in_arguments_is_not_cached(tmp_path, monkeypatch, law):
+    """Cover laws that arguments contain, as scenarios in six axes do."""
     scenarios = six_axes_scenarios(load_any("petals").mechanism)
     groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
     monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
@@ -228,12 +227,12 @@ def test_a_law_from_elsewhere_that_arguments_carry_is_not_kept(tmp_path, monkeyp
     assert (len(traced), len(list(tmp_path.iterdir()))) == ((2, 0) if isinstance(law, Mine) else (1, 1))
 
 
-def test_a_named_tuple_from_elsewhere_is_foreign():
+def test_user_defined_named_tuple_is_foreign():
     assert kept_programs.is_foreign((1, Sums(1, (2,))))  # pyright: ignore[reportArgumentType]
     assert not kept_programs.is_foreign((1, ("two", None, KelvinVoigt())))
 
 
-def test_every_call_of_a_program_is_seen():
+def test_external_calls_of_a_program_are_all_listed():
     text = """%0 = stablehlo.custom_call @lapack_dpotrf_ffi(%1)
     %2 = stablehlo.custom_call @xla.sdy.Sharding(%0)
     %3 = stablehlo.custom_call @"my-own, one"(%2) %4 = stablehlo.custom_call @cu$other(%3)"""
@@ -249,7 +248,7 @@ def test_every_call_of_a_program_is_seen():
     "error", [OSError(errno.ENOSPC, "full"), TypeError("cannot pickle"), KeyError("private")]
 )
 @pytest.mark.parametrize("step", ["remove_stale", "_to_bytes", "write_sealed"])
-def test_what_cannot_be_kept_costs_no_result(tmp_path, monkeypatch, step, error):
+def test_program_that_cannot_be_cached_costs_no_result(tmp_path, monkeypatch, step, error):
     def fails(*arguments, **named):
         raise error
 
@@ -275,7 +274,7 @@ print(kept_programs.run(solved, 1, np.diag([4.0, 0.5])))
 
 
 @where_kept
-def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path):
+def test_cached_program_solves_equations_in_process_that_traced_none(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
     run = partial(subprocess.run, [sys.executable, str(script)], capture_output=True, text=True, check=True)
@@ -285,7 +284,7 @@ def test_a_kept_program_solves_equations_in_a_process_that_traced_none(tmp_path)
 
 @where_kept
 @pytest.mark.parametrize("lanes", [(), (20,)])
-def test_a_kept_batch_has_the_same_bits_and_is_not_compiled_again(tmp_path, monkeypatch, lanes):
+def test_cached_batch_has_same_bits_and_is_not_recompiled(tmp_path, monkeypatch, lanes):
     mechanism = load("varying").mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 20, 0))
     loop = build_loop(mechanism, "phase_lead", scenarios)

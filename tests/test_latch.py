@@ -1,4 +1,4 @@
-"""Latches: what is caught, and the spring that holds it."""
+"""Latches: the condition of capture, and the spring that holds the bodies."""
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,8 @@ def at(position, theta):
     return Pose(place(position, BATCH), exponential(place(theta, BATCH)))
 
 
-def test_it_catches_what_is_deep_and_aligned_and_holds_on():
-    """Nothing before, nothing at first, and a spring from there on."""
+def test_latch_captures_deep_aligned_bodies_and_holds_them():
+    """Check for no force before the capture, none at first, and a spring from there on."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
     held = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
@@ -48,8 +48,8 @@ def test_it_catches_what_is_deep_and_aligned_and_holds_on():
 
 
 @pytest.mark.slow
-def test_several_hold_as_much_as_each_alone():
-    """Caught at unlike depths, with unlike springs, and with dampers."""
+def test_latches_together_hold_as_much_as_each_alone():
+    """Capture at different depths, with different springs and with dampers."""
     one, share = latch(False, 0.01), jnp.array([[1.0], [2.0], [3.0]])
     points = place([[0.2, 0.2, 0.2], [-0.1, 0.0, 0.3], [0.0, 0.0, 0.0]], BATCH)
     all_three = Latch(
@@ -78,8 +78,8 @@ def test_several_hold_as_much_as_each_alone():
 
 
 @pytest.mark.slow
-def test_the_spring_has_an_energy():
-    """Around a closed way of large rotations it does no work."""
+def test_latch_spring_is_conservative():
+    """Check that the spring does no work around a closed path of large rotations."""
     phase = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     way = 0.8 * np.stack([np.cos(phase) - 1, np.sin(phase), 0.5 * np.sin(2 * phase)])
     rates = 0.8 * np.stack([-np.sin(phase), np.cos(phase), np.cos(2 * phase)])

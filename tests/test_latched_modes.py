@@ -1,7 +1,7 @@
-"""A latched contact is linear: its modes under delay, and the response error with its true stiffness.
+"""Modes of a latched contact under delay, and the response error with its true stiffness.
 
-Bodies off each other's line, held from the start on by a latch of a full stiffness K, M their relative mass
-matrix; so slow that what is not linear is lost in rounding.
+A latch with a full stiffness K holds bodies off each other's line from the start; M is their relative mass
+matrix. The motion is so slow that nonlinear terms are lost in rounding.
 """
 
 import jax
@@ -60,9 +60,12 @@ def scenario(delays):
 
 
 @pytest.mark.parametrize("delays", [[DELAY] * 6, UNEQUAL], ids=["equal", "unequal"])
-def test_each_mode_grows_under_delay(delays):
-    """By the fastest growing root of det(s^2 M + K diag(exp(-s tau))) = 0, which is with equal delays that of
-    the stiffest mode by Lambert's function. The integrator's own half period comes on top."""
+def test_latched_modes_grow_under_delay_as_characteristic_roots(delays):
+    """Compare with the fastest growing root of det(s^2 M + K diag(exp(-s tau))) = 0.
+
+    With equal delays it is that of the stiffest mode by Lambert's function. The integrator adds half a period
+    of delay.
+    """
     given = scenario(delays)
     loop = build_loop(given, integrator="zoh", hold="linear", latency=0)
     _, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, given, TICKS)
@@ -78,8 +81,8 @@ def test_each_mode_grows_under_delay(delays):
     assert abs(found - root) < 1e-4 * abs(root), (found, root)
 
 
-def test_response_error_with_the_true_stiffness_has_no_rig_in_it():
-    """-K xi_a - K (xi_d - xi_a) = -K xi_d, for any six axes; without it the same run diverges."""
+def test_response_error_with_true_stiffness_removes_the_rig():
+    """Check that -K xi_a - K (xi_d - xi_a) = -K xi_d for any six axes; without it the same run diverges."""
     bodies, start = started()
     pose = Pose(vector(jnp.zeros((3, 1))), identity(jnp.zeros(1)))
     one, period = latch(), lanes(PERIOD, BATCH)

@@ -66,8 +66,8 @@ def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
 
 @pytest.mark.parametrize("noise", ["0.5 %", "none"])
 @pytest.mark.parametrize("suite", ["noisy", "damped", "hertz", "hardening", "layered"])
-def test_surface_within_1_mm_of_the_specified_place(suite, noise):
-    """Four contacts at 5 mm/s, beside the same ones with the surface where it is specified."""
+def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
+    """Run four contacts at 5 mm/s, next to the same ones with the surface where it is specified."""
     clean = ("rig.force_sensor.noise_std=0.0",) if noise == "none" else ()
     mechanism = load(f"suite-{suite}", [*PLANE, *clean, f"approach.contacts={CONTACTS}"]).mechanism
     probed = probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
@@ -86,8 +86,11 @@ def test_surface_within_1_mm_of_the_specified_place(suite, noise):
 
 @pytest.mark.parametrize("noise", ["none", "0.5 % of its own peak", "0.15 N"])
 @pytest.mark.parametrize("period", [2.5e-4, 1e-3, 4e-3])
-def test_contact_of_1_to_8_s(period, noise):
-    """Of 0.06 to 0.5 Hz. No command goes beyond 3 times the peak in space and 20 times the noise."""
+def test_impulse_ledger_is_accurate_for_contacts_of_1_to_8_s(period, noise):
+    """Cover 0.06 to 0.5 Hz.
+
+    No command goes beyond 3 times the peak of the ideal contact and 20 times the noise.
+    """
     sensor = "rig.force_sensor.noise_std=0.15"
     for damped in (False, True):
         damping = [f"contact.damping=[{2 * 0.05 * np.sqrt(414.5 * 350):.6g}]"] if damped else []
@@ -117,8 +120,8 @@ OFFSETS = {
 
 
 @pytest.mark.parametrize("case", OFFSETS)
-def test_preload_friction_and_bias(case):
-    """To 10 N, 6 N and 5 N either way, alone and together."""
+def test_impulse_ledger_is_accurate_with_preload_friction_and_bias(case):
+    """Cover up to 10 N, 6 N and 5 N in either direction, alone and together."""
     suite, changes = OFFSETS[case]
     mechanism = load(f"suite-{suite}", changes).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)

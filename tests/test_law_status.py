@@ -1,4 +1,4 @@
-"""Status of the impulse ledger, tick by tick and over a contact, and what the watchdog makes of it.
+"""Status of the impulse ledger, tick by tick and over a contact, and how the watchdog uses it.
 
 `pytest -m slow -s tests/test_law_status.py` prints how often an identified contact errs. The counting in C is
 compared with the one in Python.
@@ -135,8 +135,8 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
         for number, name in enumerate(KINDS)
     ],
 )
-def test_a_contact_is_what_the_law_said_of_most_of_it(name, limits):
-    """Once it is over, on one tick, and without a trip; with the audit of energies and without."""
+def test_contact_status_is_the_status_of_most_ticks(name, limits):
+    """Expect it after the contact, on one tick, without a trip; with the energy audit and without."""
     law, found = ran(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
     assert (record.number, record.status) == (1, wanted)
@@ -150,8 +150,8 @@ def test_a_contact_is_what_the_law_said_of_most_of_it(name, limits):
 
 
 @pytest.mark.parametrize("nearer", [1e-3, 4e-3])
-def test_contact_before_the_specified_surface_is_audited(nearer):
-    """It begins when the law acts."""
+def test_contact_before_specified_surface_is_audited(nearer):
+    """Expect the audit to begin when the law acts."""
     changes = (f"rig.contact_plane={-nearer}",)
     mechanism, made = gain_file(Kind("noisy", changes, {}, "identified"), {"settling": 0.02})
     law = Controller(made)
@@ -182,8 +182,8 @@ def counting_in_c(tmp_path_factory):
     return ctypes.CDLL(str(c99_cases.compiled(folder, "counted.c", "counted.so", "-shared", "-fPIC")))
 
 
-def test_c_counts_statuses_as_python_does(counting_in_c):
-    """Contacts of 40 ticks in which one or two statuses, drawn by chance, prevail."""
+def test_status_counts_in_c_agree_with_python(counting_in_c):
+    """Use contacts of 40 ticks in which one or two random statuses prevail."""
     rng = np.random.default_rng(0)
     numbers = [status.number for status in STATUSES if status.number != NOT_REACHED]
     record_type, statuses = ctypes.c_longlong * 7, set()
@@ -205,7 +205,7 @@ def test_c_counts_statuses_as_python_does(counting_in_c):
     assert statuses == {*STATUS_NAMES.values()} - {"out_of_contact", "unstated"}
 
 
-def test_kinds_of_contact_show_every_status_of_the_law():
+def test_contact_kinds_cover_every_status_of_the_law():
     records = [ran(name, "no energies") for name in KINDS]
     statuses = {name for _, contact in records for name in contact.said}
     never = {"unstated", "not_reached"}
@@ -215,9 +215,11 @@ def test_kinds_of_contact_show_every_status_of_the_law():
     }
 
 
-def test_without_a_measured_force_a_contact_is_not_reached():
-    """Whatever the law does: the model passes the surface and comes back, with hardware that never touches,
-    with a dead zone that hides its contact, and with a contact of a single reading."""
+def test_contact_without_measured_force_is_not_reached():
+    """Let the model pass the surface and come back without a measured force, whatever the law does.
+
+    The hardware never touches, a dead zone hides its contact, or the contact has a single reading.
+    """
     mechanism = load("suite-noise-free").mechanism
     time = 1e-3 * np.arange(260)
     motion = 2e-4 * np.sin(25.0 * (time - 0.0203))
@@ -239,7 +241,7 @@ def test_without_a_measured_force_a_contact_is_not_reached():
         assert law.seen == LAW_IN_DOUBT
 
 
-def test_the_record_stays_until_the_next_contact_is_audited():
+def test_contact_record_stays_until_next_contact_is_audited():
     mechanism, made = gain_file(KINDS["8 Hz"], {})
     law = Controller(made)
     assert law.law_status == "out_of_contact" and law.last_contact == ContactRecord()
@@ -253,7 +255,7 @@ def test_the_record_stays_until_the_next_contact_is_audited():
     assert law.last_contact[:2] == (2, "identified")
 
 
-def test_a_contact_under_way_is_judged_when_the_next_is_announced():
+def test_contact_under_way_is_evaluated_when_next_is_announced():
     for limits in LIMITS.values():
         mechanism, made = gain_file(KINDS["8 Hz"], {**limits, "settling": 5.0})
         law = Controller(made)
@@ -266,8 +268,8 @@ def test_a_contact_under_way_is_judged_when_the_next_is_announced():
         assert law.faults == 0 and law.seen == LAW_IN_DOUBT
 
 
-def test_a_restitution_that_trips_comes_with_what_the_law_said():
-    """Both faults on one tick; the one that does not trip is no cause."""
+def test_restitution_trip_reports_status_of_the_law():
+    """Expect both faults on one tick; a fault that does not trip is no cause."""
     mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
     law = Controller(made)
     found = run(mechanism, law)
@@ -277,7 +279,7 @@ def test_a_restitution_that_trips_comes_with_what_the_law_said():
 
 
 @pytest.mark.parametrize("name", [name for name in laws.names() if name != LAW])
-def test_laws_without_a_status_say_nothing(name):
+def test_laws_without_status_report_none(name):
     mechanism = load("suite-noisy").mechanism
     law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
     found = run(mechanism, law)
@@ -310,7 +312,7 @@ def test_laws_without_a_status_say_nothing(name):
         ({IDENTIFIED: 59, TOO_SHORT: 20, NOISY: 21}, NOISY),
     ],
 )
-def test_the_status_that_counts(counts, status):
+def test_contact_status_follows_from_status_counts(counts, status):
     made = StatusCount()
     for one, number in counts.items():
         for _ in range(number):
@@ -334,10 +336,10 @@ def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
-def test_share_of_doubtful_ticks_tells_short_contacts_apart(suite):
-    """Print the share of ticks in doubt, and check the gap that `DOUBTFUL` lies in.
+def test_share_of_doubtful_ticks_separates_short_contacts(suite):
+    """Print the share of ticks in doubt, and check the gap that contains `DOUBTFUL`.
 
-    Too short are those that the law calls so on any tick.
+    A contact is too short if the law says so on any tick.
     """
     contacts = 200
     doubt, short = np.empty((2, contacts))
@@ -385,8 +387,8 @@ WRONG = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
-def test_of_what_is_called_identified_hardly_any_errs(wrong):
-    """Whatever is wrong, by more than 1.5 %; and where nothing is, 98 in 100 are identified."""
+def test_identified_contacts_hardly_ever_err(wrong):
+    """Expect few errors above 1.5 %, whatever is wrong; if nothing is wrong, 98 in 100 are identified."""
     (changes, known), contacts = WRONG[wrong], 100
     told = load("suite-noisy", list(known)).mechanism
     odd = identified = 0
@@ -421,7 +423,7 @@ def restitution(mechanism: Mechanism) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
 def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
-    """A damper whose loss the unmodelled lag makes up for reads like no damper."""
+    """Cover a damper whose loss is offset by the unmodelled lag, so that it reads like no damper."""
     contacts, told = 60, load("suite-damped").mechanism
     errors, said = np.empty(contacts), []
     changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()
@@ -440,7 +442,7 @@ def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
 
 @pytest.mark.slow
 def test_slow_contacts_are_identified():
-    """Contacts of 0.4 to 1.4 Hz."""
+    """Run contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
     told = load("suite-noisy", list(changes)).mechanism
     for place, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):

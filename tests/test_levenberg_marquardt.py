@@ -28,7 +28,7 @@ def solved(residuals, targets, starts, steps):
     return solve(residuals, 10.0, np.array(targets), bounds, coordinates, np.array(steps), longest=64, tile=2)
 
 
-def test_every_problem_finds_its_own_minimum():
+def test_least_squares_finds_minimum_of_every_problem():
     targets = [[0.7, 0.2], [0.7, 0.2], [1.2, 3.0]]
     solution = solved(distance, targets, [[0.1, 0.01], [1.9, 5.0], [1.0, 1.0]], 60)
     np.testing.assert_allclose(to_gains(np.asarray(solution.coordinates), BOUNDS), targets, rtol=1e-4)
@@ -38,7 +38,7 @@ def test_every_problem_finds_its_own_minimum():
     np.testing.assert_allclose(history[:, -1], solution.loss)
 
 
-def test_equal_bounds_hold_a_gain():
+def test_gain_with_equal_bounds_stays_fixed():
     bounds = Bounds(np.array([[0.4, 1e-3]] * 2), np.array([[0.4, 10.0]] * 2), np.array([[1.0, 1.0]] * 2))
     arguments, starts = np.array([[0.7, 0.2]] * 2), np.array([[0.4, 1.0], [0.4, 5.0]])
     coordinates = to_coordinates(starts, bounds)
@@ -54,7 +54,7 @@ def tilted(static, gains, arguments):
     return (gains - arguments) @ matrix.T
 
 
-def test_a_minimum_on_the_bounds_is_that_of_bounded_linear_least_squares():
+def test_minimum_on_bounds_is_that_of_bounded_linear_least_squares():
     bounds = Bounds(*(np.full((4, 2), leaf) for leaf in (0.0, 1.0, 0.0)))
     targets = np.array([[2.0, -0.3], [0.5, 3.0], [-1.0, -2.0], [0.2, 0.6]])
     starts = np.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])
@@ -66,7 +66,7 @@ def test_a_minimum_on_the_bounds_is_that_of_bounded_linear_least_squares():
         np.testing.assert_allclose(curvature, matrix.T @ matrix)
 
 
-def test_a_gain_that_nothing_depends_on_stays():
+def test_gain_without_influence_stays():
     def blind(static, gains, arguments):
         return gains[:, :1] - arguments
 
@@ -76,8 +76,8 @@ def test_a_gain_that_nothing_depends_on_stays():
     assert [STATUSES[i] for i in solution.status] == ["converged"]
 
 
-def test_no_progress_is_convergence():
-    """A ripple finer than any step: the loss stands still long before the residuals settle."""
+def test_least_squares_without_progress_has_converged():
+    """Use a ripple finer than any step: the loss stops falling long before the residuals settle."""
 
     def rippled(static, gains, arguments):
         return jnp.concatenate([gains - 2.0, 1e-3 * jnp.sin(1e6 * gains)], axis=1)
@@ -88,13 +88,13 @@ def test_no_progress_is_convergence():
     assert solution.steps[0] < 20
 
 
-def test_too_few_steps_and_a_start_that_is_not_finite_are_named():
+def test_least_squares_reports_too_few_steps_and_nonfinite_start():
     solution = solved(blows_up, [[0.7, 0.2]] * 2, [[0.1, 0.01], [1.9, 5.0]], 2)
     assert [STATUSES[i] for i in solution.status] == ["step limit", "not finite"]
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_derivative_is_that_of_the_residuals(number):
+def test_least_squares_derivative_is_that_of_the_residuals(number):
     free = jnp.asarray(np.linspace(0.1, 0.9, 2 * number).reshape(number, 2))
     factors = jnp.asarray(np.linspace(2.0, 5.0, 2 * number).reshape(number, 2))
     tangent = jnp.asarray([1.0, -0.5])

@@ -1,4 +1,4 @@
-"""Which tick's readings a row holds, told by noise: rigs of an independent simulator, logged in every way."""
+"""Tick of the readings in a row of a log, estimated from noise; rigs of an independent simulator."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ KINDS = ["noisy", *(pytest.param(one, marks=pytest.mark.slow) for one in campaig
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_noise_tells_which_readings_are_in_a_row(kind):
+def test_noise_shows_the_tick_of_a_rows_readings(kind):
     for ahead, row in ((-1, "after"), (0, "tick"), (1, "sent")):
         runs, timing = runs_of(kind, ahead)
         assert rows_ahead(runs) == ahead
@@ -51,8 +51,8 @@ def test_noise_tells_which_readings_are_in_a_row(kind):
         check_rows_of(runs, timing)
 
 
-def test_a_rig_that_is_driven_before_and_after_is_told_by_its_contact():
-    """A thousand rows to either side in which commands come from a path, and forces are noise."""
+def test_contact_shows_tick_of_readings_if_rig_is_driven_before_and_after():
+    """Add a thousand rows on either side in which commands follow a path and forces are noise."""
     runs, _ = runs_of("noisy", -1)
     rng, path = np.random.default_rng(0), 1e-3 * np.cos(np.linspace(0.0, 3.0, 1000))
     for at, run in enumerate(runs):
@@ -64,8 +64,8 @@ def test_a_rig_that_is_driven_before_and_after_is_told_by_its_contact():
     assert rows_ahead(runs) == -1
 
 
-def test_the_explicit_integrator_answers_a_tick_late():
-    """It moves by the velocity before the force: commands are those of a controller that takes a tick."""
+def test_explicit_integrator_answers_a_tick_late():
+    """Move by the velocity before the force: commands are those of a controller that takes a tick."""
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
     moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]
@@ -76,7 +76,7 @@ def test_the_explicit_integrator_answers_a_tick_late():
         check_rows_of(moved, replace(timing, row="sent"), found)
 
 
-def test_without_noise_or_runs_enough_nothing_is_said():
+def test_tick_of_readings_is_not_reported_without_noise_or_enough_runs():
     (run, *others), timing = runs_of("clean")
     assert rows_ahead([run, *others]) == 0
     assert rows_ahead([run]) is None and rows_ahead([]) is None

@@ -1,4 +1,4 @@
-"""Logs that were cut, torn, mistyped or shuffled: a campaign of finite numbers, or one line; nothing else."""
+"""Logs that were cut, torn, mistyped or shuffled: read as finite numbers or refused in one line."""
 
 import tempfile
 from contextlib import suppress
@@ -97,12 +97,12 @@ CLOCKS = st.sampled_from([{}, {"clock": "index"}, {"row": "sent"}])
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(sorted(LOGS)), mutations, CLOCKS)
-def test_any_log_is_read_or_refused_in_one_line(kind, changes, timing):
+def test_damaged_log_is_read_or_refused_in_one_line(kind, changes, timing):
     check(kind, changes, timing)
 
 
 @pytest.mark.slow
 @settings(deadline=None, max_examples=5000)
 @given(st.sampled_from(sorted(LOGS)), mutations, CLOCKS)
-def test_any_of_many_logs_is_read_or_refused_in_one_line(kind, changes, timing):
+def test_many_damaged_logs_are_read_or_refused_in_one_line(kind, changes, timing):
     check(kind, changes, timing)

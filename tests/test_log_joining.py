@@ -1,4 +1,4 @@
-"""Channels with clocks of their own: brought to the rows of the desired position, or refused by name."""
+"""Channels with clocks of their own: joined to the rows of the desired position, or refused by name."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
     seed=st.integers(0, 99),
 )
 @settings(deadline=None, max_examples=30)
-def test_readings_are_those_of_the_rows_times(late, rate, jitter, lost, ends, seed):
+def test_joined_readings_are_those_of_the_rows_times(late, rate, jitter, lost, ends, seed):
     random = np.random.default_rng(seed)
     count = int(ends / rate)
     sampled = (late + PERIOD * rate * np.arange(count))[random.uniform(size=count) >= lost]
@@ -77,7 +77,7 @@ def test_readings_are_those_of_the_rows_times(late, rate, jitter, lost, ends, se
     assert len(kept) > (0.9 if lost else 0.999) * np.count_nonzero(inside) - 2 and set(kept) <= set(ticks)
 
 
-def test_gap_of_a_channel_loses_its_rows():
+def test_gap_in_a_channel_drops_its_rows():
     sampled = np.delete(PERIOD * np.arange(ROWS), slice(1000, 1200)) + 4e-4
     kept, _, notes = joined(sampled)
     assert not np.any((kept > 1000) & (kept < 1200)) and "interpolated between their own times" in notes[0]
@@ -138,7 +138,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize("late", [0.005, -0.012])
-def test_channel_with_stamps_that_the_mapping_names(tmp_path, late):
+def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
     h5py = pytest.importorskip("h5py")
     log, *groups = separate(late)
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -157,12 +157,12 @@ def test_channel_with_stamps_that_the_mapping_names(tmp_path, late):
         read(tmp_path / "a.h5", **TIMES, timing={"clock": "index"})
 
 
-def test_stamps_of_one_channel_need_stamps_of_the_rows():
+def test_channel_stamps_require_stamps_of_the_rows():
     with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', allowed none"):
         mapping(time={"rate": 1000.0}, force_measured={"column": "F", "time": "tF"})
 
 
-def test_text_of_the_same_length_is_joined_by_its_own_stamps(tmp_path):
+def test_text_channel_of_same_length_is_joined_by_its_own_stamps(tmp_path):
     log = touches(1)
     path = write_csv(tmp_path / "a.csv", log | {"tF": log["t"] + 0.003})
     (run,) = read(path, force_measured={"column": "F", "time": "tF"}).runs
@@ -171,7 +171,7 @@ def test_text_of_the_same_length_is_joined_by_its_own_stamps(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "late"), [(1.0, 0.005), (1e3, 0.005), (1.0, 1e-4)])
-def test_stamps_of_a_group_that_are_not_those_of_the_rows_are_refused(tmp_path, unit, late):
+def test_group_stamps_that_differ_from_those_of_the_rows_are_refused(tmp_path, unit, late):
     h5py, log = pytest.importorskip("h5py"), touches(1)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["x/time"], file["f/time"], file["f/count"] = log["t"], unit * (log["t"] + late), 2.0 * log["t"]

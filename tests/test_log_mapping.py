@@ -1,4 +1,4 @@
-"""Mapping files of logs: what they may say, and what is said of those that say something else."""
+"""Mapping files of logs: allowed content, and messages about everything else."""
 
 import copy
 
@@ -48,7 +48,7 @@ def changed(path, value):
     return raw
 
 
-def test_numbers_mean_sign_times_scaled_number_and_offset_in_the_unit():
+def test_mapping_number_is_sign_times_scaled_reading_and_offset_in_unit():
     channels = mapping_of(FULL, "map").channels
     assert si(channels.position_desired, "position_desired") == (-1e-3, -2e-3)
     assert si(channels.position_measured, "position_measured") == (1e-6, 0.0)
@@ -56,7 +56,7 @@ def test_numbers_mean_sign_times_scaled_number_and_offset_in_the_unit():
     assert si(channels.force_command, "force_command") == (1.0, 0.0)
 
 
-def test_a_file_says_the_same_as_its_table(tmp_path):
+def test_mapping_file_is_equivalent_to_its_table(tmp_path):
     path = tmp_path / "map.toml"
     path.write_text("""
         schema = "jaxhil/log/1"
@@ -110,14 +110,14 @@ def test_a_file_says_the_same_as_its_table(tmp_path):
         (("runs",), ["x"], "runs[0]: found 'x', allowed a table"),
     ],
 )  # fmt: skip
-def test_unusable_mappings(path, value, reason):
+def test_unusable_mapping_is_refused(path, value, reason):
     with pytest.raises(InputError) as caught:
         mapping_of(changed(path, value), "map.toml")
     assert str(caught.value).startswith("map.toml: ") and reason in str(caught.value)
     assert str(caught.value).isprintable()
 
 
-def test_what_neither_mapping_nor_prior_says(tmp_path):
+def test_value_missing_from_mapping_and_prior_is_refused(tmp_path):
     log = tmp_path / "free_1.csv"
     log.touch()
     cases = [

@@ -1,4 +1,4 @@
-"""Rows that were lost: commands put back as the model made them, nothing that a sensor read made up; cuts."""
+"""Lost rows: commands are restored as the model made them, sensor readings are not invented; cuts."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def cut(lost, without=(), cuts=()):
 
 
 @pytest.mark.parametrize(("lost", "error"), [(1, 1e-17), (2, 1e-17), (3, 1e-8)])
-def test_commands_are_those_that_the_model_made(lost, error):
+def test_lost_commands_are_restored_as_the_model_made_them(lost, error):
     gone = np.arange(TOUCH, TOUCH + lost)
     (found,) = cut(gone)
     np.testing.assert_array_equal(found.tick, np.arange(1200))
@@ -37,7 +37,7 @@ def test_commands_are_those_that_the_model_made(lost, error):
     assert set(found.channels["contact_index"]) == {0, 1}
 
 
-def test_without_the_model_a_cubic_tells_most():
+def test_lost_commands_without_the_model_are_mostly_restored_by_a_cubic():
     (found,) = cut([TOUCH, TOUCH + 1], without=["force_command"])
     assert np.max(np.abs(found.channels["position_desired"] - LOG["xd"])) < 1e-7
     (many,) = cut([TOUCH, TOUCH + 4, TOUCH + 6, TOUCH + 7, 1198], without=["velocity_desired"])
@@ -45,7 +45,7 @@ def test_without_the_model_a_cubic_tells_most():
     assert len(many.tick) == 1200
 
 
-def test_longer_gaps_and_cuts_divide_a_log():
+def test_log_is_divided_at_longer_gaps_and_cuts():
     first, second, third = cut(np.arange(300, 300 + SHORT + 1), cuts=[700 - SHORT - 1])
     assert [(one.tick[0], one.tick[-1]) for one in (first, second, third)] == [
         (0, 299),

@@ -1,4 +1,4 @@
-"""Scales of forces, positions and velocities by the model's momentum; logs that are rounded, torn or late."""
+"""Scales of forces, positions and velocities by the model's momentum; rounded, torn and late logs."""
 
 import numpy as np
 import pytest
@@ -106,7 +106,7 @@ REAL = {
 
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("without", [(), ("velocity_desired",)])
-def test_logs_of_real_loggers_keep_their_force_command(tmp_path, name, without):
+def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
     log, gone = REAL[name](LOG), dict.fromkeys(without)
     found = read(write_csv(tmp_path / "a.csv", log), **gone)
     assert found.notes == () and all(run.force_command is not None for run in found.runs)
@@ -115,7 +115,7 @@ def test_logs_of_real_loggers_keep_their_force_command(tmp_path, name, without):
     assert "pulls the model forward" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 
 
-def test_force_command_that_tells_nothing_is_ignored_with_a_note(tmp_path):
+def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"Fc": 5.0 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     found = read(write_csv(tmp_path / "a.csv", noise))
     (note,) = found.notes
@@ -127,22 +127,22 @@ def test_force_command_that_tells_nothing_is_ignored_with_a_note(tmp_path):
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
 
-def test_velocity_that_does_not_follow_is_ignored_with_a_note(tmp_path):
+def test_velocity_that_does_not_match_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"vd": 5e-3 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     found = read(write_csv(tmp_path / "a.csv", noise))
     assert "velocity_desired: ignored, since position_desired does not move by it" in "\n".join(found.notes)
     assert all(run.velocity_desired is None for run in found.runs)
 
 
-def test_row_that_nothing_tells_is_noted(tmp_path):
+def test_undetermined_row_is_noted(tmp_path):
     coarse = rounded(scatter(LOG, 2e-4, samples=True), xd=2e-6, vd=1e-4)
     assert "timing.row: force_command is too coarse" in "\n".join(
         read(write_csv(tmp_path / "a.csv", coarse)).notes
     )
 
 
-def test_damping_compensator_and_dead_zone_are_no_wrong_unit(tmp_path):
-    """The impulse differs by what the compensator adds and the dead zone takes."""
+def test_compensator_damping_and_dead_zone_are_not_taken_for_a_wrong_unit(tmp_path):
+    """Allow for the impulse that the compensator adds and the dead zone takes."""
     log = touches(1, speed=12e-3, noise=0.0)
     dead = log | {"F": np.sign(log["F"]) * np.maximum(np.abs(log["F"]) - 45.0, 0.0)}
     impulse = np.sum(dead["F"]) / np.sum(log["F"])
@@ -159,7 +159,7 @@ def test_damping_compensator_and_dead_zone_are_no_wrong_unit(tmp_path):
     lost=st.sampled_from([0.0, 0.01, 0.1]),
     seed=st.integers(0, 99),
 )
-def test_force_command_is_right_or_refused_whatever_the_log(factor, quantum, noise, lost, seed):
+def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lost, seed):
     log = {name: column[:500] for name, column in touches(1, noise=noise, seed=seed).items()}
     x = quantum * np.round(log["xd"] / quantum) if quantum else log["xd"]
     valid = np.random.default_rng(seed).uniform(size=len(x)) >= lost
@@ -179,7 +179,7 @@ def test_force_command_is_right_or_refused_whatever_the_log(factor, quantum, noi
 
 
 @pytest.mark.parametrize("quantum", [0.0, 1e-9, 1e-7, 1e-6])
-def test_integrator_shows_under_rounding(quantum):
+def test_integrator_is_recognised_under_rounding(quantum):
     log = touches(1, noise=1.0)
     v = log["vd"][:500]
     ways = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
@@ -206,13 +206,13 @@ def test_units_are_named_by_their_factors():
     assert likely_lengths(1 / 25.4, 0.01) == " (in in, read as mm?)"
 
 
-def test_a_campaign_of_several_files_names_the_wrong_one(tmp_path):
+def test_campaign_of_several_files_names_the_wrong_one(tmp_path):
     good, bad = write_csv(tmp_path / "a.csv", LOG), write_csv(tmp_path / "b.csv", scaled(LOG, F=1 / LBF))
     with pytest.raises(InputError, match=r"b.csv: force_measured: found 0.2"):
         read_campaign([good, bad], mapping())
 
 
-def test_a_note_of_several_logs_is_said_once(tmp_path):
+def test_note_on_several_logs_is_given_once(tmp_path):
     log = LOG | {"vd": 0.0 * LOG["vd"]}  # as loggers write a channel that is not connected
     paths = [write_csv(tmp_path / f"{name}.csv", log) for name in "abc"]
     (note,) = read_campaign(paths, mapping()).notes

@@ -1,5 +1,4 @@
-"""One program for processors and graphics cards: rollout and derivatives lower for CUDA as they are, without
-a call back into Python, and options of the compiler for processors are given to those alone."""
+"""Lowering of rollout and derivatives for CUDA, without callbacks; CPU compiler options for CPUs only."""
 
 import re
 
@@ -61,12 +60,12 @@ def jacobian(name, compensator):
     return calls(jax.jacfwd(errors), np.array([*gains.values()], float), scenarios)
 
 
-def test_a_batch_lowers_for_cuda_and_calls_nothing_outside():
+def test_batch_lowers_for_cuda_without_external_calls():
     assert batch("varying", "none") == set()
 
 
-def test_what_tuning_runs_lowers_for_cuda(monkeypatch):
-    """The whole solver; its steps are worked out by the card's own Cholesky decomposition."""
+def test_tuning_lowers_for_cuda(monkeypatch):
+    """Lower the whole solver; the card's own Cholesky decomposition computes its steps."""
     programs = []
     monkeypatch.setattr(program_cache, "prepare", lambda *program: programs.append(program))
     prepare_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
@@ -75,7 +74,7 @@ def test_what_tuning_runs_lowers_for_cuda(monkeypatch):
     assert found == CHOLESKY
 
 
-def test_what_calls_back_into_python_would_be_seen():
+def test_callback_into_python_is_detected():
     like = jax.ShapeDtypeStruct((), float)
     with pytest.raises(ValueError, match="different from the lowering platform cuda"):
         calls(lambda x: jax.pure_callback(np.sin, like, x), 1.0)
@@ -92,12 +91,12 @@ def test_every_law_and_its_derivatives_lower_for_cuda(name, compensator):
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", SIX_AXES)
 def test_six_axes_and_their_derivatives_lower_for_cuda(compensator):
-    """They solve six equations in six unknowns, by what the card has for that."""
+    """Solve six equations in six unknowns by the card's own routine."""
     assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
     assert jacobian("probe-drogue", compensator) <= LINEAR_EQUATIONS
 
 
-def test_options_for_processors_are_given_to_those_alone(monkeypatch):
+def test_compiler_options_for_cpus_go_to_cpus_only(monkeypatch):
     assert known_options(ROLLOUT) == ROLLOUT
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert known_options(ROLLOUT) == {}
@@ -106,10 +105,8 @@ def test_options_for_processors_are_given_to_those_alone(monkeypatch):
 @pytest.mark.parametrize(
     ("plugin", "platforms", "given"), ((None, "", True), ("there", "", False), ("there", "cpu", True))
 )
-def test_less_optimisation_is_asked_of_the_compiler_for_processors_alone(
-    monkeypatch, plugin, platforms, given
-):
-    """Where jax has a plugin, as it needs for a graphics card, and is not told to leave it."""
+def test_less_optimisation_is_asked_of_the_cpu_compiler_only(monkeypatch, plugin, platforms, given):
+    """Cover a jax plugin, as a graphics card needs one, that jax is not told to leave out."""
     monkeypatch.setattr(environment, "find_spec", {"jax_plugins": plugin}.get)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
     assert (LEVEL in flags("")) == given

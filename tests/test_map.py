@@ -1,4 +1,4 @@
-"""Stability maps: theory beside them, growth in contact against long simulated ones, margins, refusals."""
+"""Stability maps: theory, growth in contact against long simulations, margins and refusals."""
 
 import cmath
 import json
@@ -54,7 +54,7 @@ def simulated_growth(run, period):
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", RIGS.values(), ids=RIGS)
 @pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
-def test_growth_is_that_of_a_long_simulated_contact(compensator, changes):
+def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, changes):
     mechanism = jaxhil.load("varying", SOFT | changes)
     found = growth(
         mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
@@ -65,7 +65,7 @@ def test_growth_is_that_of_a_long_simulated_contact(compensator, changes):
 
 
 @pytest.mark.slow
-def test_derivatives_by_gains_are_those_of_finite_differences():
+def test_map_derivatives_by_gains_are_finite_differences():
     mechanism = jaxhil.load("varying", {"uncertainty": {}})
     gains, scenarios = literature_gains(mechanism, "phase_lead"), build_scenarios(mechanism)
     slopes = growth(mechanism, "phase_lead", gains, scenarios).by_gain
@@ -79,7 +79,7 @@ def test_derivatives_by_gains_are_those_of_finite_differences():
         assert slopes[name] == pytest.approx(difference, rel=1e-5)
 
 
-def test_closed_forms():
+def test_growth_agrees_with_closed_forms():
     phases = np.array([0.02, 0.05, 0.2, 0.7])
     assert series(phases) == pytest.approx([delayed_restitution(phase) for phase in phases], abs=1e-6)
     assert np.isnan(series(np.array([-0.1, 1.5]))).all() and series(np.zeros(1)) == pytest.approx(1)
@@ -134,7 +134,7 @@ def growing(found, restitution):
     return np.exp(roots.real * frequency * 0.001)
 
 
-def test_margins_are_where_the_limit_is(ideal):
+def test_margins_end_at_the_stability_limit(ideal):
     found, _ = ideal
     nominal = found.document["nominal"]
     [stiffness, delay] = (nominal["margins"]["error"][axis] for axis in "xy")
@@ -146,7 +146,7 @@ def test_margins_are_where_the_limit_is(ideal):
     assert math.sqrt(stiffness["high"] / 350.0) * 0.004 == pytest.approx(phase, rel=1e-2)
 
 
-def test_axes_are_those_asked_for(ideal):
+def test_map_has_the_requested_axes(ideal):
     found, _ = ideal
     assert found.x[[0, -1]] == pytest.approx([5e4, 4e5]) and found.y[[0, -1]] == pytest.approx([5e-4, 8e-3])
     assert found.error.shape == (5, 5) and found.document["x"]["nominal"] == 124355.0
@@ -165,14 +165,14 @@ def test_axes_are_those_asked_for(ideal):
         (("contact.stiffness", "rig.simulator.time_constant"), "found no value"),
     ],
 )
-def test_refusals(jaxhil, tmp_path, axes, said):
+def test_map_refuses_unusable_arguments(jaxhil, tmp_path, axes, said):
     ended = jaxhil("map", "varying", "--x", axes[0], "--y", axes[1], "-o", str(tmp_path))
     assert ended.code == 2 and said in ended.err and ended.out == ""
 
 
 @pytest.mark.slow
-def test_limits_of_a_small_control_period():
-    """Contours of items 1 and 2, and the growth limit of item 5, are met to 1e-3 in the limit."""
+def test_map_reaches_theoretical_limits_at_small_control_periods():
+    """Compare the contours of items 1 and 2 and the growth limit of item 5, each to 1e-3."""
     axes = "contact.stiffness=5e4:2e5", "rig.force_sensor.delay=0.0005:0.008"
     for period, allowed in ((4e-4, 1e-3), (1e-4, 1e-4)):
         found = tuning.map(jaxhil.load("varying", IDEAL | {"rig.control_period": period}), *axes, points=12)
@@ -196,7 +196,7 @@ def test_limits_of_a_small_control_period():
 @pytest.mark.slow
 @pytest.mark.users_options
 @pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
-def test_time_of_a_map_of_100_by_100_points(compensator):
+def test_map_of_100_by_100_points_takes_at_most_20_s(compensator):
     axes = "contact.stiffness", "rig.force_sensor.delay=0.001:0.008"
     took = spent = 0.0
     for _ in range(2):
@@ -210,7 +210,7 @@ def test_time_of_a_map_of_100_by_100_points(compensator):
 
 @pytest.mark.slow
 @pytest.mark.users_options
-def test_on_a_cluster_it_is_the_same_to_the_bit(tmp_path):
+def test_map_on_a_cluster_is_the_same_to_the_bit(tmp_path):
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 60}
     here = tuning.map("varying", **asked)
     with started(tmp_path) as cluster:
@@ -219,7 +219,7 @@ def test_on_a_cluster_it_is_the_same_to_the_bit(tmp_path):
     assert there.document == here.document
 
 
-def test_an_interrupted_map_goes_on(tmp_path, monkeypatch):
+def test_interrupted_map_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(map_grid, "PART", 128)
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 8}
     whole = tuning.map("varying", **asked, folder=tmp_path / "whole")

@@ -1,4 +1,4 @@
-"""A mechanism's keys, one by one: what is read, what defaults, what is refused and in which words."""
+"""Keys of a mechanism, one by one: values, defaults, refusals and their messages."""
 
 import math
 
@@ -48,7 +48,7 @@ MAY_BE_INFINITE = [
 ]
 
 
-def test_full_table_is_read_value_by_value():
+def test_mechanism_table_is_read_value_by_value():
     mechanism = from_builtins(FULL, "f")
     for path in leaves():
         if path != "uncertainty":
@@ -63,7 +63,7 @@ def test_full_table_is_read_value_by_value():
     assert mechanism.uncertainty["rig.force_sensor.delay"].independent
 
 
-def test_defaults():
+def test_mechanism_keys_have_their_defaults():
     raw = {"schema": FULL["schema"], "name": "n", "bodies": {"equivalent_mass": 1}}
     raw |= {"approach": {"velocity": 1}, "contact": {"law": "linear", "stiffness": 5}}
     raw |= {"rig": {"control_period": 0.001, "simulator": {"model": "ideal"}}}
@@ -131,7 +131,7 @@ def test_misspelt_key_gets_a_hint():
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, -(10**400)])
-def test_numbers_are_finite_unless_the_key_allows(path, value):
+def test_numbers_must_be_finite_unless_the_key_allows(path, value):
     listed = [value, 1.0, 1.0] if isinstance((OF_OTHERS | dict(flat(FULL))).get(path), list) else value
     base = changed()
     if path in ("bodies.chaser_mass", "bodies.target_mass"):
@@ -152,7 +152,7 @@ def flat(node, path=""):
 
 
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) & set(leaves())))
-def test_zero_and_negative(path):
+def test_zero_and_negative_values_are_accepted_or_refused_by_key(path):
     nominal = dict(flat(FULL))[path]
     signed = ("contact_plane", "force_sensor.bias")
     may_be_negative = path.removeprefix("rig.") in signed
@@ -190,7 +190,7 @@ def test_zero_and_negative(path):
         ("schema", "jaxhil/mechanism/1", "jaxhil/mechanism/2"),
     ],
 )
-def test_edges_of_ranges(path, inside, outside):
+def test_edges_of_ranges_are_accepted_and_values_beyond_are_refused(path, inside, outside):
     assert isinstance(from_builtins(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
     assert f": {path}" in message and ", allowed " in message
@@ -205,13 +205,13 @@ def test_edges_of_ranges(path, inside, outside):
         ("bodies.equivalent_mass", 1e-100, 1e-320),
     ],
 )
-def test_edges_of_ranges_of_another_law(path, inside, outside):
+def test_edges_of_ranges_of_another_law_are_accepted_and_beyond_refused(path, inside, outside):
     base = changed({"contact.law": "hunt_crossley"})
     assert value_at(from_builtins(changed({path: inside}, base), "f"), path) in (inside, [inside])
     assert f": {path}" in refusal(changed({path: outside}, base))
 
 
-def test_depths_grow():
+def test_contact_depths_must_increase():
     assert from_builtins(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
     for wrong in ([0.001, 0.001], [0.0, 0.001], [0.001, -0.1]):
         assert ": contact.depths[" in refusal(changed({**LAYERED, "contact.depths": wrong}))
@@ -231,7 +231,7 @@ def test_numbers_that_overflow_or_vanish_in_products_are_refused(value):
     ),
     st.data(),
 )
-def test_any_value_anywhere_is_accepted_or_refused_in_one_line(value, data):
+def test_any_value_at_any_key_is_accepted_or_refused_in_one_line(value, data):
     path = data.draw(st.sampled_from([*leaves(), *(table[:-1] for table in tables() if table)]))
     raw = changed({path: value})
     try:
@@ -251,7 +251,7 @@ def test_shown_and_one_line_are_short_and_printable(text, limit):
     assert shown([text]).isprintable() and len(shown([text])) <= 60
 
 
-def test_shown_copes_with_values_that_have_no_text():
+def test_shown_handles_values_without_text():
     nested = []
     for _ in range(100_000):
         nested = [nested]

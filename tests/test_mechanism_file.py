@@ -1,4 +1,4 @@
-"""Reading mechanism files: built-ins, unreadable files, round trips, what each key means."""
+"""Mechanism files: built-ins, unreadable files, round trips and the meaning of each key."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ from jaxhil.mechanism.toml_table import MAX_BYTES
 TEXT = builtin_path("claw-350kg").read_text()
 
 
-def test_builtins_are_those_promised():
+def test_builtin_mechanisms_are_the_documented_ones():
     names = "claw-350kg layered rattling rig-300kg rod-100n-mm varying"
     assert builtin_names() == names.split()
     assert load() == load(DEFAULT) == load("varying")
@@ -41,7 +41,7 @@ SUITES = "damped dead-zone depth-damped elastoplastic fast friction hardening he
 SUITES += " mixed noise-free noisy plane preload rattling repeated"
 
 
-def test_suites_are_those_promised():
+def test_suites_are_the_documented_ones():
     assert suite_names() == [f"suite-{name}" for name in SUITES.split()]
     for name in suite_names():
         mechanism, _, label = load(name)
@@ -51,7 +51,7 @@ def test_suites_are_those_promised():
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_builtin(name):
+def test_builtin_mechanism_has_name_digest_and_source(name):
     mechanism, sha256, label = load(name)
     assert mechanism.name == label == name
     assert sha256 == hashlib.sha256(builtin_path(name).read_bytes()).hexdigest()
@@ -60,8 +60,7 @@ def test_builtin(name):
     assert mechanism.rig.force_sensor.noise_std == 0.0
 
 
-def test_builtin_numbers():
-    """The built-ins have the contact frequency and damping ratio that their comments state."""
+def test_builtins_have_frequency_and_damping_ratio_of_their_comments():
     for name, frequency, ratio in (
         ("rig-300kg", 3.0, 0.0),
         ("claw-350kg", 3.0, 0.03),
@@ -75,7 +74,7 @@ def test_builtin_numbers():
         assert mechanism.contact.damping[0] == pytest.approx(damping, rel=2e-4)
 
 
-def test_file_is_read_like_the_builtin(written):
+def test_mechanism_file_is_read_like_the_builtin(written):
     path = written(TEXT)
     loaded = load(path)
     assert loaded.mechanism == load(str(path)).mechanism == load("claw-350kg").mechanism
@@ -83,7 +82,7 @@ def test_file_is_read_like_the_builtin(written):
     assert load(written("\ufeff" + TEXT.replace("\n", "\r\n"))).mechanism == loaded.mechanism
 
 
-def test_a_path_is_never_a_builtin(tmp_path, monkeypatch):
+def test_path_is_never_taken_for_a_builtin(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "no such file" in file_refusal(Path("varying"))
 
@@ -109,13 +108,13 @@ def test_a_path_is_never_a_builtin(tmp_path, monkeypatch):
     ],
     ids=lambda value: repr(value[:12]),
 )
-def test_unusable_content(written, content, reason):
+def test_unusable_mechanism_file_content_is_refused(written, content, reason):
     path = written(content)
     message = file_refusal(path)
     assert message.startswith(f"{path}: ") and reason in message
 
 
-def test_long_texts_and_lists_are_no_long_keys(written):
+def test_long_texts_and_lists_are_not_taken_for_long_keys(written):
     lists = ", ".join(["0.5 "] * 1000)
     text = TEXT.replace("[395.8]", f"[{lists}]") + "# " + "a.b" * 500
     text = text.replace('name = "claw-350kg"', f'name = "{"a." * 50}"')
@@ -126,7 +125,7 @@ def test_long_texts_and_lists_are_no_long_keys(written):
         assert len(load(written(replaced)).mechanism.contact.damping) == 1000
 
 
-def test_unreadable_files(tmp_path):
+def test_unreadable_mechanism_files_are_refused(tmp_path):
     assert "found a directory" in file_refusal(tmp_path)
     assert "found a directory" in file_refusal("")
     assert "no such file" in file_refusal(tmp_path / "absent.toml")
@@ -139,7 +138,7 @@ def test_unreadable_files(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root reads every file")
-def test_file_without_permission(written):
+def test_mechanism_file_without_permission_is_refused(written):
     path = written(TEXT)
     path.chmod(0)
     assert "Permission denied" in file_refusal(path)
@@ -147,8 +146,8 @@ def test_file_without_permission(written):
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, len(TEXT) - 1))
-def test_truncated_file_is_refused_or_still_a_mechanism(written, cut):
-    """A file cut anywhere is refused in one line, or what is left of it is a whole mechanism."""
+def test_truncated_mechanism_file_is_refused_or_complete(written, cut):
+    """Cut the file anywhere: it is refused in one line, or the rest is a whole mechanism."""
     path = written(TEXT[:cut])
     try:
         mechanism = load(path).mechanism
@@ -160,7 +159,7 @@ def test_truncated_file_is_refused_or_still_a_mechanism(written, cut):
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(noise=st.binary(max_size=40), position=st.integers(0, len(TEXT)))
-def test_damaged_file_is_read_or_refused_in_one_line(written, noise, position):
+def test_damaged_mechanism_file_is_read_or_refused_in_one_line(written, noise, position):
     data = TEXT.encode()
     path = written(data[:position] + noise + data[position:])
     try:
@@ -170,7 +169,7 @@ def test_damaged_file_is_read_or_refused_in_one_line(written, noise, position):
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_round_trip_through_json(name):
+def test_mechanism_survives_round_trip_through_json(name):
     mechanism = load(name, ["rig.force_sensor.bias=-0.1", "approach.phase=0.1"]).mechanism
     text = json.dumps(to_builtins(mechanism), allow_nan=False)
     assert from_builtins(json.loads(text), "a gain file") == mechanism
@@ -182,13 +181,13 @@ def test_from_builtins_refuses_what_is_no_table():
         from_builtins([1], "a\nfile")  # pyright: ignore[reportArgumentType]
 
 
-def test_reading_needs_no_jax():
+def test_mechanism_file_is_read_without_jax():
     code = "import sys, jaxhil.mechanism.file, jaxhil.mechanism.uncertainty; sys.exit('jax' in sys.modules)"
     root = Path(__file__).parent.parent
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 
 
-def test_every_key_says_what_it_is_and_every_number_its_unit():
+def test_every_key_has_a_meaning_and_every_number_a_unit():
     def keys(kind, path=""):
         fields = kind.type.fields if isinstance(kind, Metadata) else kind.fields
         for field in fields:

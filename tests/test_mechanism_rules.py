@@ -1,4 +1,4 @@
-"""What a mechanism's keys must be together: laws, models, where a run starts, transfer functions."""
+"""Rules across a mechanism's keys: laws, models, the start of a run, transfer functions."""
 
 import math
 
@@ -31,7 +31,7 @@ ELASTOPLASTIC = {
 
 
 @pytest.mark.parametrize("contact", [HARDENING, DEPTH_DAMPED, ELASTOPLASTIC], ids=lambda c: c["contact.law"])
-def test_keys_of_one_law(contact):
+def test_contact_law_requires_its_key_and_checks_its_range(contact):
     name, key = contact["contact.law"], list(contact)[1]
     drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
     mechanism = from_builtins(changed({**contact, **drawn}), "f")
@@ -59,7 +59,7 @@ def test_keys_of_other_laws_and_models_are_refused(path):
     assert f': uncertainty."{path}": found ' in refusal(changed({"uncertainty": uncertain}))
 
 
-def test_what_the_law_does_not_use_may_be_at_its_default():
+def test_unused_keys_of_a_law_may_be_at_their_default():
     for law in (HARDENING, LAYERED):
         assert from_builtins(changed({**law, "contact.exponent": 1.5, "contact.tension": False}), "f")
         for key, value, only in (
@@ -104,7 +104,7 @@ def test_elastoplastic_contact_has_no_damping():
         (IDEAL, "rig.command_hold"),
     ],
 )
-def test_rules_across_keys(changes, key):
+def test_keys_that_contradict_each_other_are_refused(changes, key):
     assert f": {key}: found" in refusal(changed(changes))
 
 
@@ -121,7 +121,7 @@ def test_rules_across_keys(changes, key):
         {**IDEAL, "rig.command_hold": "linear"},
     ],
 )
-def test_other_laws_and_models(changes):
+def test_mechanism_with_other_law_or_model_survives_round_trip(changes):
     mechanism = from_builtins(changed(changes), "f")
     assert from_builtins(to_builtins(mechanism), "f") == mechanism
 
@@ -167,7 +167,7 @@ def test_velocity_limit_below_the_approach_speed_is_refused():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_the_start_is_free_of_the_contact_plane(side):
+def test_start_is_clear_of_the_contact_surface(side):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     plane = side * (0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)))
     changes = {"contact.clearance": 0.02}
@@ -196,7 +196,7 @@ def test_the_start_is_free_of_the_contact_plane(side):
         ([1.0, 1.0], np.poly(-np.ones(20)).tolist(), None),
     ],
 )
-def test_transfer_function(numerator, denominator, key):
+def test_transfer_function_is_accepted_or_refused_by_key(numerator, denominator, key):
     # One-sided: a gap would have to be wider than the lag of some of these.
     changes = {**TRANSFER_FUNCTION, "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}
@@ -214,7 +214,7 @@ def test_transfer_function(numerator, denominator, key):
     st.lists(st.complex_numbers(min_magnitude=0.01, max_magnitude=100.0), max_size=3),
     st.lists(st.floats(-100.0, 100.0), max_size=3),
 )
-def test_hurwitz_against_roots(pairs, reals):
+def test_hurwitz_criterion_agrees_with_roots(pairs, reals):
     roots = [*pairs, *np.conj(pairs), *reals]
     rightmost = max((root.real for root in map(complex, roots)), default=-1.0)
     polynomial = np.real(np.poly(roots)) if roots else np.ones(1)

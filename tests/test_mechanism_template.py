@@ -1,4 +1,4 @@
-"""A new mechanism file, the JSON Schema of such files, and the descriptions of keys that both are made of."""
+"""New mechanism files, their JSON Schema, and the key descriptions that both are made of."""
 
 import functools
 import re
@@ -42,15 +42,15 @@ CORRELATED = {
 
 
 @pytest.mark.parametrize("name", [*NAMES, "correlated"])
-def test_a_new_file_says_the_same(name, written):
+def test_new_mechanism_file_is_equivalent_to_its_source(name, written):
     mechanism = load("varying", CORRELATED).mechanism if name == "correlated" else load(name).mechanism
     text = commented(mechanism)
     assert load(written(text)).mechanism == mechanism
     assert max(map(len, text.splitlines())) <= 110 or max(map(len, mechanism.source.splitlines())) > 90
 
 
-def test_a_new_file_has_every_key_at_its_default(written):
-    """Without the sign of a comment, what it states as a default is the default."""
+def test_new_mechanism_file_has_every_key_at_its_default(written):
+    """Remove the comment signs: what a comment states as the default is the default."""
     text = commented(load("rig-300kg").mechanism)
     defaults = {
         f"{table.path}.{key.name}".lstrip("."): key.default for table in tables() for key in table.keys
@@ -73,13 +73,13 @@ def test_a_new_file_has_every_key_at_its_default(written):
     assert load(written(live)).mechanism == load("rig-300kg").mechanism
 
 
-def test_a_new_file_explains_itself():
+def test_new_mechanism_file_explains_itself():
     text = commented(load("varying").mechanism)
     assert re.search(r"^velocity = 0\.005 +# speed of the first approach: a number > 0 m/s$", text, re.M)
     assert re.search(r"^#tension = false +# whether kelvin_voigt may pull: true or false$", text, re.M)
 
 
-def test_every_key_is_described():
+def test_every_key_has_a_description():
     keys = {f"{table.path}.{key.name}": key for table in tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
     others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # whole ones, and of keys
@@ -104,13 +104,13 @@ class _Unitless(msgspec.Struct):
     ("kind", "reason"),
     [(_Silent, "drag: its type does not say what it means"), (_Unitless, "drag: .* the number's unit")],
 )
-def test_a_key_without_meaning_or_unit_is_refused(kind, reason):
+def test_key_without_meaning_or_unit_is_refused(kind, reason):
     with pytest.raises(ValueError, match=reason):
         tables(kind)
 
 
 @pytest.mark.parametrize("name", [*NAMES, *six_axis_names()])
-def test_the_schema_takes_what_is_built_in(validator, name):
+def test_schema_accepts_builtins(validator, name):
     validator.validate(tomllib.loads(builtin_path(name).read_text(encoding="utf-8")))
 
 
@@ -126,7 +126,7 @@ def test_the_schema_takes_what_is_built_in(validator, name):
         ("uncertainty", "contact.stiffness", {"distribution": "uniform", "factor": [0.5]}),
     ],
 )
-def test_the_schema_refuses_what_the_reader_refuses(validator, table, key, value):
+def test_schema_refuses_what_the_reader_refuses(validator, table, key, value):
     document = to_builtins(load("varying").mechanism)
     document[table][key] = value
     assert not validator.is_valid(document)
@@ -144,7 +144,7 @@ def test_the_schema_refuses_what_the_reader_refuses(validator, table, key, value
         (("rig", "velocity_limit"), 1.0),
     ],
 )
-def test_the_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, value):
+def test_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, value):
     document = to_builtins(load_any("probe-drogue").mechanism)
     assert validator.is_valid(document)
     *tables, key = path
@@ -152,7 +152,7 @@ def test_the_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path,
     assert not validator.is_valid(document)
 
 
-def test_the_schema_knows_units_and_numbers_for_lists(validator):
+def test_schema_accepts_units_and_numbers_for_lists(validator):
     document = to_builtins(load("varying").mechanism)
     document["contact"]["stiffness"] = 1e5
     validator.validate(document)

@@ -1,4 +1,4 @@
-"""The command's excess variation: sequences of commands with known swings, through a contact's begin and end.
+"""Excess variation of the command: sequences with known swings, through the onset and end of a contact.
 
 The mechanism touches, with a given command at every tick; what is recorded of it is compared with the sum
 over the sequence by hand. Runs of the loop are compared with the oracle in test_rollout.
@@ -78,22 +78,22 @@ HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
         (np.tile([50, -50], 10), 9 * 100),
     ],
 )
-def test_known_sequences(commands, expected):
+def test_excess_variation_of_known_sequences(commands, expected):
     assert recorded(commands) == pytest.approx(expected, abs=1e-11)
 
 
-def test_a_hand_made_sum():
+def test_excess_variation_is_the_sum_by_hand():
     commands = 60 * np.random.default_rng(0).normal(size=200)
     path = np.array([0, *commands, 0])
     assert recorded(commands) == pytest.approx(np.abs(np.diff(path)).sum() / 2 - np.ptp(path), rel=1e-13)
 
 
-def test_what_comes_after_the_contact_is_none_of_it():
+def test_excess_variation_ignores_commands_after_the_contact():
     assert recorded(HUMP, after=[70, -70, 70]) == pytest.approx(0, abs=1e-11)
 
 
-def test_a_command_that_is_left_at_the_end_goes_back_to_nothing():
-    """Half the undershoot is still there when patience ends."""
+def test_excess_variation_counts_return_of_the_last_command_to_zero():
+    """Leave half of the undershoot when the waiting time ends."""
     commands = np.concatenate([HUMP, np.full(120, -10.0)])
     touching = np.zeros(400, bool)
     touching[BEFORE : BEFORE + len(HUMP)] = True
@@ -101,7 +101,7 @@ def test_a_command_that_is_left_at_the_end_goes_back_to_nothing():
     assert float(excess(padded, touching)) == pytest.approx(0, abs=1e-11)
 
 
-def test_derivatives_are_those_of_the_sum():
+def test_excess_variation_derivatives_are_those_of_the_sum():
     generator = np.random.default_rng(1)
     touching = (np.arange(400) >= BEFORE) & (np.arange(400) < BEFORE + len(HUMP))
     commands, way = np.zeros((2, 400))
@@ -117,8 +117,8 @@ def test_derivatives_are_those_of_the_sum():
     assert np.isfinite(slope(np.where(touching, 60.0, 0.0)))
 
 
-def test_contacts_without_identification_swing_once():
-    """The undershoot of a phase lead belongs to its one swing."""
+def test_contacts_without_identification_have_one_swing():
+    """Count the undershoot of a phase lead as part of its one swing."""
     for compensator, gains in (("none", {}), ("phase_lead", nominal_gains(PARSED, "phase_lead"))):
         recorded = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)
         assert recorded["excess_variation"] == pytest.approx(0, abs=1e-11 * recorded["peak_command"][0])

@@ -1,4 +1,4 @@
-"""Missed alarms are counted on runs with a fault injected, scaled until the true error is just too large."""
+"""Missed alarms: counted on runs with an injected fault, scaled until the error is just too large."""
 
 import math
 
@@ -45,8 +45,8 @@ def fault(rates, name):
     return found
 
 
-def test_injected_delay_is_the_one_that_theory_asks_for(rates):
-    """e = exp(pi omega tau/2) of a force that is tau late, and the error is LIMIT to BAND times LIMIT."""
+def test_injected_delay_is_that_of_theory(rates):
+    """Use e = exp(pi omega tau/2) of a force delayed by tau; the error is LIMIT to BAND times LIMIT."""
     mechanism = load("claw-350kg", EXACT).mechanism
     omega = math.sqrt(mechanism.contact.stiffness[0] / mechanism.bodies.mass)
     for name in ("force_delay", "simulator_delay"):
@@ -57,7 +57,7 @@ def test_injected_delay_is_the_one_that_theory_asks_for(rates):
         assert one["size"] == pytest.approx(2 / (math.pi * omega) * math.log1p(one["error"]), rel=0.05)
 
 
-def test_fault_that_changes_nothing_is_not_counted(rates):
+def test_fault_without_effect_is_not_counted(rates):
     # Without a compensator nobody reads the position; there are no gains to take away.
     one = fault(rates, "position_delay")
     assert one["runs"] == 0 and not one["counted"] and one["size"] is None
@@ -84,7 +84,7 @@ def test_watchdog_without_a_margin_misses_every_fault():
     assert any(text.startswith("missed alarms with the force measured later") for text in blind["reasons"])
 
 
-def test_gains_are_a_fault_of_laws_that_can_do_without(rates):
+def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
     found = calibrated("phase_lead")
     # Nothing is late here: the literature's lead is 0 already, and there is nothing to take away.
     assert [one["name"] for one in found["fault_runs"]] == [one.name for one in FAULTS if one.name != "gains"]
@@ -124,7 +124,7 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
     assert missed["verdict"] == "bad"
 
 
-def test_number_of_scenarios_follows_from_what_is_allowed():
+def test_number_of_scenarios_follows_from_the_allowed_rate():
     assert scenarios_needed(0.02) == 2 * 183
     assert scenarios_needed(0.5) == 64 == scenarios_needed(1.0) and scenarios_needed(
         1e-6

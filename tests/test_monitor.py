@@ -1,4 +1,4 @@
-"""Contacts of an independent rig against a mechanism file: exact without noise, calibrated with it."""
+"""Monitor: contacts of an independent rig against a mechanism file, exact without noise, else calibrated."""
 
 from dataclasses import replace
 
@@ -62,8 +62,8 @@ RARER = ("clean", "third_order", "resonance", "hertz", "layered")
 
 
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
-def test_without_noise_all_is_0(name):
-    """Laws, lags, latencies and holds of the file's rig are those of the independent one."""
+def test_monitor_finds_no_deviation_without_noise(name):
+    """Use a file whose laws, lags, latencies and holds are those of the independent rig."""
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
     found = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
@@ -76,7 +76,7 @@ def test_without_noise_all_is_0(name):
     assert np.all(np.abs(np.nan_to_num(value)) < bound)
 
 
-def test_a_rig_that_is_the_file_s_scatters_as_predicted():
+def test_monitor_of_a_matching_rig_scatters_as_predicted():
     found = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
     assert found.state == "good" and found.alarm is None and found.changes == ()
     z = np.array([one.z for one in found.contacts])
@@ -98,7 +98,7 @@ DAILY = ("delay", "noise")
 @pytest.mark.parametrize(
     "what", [pytest.param(one, marks=() if one in DAILY else pytest.mark.slow) for one in CHANGES]
 )
-def test_a_change_is_found_and_named(what):
+def test_monitor_finds_and_names_a_change(what):
     other, name, value, within = CHANGES[what]
     before, after = contacts(CLEAN, seed=1, speeds=SPEEDS[:3]), contacts(other, seed=2, speeds=SPEEDS[:3])
     found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
@@ -112,8 +112,8 @@ def test_a_change_is_found_and_named(what):
     assert f"since contact 4 of 6 (touch_0.csv): {found.changes[0].name}" in found.verdict
 
 
-def test_what_the_file_covers_is_to_be_watched():
-    """A change within a wide range, after contacts that told where in the range the rig is."""
+def test_monitor_state_is_watch_if_the_file_covers_the_change():
+    """Change a value within a wide range after contacts that showed where in the range the rig is."""
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
     after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
@@ -121,7 +121,7 @@ def test_what_the_file_covers_is_to_be_watched():
     assert found.state == "watch" and found.since == 6 and "covers it" in found.verdict
 
 
-def test_numbers_hang_together_as_the_file_says():
+def test_monitor_correlates_numbers_as_the_file_says():
     wide = STATED | {
         "contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0], "independent": True}
     }
@@ -156,7 +156,7 @@ def written(folder, campaign):
     return sorted(folder.glob("*.csv"))
 
 
-def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
+def test_monitor_command_prints_a_verdict_and_returns_its_exit_code(jaxhil, tmp_path):
     known = tmp_path / "known.toml"
     known.write_text(to_toml(to_builtins(file_of(CLEAN))))
     logs = written(tmp_path / "same", contacts(CLEAN, seed=3, speeds=SPEEDS[:3]))
@@ -180,7 +180,7 @@ def test_the_command_prints_a_verdict_and_ends_with_it(jaxhil, tmp_path):
     (["FAR", "LOG"], "rig.contact_plane: found 0.05 m, which none of the contacts in the logs goes beyond"),
     (["OTHER", "LOG"], "contact.law: found 'elastoplastic', expected linear, kelvin_voigt"),
 ))  # fmt: skip
-def test_what_cannot_be_held_against_is_one_line(jaxhil, tmp_path, arguments, words):
+def test_monitor_refuses_unusable_input_in_one_line(jaxhil, tmp_path, arguments, words):
     campaign = contacts(CLEAN, speeds=SPEEDS[:1])
     mapping = tmp_path / "map.toml"
     channels = (

@@ -1,4 +1,4 @@
-"""How often the monitor is wrong and how soon it is right, on files that were identified from other contacts.
+"""Error rates and detection times of the monitor, on files identified from other contacts.
 
 All of it is slow; `test_monitor.py` has a sample for every day. Print the figures with
 `pytest -m slow -s tests/test_monitor_campaigns.py`.
@@ -48,7 +48,7 @@ def delayed(seed, speeds, growth):
     return replace(contacts("clean", seed, SPEEDS), runs=tuple(runs))
 
 
-def test_a_rig_that_does_not_change_raises_no_alarm_in_500_contacts(files):
+def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
     z, alarms, number = [], 0, 0
     for seed, mechanism in enumerate(files):
         speeds = np.random.default_rng(seed).choice(SPEEDS, 250)
@@ -63,8 +63,8 @@ def test_a_rig_that_does_not_change_raises_no_alarm_in_500_contacts(files):
 
 
 @pytest.mark.parametrize("number", (15, 60))
-def test_drifts_are_found_early(files, number):
-    """Over so many contacts the stiffness grows by 15 %, or the force delay by 0.6 ms."""
+def test_monitor_finds_drifts_early(files, number):
+    """Let the stiffness grow by 15 %, or the force delay by 0.6 ms, over so many contacts."""
     found = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):
         speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)

@@ -1,4 +1,4 @@
-"""Charts: the change point by hand, and how often and how soon they raise an alarm."""
+"""Control charts of the monitor: the change point by hand, false alarms and detection times."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from tuning.identification.monitor.figures import NAMES
 CUSUM_LIMIT, AVERAGE_LIMIT = 9.0, 4.07  # with 0.5 allowed and weight 0.2: together as rare as `LIMIT`
 
 
-def test_a_change_by_hand():
+def test_change_point_agrees_with_calculation_by_hand():
     z = np.array([[0.0, 1.0], [0.0, np.nan], [2.0, 1.0], [2.0, np.nan]])
     likelier, since = changes(z)
     # (2 + 2)^2 / 2 and (1 + 1)^2 / 2, which not knowing changes nothing of.
@@ -44,8 +44,8 @@ def alarms(mean, lanes, contacts, rng):
     return first
 
 
-def test_one_alarm_is_that_of_the_charts():
-    """The ratios that are counted here are those of `changes`."""
+def test_first_alarm_is_that_of_the_charts():
+    """Compare the ratios that are counted here with those of `changes`."""
     z = np.random.default_rng(2).standard_normal((40, 3)) + np.array([0.0, 1.5, -4.0])
     for figure in range(3):
         first = next((i for i in range(40) if changes(z[: i + 1])[0][figure] > LIMIT), 40)
@@ -62,7 +62,7 @@ class Silent:
 
 
 @pytest.mark.slow
-def test_false_alarms_are_as_rare_as_stated_and_jumps_found_sooner_than_by_other_charts():
+def test_charts_have_stated_false_alarm_rate_and_find_jumps_before_others():
     rng, contacts = np.random.default_rng(0), 4000
     first = alarms(lambda i: 0.0, 1500, contacts, rng)
     watched, raised = first.sum(axis=1), (first < contacts).sum(axis=1)

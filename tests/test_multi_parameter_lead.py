@@ -1,4 +1,4 @@
-"""Pole placement against the characteristic equation, and the law in the loop against its pole."""
+"""Multi-parameter lead: pole placement against the characteristic equation, and the law in the loop."""
 
 import itertools
 from math import log, pi
@@ -26,7 +26,7 @@ PHASES = (np.arange(8) + 0.5) / 8
 @pytest.mark.parametrize(
     ("frequency", "delay", "restitution"), list(itertools.product(FREQUENCIES, DELAYS, [0.1, 0.7, 1.0, 1.2]))
 )
-def test_the_root_is_where_it_was_to_be(frequency, delay, restitution):
+def test_placed_pole_is_a_root_of_the_characteristic_equation(frequency, delay, restitution):
     gain, rate = pole_placement(frequency, delay, restitution)
     ratio = -log(restitution) / np.sqrt(pi**2 + log(restitution) ** 2)
     root = frequency * (-ratio + 1j * np.sqrt(1 - ratio**2))
@@ -40,14 +40,14 @@ def test_the_root_is_where_it_was_to_be(frequency, delay, restitution):
 
 
 @pytest.mark.parametrize(("frequency", "delay"), list(itertools.product(FREQUENCIES, DELAYS)))
-def test_the_undamped_closed_form(frequency, delay):
+def test_pole_placement_without_damping_is_the_closed_form(frequency, delay):
     angle = frequency * delay
     expected = np.cos(angle), np.sin(angle) / frequency
     assert pole_placement(frequency, delay, 1.0) == pytest.approx(expected, rel=0, abs=1e-12)
 
 
 @pytest.mark.parametrize("bad", [(0.0, 0.01, 1.0), (1.0, np.inf, 1.0), (1.0, 0.01, 0.0), (1.0, 0.01, np.nan)])
-def test_what_no_pole_can_be_placed_for_is_refused(bad):
+def test_pole_placement_refuses_what_has_no_pole(bad):
     with pytest.raises(InputError, match=r"^pole_placement: \w+: found .*, allowed finite numbers > "):
         pole_placement(*bad)
 
@@ -61,13 +61,13 @@ def placed(phases):
     return {"force_gain": gain, "force_rate_gain": rate}, phase
 
 
-def test_the_loop_has_the_pole_placed():
+def test_loop_has_the_placed_pole():
     gains, phase = placed([0.1, 0.3])
     found = without_period("multi_parameter_lead", 1.6, gains, force_sensor__delay=phase / OMEGA)
     np.testing.assert_allclose(np.exp(found), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
 
 
-def test_a_contact_comes_back_as_desired():
+def test_contact_has_the_desired_restitution():
     phases, periods = np.array([0.05, 0.1, 0.2, 0.4]), np.array([5e-4, 2.5e-4])
     gains, phase = placed(phases)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=periods[1]))
@@ -85,7 +85,7 @@ def test_a_contact_comes_back_as_desired():
     assert np.all(error < 0.01 * (np.exp(pi * phases / 2) - 1)[:, None])
 
 
-def test_nominal_is_within_bounds_for_long_delays_too():
+def test_nominal_gains_are_within_bounds_for_long_delays_too():
     delays = np.linspace(0.0, 0.5, 11)
     overrides = [[f"rig.force_sensor.delay={delay}"] for delay in delays]
     overrides += [["rig.command_hold=zoh", "rig.simulator.model=ideal", "rig.force_sensor.delay=0.0"]]
@@ -102,7 +102,7 @@ def test_nominal_is_within_bounds_for_long_delays_too():
     assert len(signs) == 4
 
 
-def test_amplification_of_noise():
+def test_noise_amplification_of_multi_parameter_lead():
     check_amplification(
         "multi_parameter_lead",
         [
@@ -113,7 +113,7 @@ def test_amplification_of_noise():
     )
 
 
-def test_phase_lead_is_one_of_them():
+def test_phase_lead_is_a_special_case_of_multi_parameter_lead():
     constants = Constants(jnp.asarray(1e-3), jnp.asarray(jnp.inf))
     ours = {"force_gain": 1.0, "force_rate_gain": 0.008, "lead_filter": 0.0013}
     theirs = {"phase_lead": 0.008, "lead_filter": 0.0013}

@@ -1,4 +1,4 @@
-"""The best gains of many tasks: scans, batches of starts until several agree, the polish of the best."""
+"""Best gains of many tasks: scans, batches of starts until several agree, polishing of the best."""
 
 import dataclasses
 
@@ -38,8 +38,8 @@ def value(validation, index, start, objective=RMS):
 
 
 @pytest.mark.slow
-def test_every_task_is_found_under_its_own_objective(tasks, validation):
-    """Starts and ends of tasks together are those that each has alone under its objective."""
+def test_every_task_is_solved_under_its_own_objective(tasks, validation):
+    """Compare the starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
     chosen = choose_starts(validation, 3, 0, several)
     polished = finish(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
@@ -65,7 +65,7 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_scan_tries_poor_points_on_a_part_and_chooses_as_if_on_all_scenarios(seed, monkeypatch):
+def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
     runs = []
     work = Work()
     monkeypatch.setattr(work, "ran", runs.append)
@@ -79,8 +79,8 @@ def test_a_scan_tries_poor_points_on_a_part_and_chooses_as_if_on_all_scenarios(s
 
 
 @pytest.mark.slow
-def test_the_best_start_is_polished(tasks, validation):
-    """Stopped far too early, none is at its minimum yet; where all starts failed there is none to polish."""
+def test_best_start_is_polished(tasks, validation):
+    """Stop the solver far too early, so that none is at its minimum; if all fail, none is polished."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
     polished = finish(validation, early, 128, seed=0)
@@ -98,7 +98,7 @@ def test_the_best_start_is_polished(tasks, validation):
 
 
 def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
-    """One task's starts never agree, whatever they end at; the others' do at once."""
+    """Let one task's starts never agree, whatever they end at, and the others' at once."""
     asked = []
 
     def solve(tasks, starts, steps, objective, work):
@@ -130,7 +130,7 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
     assert found[1].evaluations == BATCHES * (FEW + 3 * 3) + 32
 
 
-def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
+def test_single_start_is_the_literature_and_is_polished(tasks, validation):
     found = find_gains(validation, searched(1, 2, 32))
     for index, one in enumerate(found):
         (start,) = one.starts
@@ -140,7 +140,7 @@ def test_a_start_alone_is_the_literature_s_and_polished(tasks, validation):
 
 
 def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
-    """Once, before the first round."""
+    """Expect it once, before the first round."""
     done = []
     monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
     monkeypatch.setattr(multistart, "prepare_solver", lambda *_: None)
@@ -150,8 +150,8 @@ def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
-    """The solver lowers a norm in place of the mean of the worst contacts; what counts is that mean."""
+def test_best_start_is_the_best_by_the_objective_itself(tasks, validation):
+    """Let the solver lower a norm in place of the mean of the worst contacts; that mean counts."""
     objective = Objective("cvar")
     for index, one in enumerate(find_gains(validation, searched(3, 4, 16, objective))):
         assert one.best is not None
@@ -161,7 +161,7 @@ def test_the_best_is_the_best_by_the_objective_itself(tasks, validation):
         assert one.best.rms <= min(values)
 
 
-def test_a_task_that_fails_leaves_the_others_their_best(tasks, validation):
+def test_failed_task_leaves_the_others_their_best_gains(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = build_validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken), tasks[2]], 15, 0)
     found, healthy = (find_gains(one, searched(3, 2, 16)) for one in (sick, validation))
@@ -182,7 +182,7 @@ class Kinked:
         return {"x": float(coordinates[0]), "y": float(coordinates[1])}
 
 
-def test_a_start_that_is_stuck_is_searched_on_and_the_others_are_left():
+def test_stuck_start_is_searched_further_and_the_others_are_left():
     corner, best = np.array([0.3, 0.3]), np.array([0.8, 0.8])
     starts = [
         Start("converged", 3, 1.0, [1.0], {"x": 0.8, "y": 0.8}, best),

@@ -1,4 +1,4 @@
-"""How much louder than the sensor's noise a law's force is: of its filter, and of a loop in contact."""
+"""Noise amplification: of a law's filter, and of a loop in contact."""
 
 from functools import partial
 
@@ -34,7 +34,7 @@ def amplified(compensator, gains, period=1e-3):
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_amplification_is_that_of_the_filter(compensator):
+def test_noise_amplification_is_that_of_the_filter(compensator):
     for gains in GAINS:
         values = dict(zip(NAMES, gains, strict=True))
         ours, slopes = amplified(compensator, values)
@@ -48,7 +48,7 @@ def test_amplification_is_that_of_the_filter(compensator):
             np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-7)
 
 
-def test_no_compensation_and_no_lead_pass_the_noise_on():
+def test_no_compensation_and_no_lead_pass_the_noise_unchanged():
     assert amplified("none", {})[0] == 1
     no_lead = {"phase_lead": 0, "lead_filter": 0.003}
     np.testing.assert_allclose(amplified("phase_lead", no_lead)[0], 1, rtol=1e-14)
@@ -79,7 +79,7 @@ def steady_contact(**values):
     return gains, command - np.polynomial.polynomial.polyval(time, line).T
 
 
-def test_amplification_is_that_of_the_loop_in_steady_contact():
+def test_noise_amplification_is_that_of_the_loop_in_steady_contact():
     gains, whole = steady_contact()
     _, lead = steady_contact(**LEAD_ALONE)
     expected = amplified("response_error", gains)[0]
@@ -91,9 +91,11 @@ def test_amplification_is_that_of_the_loop_in_steady_contact():
     assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
 
 
-def test_a_young_contact_is_noisier_by_what_is_identified():
-    """The more, the larger the initial covariance, and in the first tenth of a contact alone: a force above
-    the contact threshold is hardly ever noise."""
+def test_noise_amplification_rises_early_in_contact_by_identification():
+    """Expect more for a larger initial covariance, and in the first tenth of a contact only.
+
+    A force above the contact threshold is hardly ever noise.
+    """
 
     def noise(**values):
         gains, command, force = noisy_contact(0.005, 300.0, lanes=128, ticks=400, **values)

@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom on a copy, and is committed as it ran: clean, with its outputs.
+"""Notebooks: each runs from top to bottom on a copy, and is committed clean, with its outputs.
 
 They run with `-m slow`, as `.ci/run` does; what is committed is checked every day.
 """
@@ -28,14 +28,14 @@ def path(request):
     return request.param
 
 
-def test_there_are_notebooks():
+def test_notebooks_exist():
     assert NOTEBOOKS
 
 
 # Event loop and messaging of the notebook client are not ours to warn about.
 @pytest.mark.filterwarnings("default")
 @pytest.mark.slow
-def test_every_cell_runs(path, tmp_path, monkeypatch):
+def test_notebook_runs_every_cell(path, tmp_path, monkeypatch):
     copy = Path(shutil.copy(path, tmp_path))
     inherited = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *([inherited] if inherited else [])]))
@@ -71,7 +71,7 @@ def _printed(cell) -> tuple[list[str], list[float]]:
     return NUMBER.sub("#", text).split(), [float(number) for number in NUMBER.findall(text)]
 
 
-def test_committed_outputs_are_those_of_one_run(path):
+def test_committed_notebook_outputs_are_those_of_one_run(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -80,7 +80,7 @@ def test_committed_outputs_are_those_of_one_run(path):
     assert "display_data" in kinds and "error" not in kinds
 
 
-def test_only_the_front_door_is_imported(path):
+def test_notebook_imports_only_the_public_interface(path):
     notebook = nbformat.read(path, as_version=4)
     code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
     assert len(code[0].splitlines()) <= 8
@@ -89,7 +89,7 @@ def test_only_the_front_door_is_imported(path):
     assert {module for module in later if module.startswith(("jaxhil.", "tuning."))} <= ALSO_PUBLIC
 
 
-def test_committed_file_is_small_and_names_no_machine(path):
+def test_committed_notebook_is_small_and_names_no_machine(path):
     text = path.read_text(encoding="utf-8")
     assert len(text) < LARGEST
     notebook = nbformat.reads(text, as_version=4)

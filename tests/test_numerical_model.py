@@ -1,4 +1,4 @@
-"""The numerical model in six degrees of freedom: closed forms of free tops, momentum, and the relative mass.
+"""Numerical model in six degrees of freedom: closed forms of free tops, momentum, relative mass.
 
 One program follows two bodies under given wrenches; its lanes are the cases.
 """
@@ -137,7 +137,7 @@ def at_the_same_time(series):
     return np.stack([series[250 * 2**lane, :, lane] for lane in range(3)], axis=-1)
 
 
-def test_free_top_is_jacobis_and_of_second_order(run):
+def test_free_top_follows_jacobis_solution_to_second_order(run):
     found = AXES.inv().apply(at_the_same_time(run["angular"][0]).T).T
     (one, two, three), (first, _, third) = MOMENTS, FREE
     second = third * np.sqrt(three * (one - three) / (two * (one - two)))
@@ -153,8 +153,8 @@ def test_free_top_is_jacobis_and_of_second_order(run):
     assert np.max(np.abs(energy / energy[0] - 1)) < 1e-6
 
 
-def test_attitude_of_an_axisymmetric_top(run):
-    """It turns about its spin momentum at |pi|/J_1, and about its own axis at (1 - J_3/J_1) w_3."""
+def test_axisymmetric_top_has_closed_form_attitude(run):
+    """Expect it to turn about its spin momentum at |pi|/J_1, and about its own axis at (1 - J_3/J_1) w_3."""
     first = Rotation.from_quat(run["attitude"][0].T)
     time = 250 * PERIOD
     spin = first.apply(SYMMETRIC * SPUN)
@@ -180,8 +180,8 @@ def test_momentum_is_conserved_under_any_wrench(run):
 
 
 @pytest.mark.slow
-def test_along_and_about_one_axis_the_integrators_are_those_of_the_line():
-    """A force along a principal axis and a torque about it, under each of the three."""
+def test_six_axis_integrators_agree_with_one_axis_along_and_about_an_axis():
+    """Apply a force along a principal axis and a torque about it, under each of the three."""
     pushes = SEEDED.normal(size=40) * 20
 
     @jax.jit
@@ -224,8 +224,8 @@ def push_from_rest(pair, states, wrench, point, normal):
 
 
 @pytest.mark.slow
-def test_a_wrench_accelerates_the_relative_mass():
-    """From rest, in a very short period; in half of the lanes, by a force along a normal."""
+def test_wrench_accelerates_the_relative_mass():
+    """Start from rest, in a very short period; in half of the lanes, push along a normal."""
     pair, states = begin()
     states = States(*(state._replace(velocity=0 * state.velocity, spin=0 * state.spin) for state in states))
     wrench, point, normal = (SEEDED.normal(size=(size, LANES)) for size in (6, 3, 3))

@@ -1,4 +1,4 @@
-"""Objectives: their residuals against a plain recomputation, derivatives, failures; noise from the gains."""
+"""Objectives: residuals against a plain recomputation, derivatives, failures; noise from the gains."""
 
 from dataclasses import replace
 from functools import partial
@@ -124,7 +124,7 @@ def test_residuals_are_those_of_an_evaluation(outcomes, known):
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
-def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
+def test_sum_of_squares_is_the_objective_or_just_above(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = contact_terms(outcome)
@@ -139,15 +139,15 @@ def test_the_sum_of_squares_is_the_stated_value_or_just_above(outcomes, name):
             assert value < ours < 1.5 * value
 
 
-def test_every_problem_has_weights_of_its_own(batch):
-    """In one program each has the residuals that it has where all are weighed alike."""
+def test_every_problem_has_its_own_weights(batch):
+    """Compare each with its residuals in a program where all have the same weights."""
     several = [STATED, replace(STATED, noise_weight=0.02, limit=0.7), Objective("rms", 5.0, 10.0, 0.1, 1.0)]
     together = run(batch, objective=several)[0]
     for i, objective in enumerate(several):
         np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
 
 
-def test_a_part_of_weight_0_is_no_part():
+def test_objective_part_of_weight_0_is_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
@@ -157,8 +157,8 @@ def test_a_part_of_weight_0_is_no_part():
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
 
-def test_weights_are_multiples_of_the_limit():
-    """A weight w of a figure X costs the error at most sqrt(J_0^2 - figure_0^2) = w limit X_0."""
+def test_objective_weights_are_multiples_of_the_limit():
+    """Check that a weight w of a metric X costs the error at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
     errors, excesses, swings = np.array([0.01, -0.02]), np.array([0.3, 0.5]), np.array([0.7, 0.1])
     for limit in (0.003, 0.01, 0.2):
         for name, value in (("command", excesses), ("chatter", swings), ("noise", np.array([2.5]))):
@@ -177,7 +177,7 @@ def test_weights_are_multiples_of_the_limit():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.004, 0.02, 1.0])
-def test_errors_within_the_tolerance_count_next_to_nothing(tolerance):
+def test_errors_within_the_tolerance_hardly_count(tolerance):
     errors, excesses = np.random.default_rng(3).normal(scale=0.01, size=45), np.full(45, 0.4)
     objective = Objective("rms", 2.0, 0.2, 0.1, tolerance=tolerance)
     size = objective_value(Objective("rms", 2.0), errors)
@@ -192,7 +192,7 @@ def test_errors_within_the_tolerance_count_next_to_nothing(tolerance):
     assert SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
 
 
-def test_a_tolerance_of_0_is_no_other_objective_in_the_program_of_any():
+def test_tolerance_of_0_gives_the_same_objective_in_a_shared_program():
     terms = common_terms([Objective(tolerance=0.0)])
     assert terms == common_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
     assert terms == Terms("rms", True, True, False, tolerance=True)
@@ -203,7 +203,7 @@ def test_a_tolerance_of_0_is_no_other_objective_in_the_program_of_any():
     assert not values[len(plain) :].any()
 
 
-def test_terms_are_those_of_any():
+def test_common_terms_are_those_that_any_objective_has():
     assert common_terms([Objective(), Objective(noise_weight=0.1)]) == Terms("rms", False, True, False, False)
     assert common_terms([Objective("cvar", 2.0, 0.1)]) == Terms("cvar", True, False, False, False)
     assert common_terms([Objective(chatter_weight=0.1), Objective()]) == Terms(
@@ -228,15 +228,17 @@ def against_differences(batch, jacobian):
     return own
 
 
-def test_derivatives_are_central_differences(batch, known):
+def test_objective_derivatives_are_central_differences(batch, known):
     own = against_differences(batch, known[1])
     parts = *np.split(own[..., :-1], 3, axis=-1), own[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
 
 
 def test_sensor_noise_is_the_same_for_all_gains(known):
-    """The same noise at every call, and gains that change a little change the residuals a little: that is
-    what derivatives are for."""
+    """Use the same noise at every call.
+
+    If gains change a little, the residuals change a little: derivatives need that.
+    """
     noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
     value, jacobian = run(noisy)
     assert np.all(np.max(np.abs(value - known[0]), axis=1) > 0.3)
@@ -244,7 +246,7 @@ def test_sensor_noise_is_the_same_for_all_gains(known):
     against_differences(noisy, jacobian)
 
 
-def test_problems_do_not_mix(batch, known):
+def test_problems_of_one_program_do_not_mix(batch, known):
     value, jacobian = known
     for mine in range(len(GAINS)):
         others = np.arange(len(GAINS)) != mine
@@ -309,7 +311,7 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
     assert expected <= bound
 
 
-def test_known_errors_have_known_figures():
+def test_known_errors_have_known_metrics():
     errors = np.array([0.03, -0.04, *[0.0] * 18])
     assert objective_value(Objective("rms"), errors) == pytest.approx(0.05 / np.sqrt(20), rel=1e-14)
     assert objective_value(Objective("cvar"), errors) == objective_value(Objective("worst"), errors) == 0.04
@@ -330,7 +332,7 @@ def test_known_errors_have_known_figures():
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
 
 
-def test_a_high_norm_stands_for_the_worst():
+def test_high_norm_approximates_the_worst_error():
     errors = np.random.default_rng(0).normal(size=96)
     norm = np.sum(np.abs(errors) ** POWERS["worst"]) ** (1 / POWERS["worst"])
     assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
@@ -342,7 +344,7 @@ def test_a_high_norm_stands_for_the_worst():
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
-def test_derivatives_by_the_errors(name):
+def test_objective_derivatives_by_the_errors(name):
     objective, generator = Objective(name, 3.0, 0.2, 0.01, 0.03), np.random.default_rng(1)
     errors, excesses = generator.normal(size=45), np.maximum(0, generator.normal(size=45))
     terms = errors, excesses, 2.0, generator.uniform(0, 3, 45)
@@ -359,7 +361,7 @@ def test_derivatives_by_the_errors(name):
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)
-def test_no_error_at_all_has_a_finite_derivative(name):
+def test_objective_without_any_error_has_a_finite_derivative(name):
     objective = Objective(name, 3.0, 0.2, 0.01, 0.03)
     for largest in (0.0, 0.1):
         errors = np.where(np.arange(30) == 7, largest, 0)
@@ -379,7 +381,7 @@ def test_no_error_at_all_has_a_finite_derivative(name):
         ({"command_weight": np.inf}, "objective: command_weight: found inf, allowed finite numbers >= 0"),
     ],
 )
-def test_an_objective_that_is_none_is_refused(values, message):
+def test_unknown_objective_is_refused(values, message):
     with pytest.raises(InputError) as refused:
         Objective(**values)
     assert str(refused.value) == message

@@ -1,4 +1,4 @@
-"""`--set` and `--unset`: values of a mechanism file changed on the command line, and what is refused."""
+"""`--set` and `--unset`: changes of a mechanism file's values on the command line, and refusals."""
 
 import math
 
@@ -34,7 +34,7 @@ TEXT = builtin_path("claw-350kg").read_text()
         ("uncertainty={}", "uncertainty", {}),
     ],
 )
-def test_override(override, path, value):
+def test_override_sets_the_value(override, path, value):
     node = to_builtins(load("varying", [override]).mechanism)
     for part in path.split(".")[:-1]:
         node = node[part]
@@ -64,7 +64,7 @@ def test_overrides_apply_in_order_and_leave_the_digest():
     assert loaded.sha256 == load("varying").sha256
 
 
-def test_override_of_a_bare_number_in_the_file(written):
+def test_override_replaces_a_bare_number_in_the_file(written):
     path = written(TEXT.replace("[124355.0]", "124355"))
     assert load(path, ["contact.stiffness[0]=5"]).mechanism.contact.stiffness == [5.0]
 
@@ -72,7 +72,7 @@ def test_override_of_a_bare_number_in_the_file(written):
 SECOND_ORDER = ["rig.simulator.natural_frequency", "rig.simulator.damping_ratio"]
 
 
-def test_another_model_takes_its_keys_and_no_others():
+def test_override_of_a_model_accepts_its_keys_and_no_others():
     first_order = ["rig.simulator.model=first_order", "rig.simulator.time_constant=0.01"]
     message = file_refusal("varying", first_order)
     assert message.startswith(f"varying: --set {' '.join(first_order)}: rig.simulator.")
@@ -88,7 +88,7 @@ def test_another_model_takes_its_keys_and_no_others():
     assert ideal == load("varying", changes).mechanism == jaxhil.load("varying", changes)
 
 
-def test_unset_takes_out_keys_tables_and_uncertainty():
+def test_unset_removes_keys_tables_and_uncertainty():
     mechanism = load("varying", (), ["contact.damping", "rig.force_sensor", "approach.contacts"]).mechanism
     assert mechanism.contact.damping == [0.0] and mechanism.rig.force_sensor.delay == 0.0
     assert mechanism.approach.contacts == 1 and "rig.force_sensor.delay" not in mechanism.uncertainty
@@ -122,7 +122,7 @@ def test_unusable_unset_is_named(path, reason):
     assert message.startswith("varying: --unset ") and reason in message
 
 
-def test_what_is_uncertain_has_a_value():
+def test_uncertain_key_requires_a_value():
     message = file_refusal(
         "varying", ["uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}"]
     )
@@ -165,13 +165,13 @@ def test_unusable_override_is_named(override, reason):
     assert message.startswith("varying: --set ") and reason in message
 
 
-def test_override_below_a_value_that_is_no_table(written):
+def test_override_below_a_value_that_is_no_table_is_refused(written):
     path = written("rig = 5")
     message = file_refusal(path, ["rig.simulator.model=ideal"])
     assert "--set rig.simulator.model=ideal: rig: found 5, allowed a table" in message
 
 
-def test_fault_of_the_file_is_not_put_on_an_override(written):
+def test_fault_of_the_file_is_not_attributed_to_an_override(written):
     path = written(TEXT.replace("velocity = 0.005", "velocity = -1"))
     assert file_refusal(path, ["name=x"]).startswith(f"{path}: approach.velocity: found -1")
     assert load(path, ["approach.velocity=1"]).mechanism.approach.velocity == 1.0
@@ -188,7 +188,7 @@ def test_any_override_is_applied_or_refused_in_one_line(text):
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
 def test_every_numeric_key_can_be_overridden_or_says_why(path):
-    """`--set PATH=1` reaches its key: the value is taken, or a message is about that very path."""
+    """Set PATH=1 for every key: the value is accepted, or the message is about that very path."""
     try:
         mechanism = load("varying", [f"{path}=1"]).mechanism
     except InputError as error:

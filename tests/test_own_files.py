@@ -1,4 +1,4 @@
-"""Commands replace what they wrote, and touch nothing else: no file of the user's, no link, no pipe."""
+"""Protection of files: commands replace what they wrote, and no other file, link or pipe."""
 
 import json
 import os
@@ -41,13 +41,13 @@ def refused(ran, *words):
         assert word in ran.err
 
 
-def test_results_do_not_replace_files_of_something_else(jaxhil, thesis, untouched):
+def test_results_do_not_replace_third_party_files(jaxhil, thesis, untouched):
     refused(jaxhil(*COMPARE, "-o", thesis), "errors.png: found a file of something else")
     tune = ("tune", "rig-300kg", "-o", thesis.parent, "--set", "name='thesis'")
     refused(jaxhil(*tune), "thesis/errors.png: found a file of something else")
 
 
-def test_an_overview_does_not_replace_a_picture_of_something_else(jaxhil, thesis):
+def test_overview_does_not_replace_a_third_party_picture(jaxhil, thesis):
     (thesis / "overview.png").write_text("years")
     names = ("rig-300kg", "varying", "layered", "rattling", "claw-350kg")
     refused(jaxhil("tune", *names, "-o", thesis), "overview.png: found a file of something else")
@@ -55,7 +55,7 @@ def test_an_overview_does_not_replace_a_picture_of_something_else(jaxhil, thesis
 
 
 @pytest.mark.parametrize("content", ["{}", "years", "[1]", ""])
-def test_a_document_of_something_else_is_not_replaced(jaxhil, tmp_path, content):
+def test_third_party_document_is_not_replaced(jaxhil, tmp_path, content):
     for name in ("compare.json", "gains.json"):
         (tmp_path / name).write_text(content)
     refused(jaxhil(*COMPARE, "-o", tmp_path), "compare.json: found a file of something else")
@@ -64,7 +64,7 @@ def test_a_document_of_something_else_is_not_replaced(jaxhil, tmp_path, content)
     assert [(tmp_path / name).read_text() for name in ("compare.json", "gains.json")] == [content] * 2
 
 
-def test_a_sweep_takes_no_folder_of_the_users(jaxhil, thesis, untouched, tmp_path):
+def test_sweep_does_not_use_a_folder_of_the_user(jaxhil, thesis, untouched, tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     for more in ((), ("--resume",)):
         ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)
@@ -115,7 +115,7 @@ def test_results_of_another_mechanism_are_not_replaced(jaxhil, tmp_path, kind):
     assert path.read_bytes() == before
 
 
-def test_identified_numbers_of_another_mechanism_are_not_replaced(jaxhil, tmp_path):
+def test_identified_values_of_another_mechanism_are_not_replaced(jaxhil, tmp_path):
     content = {"estimates": [], "mechanism": {"name": "a b"}}
     (tmp_path / "identification.json").write_text(json.dumps(content))
     ran = jaxhil("identify", "none.csv", "--prior", "rig-300kg", "-o", tmp_path)
@@ -131,7 +131,7 @@ def test_mechanisms_of_one_call_share_no_folder(jaxhil, tmp_path, names):
     assert entry["mechanism"] == names[0]
 
 
-def test_gains_of_another_mechanism_of_the_same_name_are_replaced_with_a_warning(jaxhil, tmp_path):
+def test_gains_of_another_mechanism_of_same_name_are_replaced_with_warning(jaxhil, tmp_path):
     file = named(tmp_path / "rig.toml", "機構一")
     options = (file, *TUNE[1:], "-o", tmp_path / "out")
     assert "replaced" not in jaxhil(TUNE[0], *options).err
@@ -159,8 +159,8 @@ def test_gains_of_another_mechanism_of_the_same_name_are_replaced_with_a_warning
     ],
     ids=" ".join,
 )
-def test_what_is_read_is_no_pipe_and_no_device(jaxhil, tmp_path, monkeypatch, command, kind):
-    """It would be waited for, or never end."""
+def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, command, kind):
+    """Avoid waiting for a pipe, and reading a device without end."""
     monkeypatch.chdir(tmp_path)
     place = tmp_path / "input.csv"
     if kind == "pipe":
@@ -171,7 +171,7 @@ def test_what_is_read_is_no_pipe_and_no_device(jaxhil, tmp_path, monkeypatch, co
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
-def test_a_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
+def test_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
     place = tmp_path / "plot.png"
     if kind == "pipe":
         os.mkfifo(place)
@@ -185,7 +185,7 @@ def test_a_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
     assert (os.lstat(place).st_ino, os.stat("/dev/full").st_ino) == before
 
 
-def test_a_link_that_is_named_stands_for_its_file(jaxhil, tmp_path):
+def test_named_link_stands_for_its_file(jaxhil, tmp_path):
     (tmp_path / "there.png").write_bytes(b"an older picture")
     (tmp_path / "plot.png").symlink_to("there.png")
     ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "plot.png", "--json")

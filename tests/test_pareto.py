@@ -1,5 +1,7 @@
-"""The trade-off of accuracy against noise: a ladder in units of the objective, points that beat each other
-nowhere, all in one program; every figure against an evaluation of its own."""
+"""Trade-off of accuracy against noise: weights, undominated points, one program.
+
+Every metric is compared with an evaluation of its own.
+"""
 
 import dataclasses
 import math
@@ -64,7 +66,7 @@ def errors_of(loop, scenarios, gains):
 # What a point is judged by
 
 
-def test_the_ladder_is_in_units_of_the_objective():
+def test_pareto_weights_are_in_units_of_the_objective():
     light, heavy = ENDS
     weights = ladder(8, error=0.012, excess=3.0)
     assert weights[0] == 0
@@ -76,7 +78,7 @@ def test_the_ladder_is_in_units_of_the_objective():
     assert np.isfinite(ladder(8, 0.012, 0.0)).all()
 
 
-def test_a_point_is_beaten_by_what_is_better_in_one_and_no_worse_in_the_other():
+def test_pareto_point_is_dominated_if_another_is_better_and_none_worse():
     places = [(0.01, 3.0), (0.02, 2.0), (0.02, 2.5), (0.03, 1.0), (0.03, 1.0), (0.04, 1.0)]
     assert dominated(places) == [False, False, True, False, False, True]
     generator = np.random.default_rng(0)
@@ -89,7 +91,7 @@ def test_a_point_is_beaten_by_what_is_better_in_one_and_no_worse_in_the_other():
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_amplification_is_that_of_the_lead_filter(compensator):
+def test_noise_amplification_is_that_of_the_lead_filter(compensator):
     mechanism = load("varying", ["rig.control_period=0.002"]).mechanism
     gains = {**literature_gains(mechanism, compensator), "phase_lead": 0.006, "lead_filter": 0.0017}
     impulse = np.zeros(3000)
@@ -103,7 +105,7 @@ def test_amplification_is_that_of_the_lead_filter(compensator):
 NO_TRADE_OFF = ["none", "position_lead", "virtual_contact", "passivity", "impulse_ledger"]
 
 
-def test_only_what_amplifies_has_something_to_trade():
+def test_only_amplifying_laws_have_a_trade_off():
     assert {name for name in COMPENSATORS if not has_trade_off(name)} == set(NO_TRADE_OFF)
     assert amplification(load().mechanism, "none", {}) == 1
 
@@ -112,7 +114,7 @@ def test_only_what_amplifies_has_something_to_trade():
 
 
 @pytest.mark.slow
-def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
+def test_metrics_of_every_pareto_point_are_those_of_an_evaluation(results, made):
     for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
         seed = SETTINGS.seed + VALIDATION_SEED
         scenarios = build_scenarios(mechanism, draw(mechanism, SETTINGS.validation, seed), seed)
@@ -133,9 +135,12 @@ def test_every_point_s_figures_are_those_of_an_evaluation(results, made):
 
 
 @pytest.mark.slow
-def test_no_point_is_better_under_another_s_weight(results, made):
-    """On the scenarios that they were tuned on: none beats another at its own weight, nor do the gains that
-    were tuned before. So the heavier the weight, the quieter and the less accurate."""
+def test_no_pareto_point_is_better_under_another_points_weight(results, made):
+    """Compare on the training scenarios.
+
+    No point beats another at its own weight, nor do the gains that were tuned before. So the heavier the
+    weight, the quieter and the less accurate the gains.
+    """
     for mechanism, front in zip(MECHANISMS, made[0], strict=True):
         task = build_task(mechanism, "phase_lead", SETTINGS.scenarios, SETTINGS.seed)
         every = [*front.points, front.tuned, front.literature]
@@ -157,11 +162,11 @@ def test_no_point_is_better_under_another_s_weight(results, made):
 
 
 @pytest.mark.slow
-def test_all_weights_of_all_mechanisms_share_one_program(made):
+def test_weights_of_all_mechanisms_share_one_program(made):
     assert made[1] == 1
 
 
-def test_points_begin_at_what_their_neighbours_found():
+def test_pareto_points_start_at_the_results_of_their_neighbours():
     found = [pareto_search._Candidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
     assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(found)] == [
         [1, 2],
@@ -171,7 +176,7 @@ def test_points_begin_at_what_their_neighbours_found():
     ]
 
 
-def test_what_a_start_reached_is_distinguished_from_its_noise():
+def test_result_of_a_start_is_distinguished_from_its_noise():
     task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
     excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
     start = pareto_search.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)

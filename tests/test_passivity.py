@@ -1,4 +1,4 @@
-"""Passivity: the contact never gives back more than it has taken, whatever the readings."""
+"""Passivity: the contact never returns more energy than it has taken, whatever the readings."""
 
 import math
 from fractions import Fraction
@@ -47,7 +47,7 @@ def check(forces, velocities, period):
     return corrected
 
 
-def test_energy_of_random_readings_stays_positive():
+def test_passivity_energy_of_random_readings_stays_positive():
     rng = np.random.default_rng(3)
     corrected = 0
     for size in (1e-9, 1.0, 1e6):
@@ -63,11 +63,11 @@ ANY = st.floats(-1e120, 1e120) | st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e
 
 
 @given(rows=st.lists(st.tuples(ANY, ANY), min_size=1, max_size=30))
-def test_energy_of_hostile_readings_stays_positive(rows):
+def test_passivity_energy_of_hostile_readings_stays_positive(rows):
     check(*zip(*rows, strict=True), 1e-3)
 
 
-def test_what_no_number_holds_does_not_stay():
+def test_passivity_forgets_energy_that_overflows():
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(1e308, 0.0, 1e308, 0.0) == 1e308
     # Nothing was taken in, so nothing is given back.
@@ -75,7 +75,7 @@ def test_what_no_number_holds_does_not_stay():
 
 
 def test_virtual_damping_returns_the_energy_to_0():
-    """alpha = -E/(T v^2) of the source, E with this tick's F in it."""
+    """Use alpha = -E/(T v^2) of the source, where E includes this tick's F."""
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(100.0, 0.0, 0.005, 0.0) == 100.0
     energy = 1e-3 * 100.0 * 0.005 + 1e-3 * 150.0 * -0.004
@@ -85,15 +85,15 @@ def test_virtual_damping_returns_the_energy_to_0():
     assert law.step(50.0, 0.0, 0.0, 0.0) == 50.0
 
 
-def test_energy_is_forgotten_at_the_next_contact_but_not_between_two_surfaces():
+def test_passivity_energy_is_reset_at_next_contact_but_not_between_surfaces():
     energy, yes = jnp.asarray([1.0, 2.0]), jnp.asarray([True, False])
     assert LAW.restart({}, energy, yes, yes).tolist() == [0.0, 2.0]
     assert LAW.restart({}, energy, yes, ~yes).tolist() == [1.0, 2.0]
 
 
 @pytest.mark.parametrize("damping", [0.0, 300.0])
-def test_a_contact_that_diverges_no_longer_does(damping):
-    """But for what the observation of the energy at the ticks leaves: (T F_c)^2/(2 M) a tick."""
+def test_passivity_stops_a_contact_from_diverging(damping):
+    """Allow for what the observation of the energy at the ticks leaves: (T F_c)^2/(2 M) a tick."""
     parsed = validated(mechanism({"damping": [damping]}, IDEAL))
     delay = np.array([0.001, 0.004, 0.01, 0.02])
     scenario = spread(parsed, len(delay), force_sensor__delay=delay)

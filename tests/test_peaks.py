@@ -23,8 +23,8 @@ def largest(curve, times, anew):
     return peak.largest
 
 
-def test_between_unequal_steps():
-    """Of a parabola its vertex; of a sine 2e-5 less at most, where the largest sample lacks 6e-4."""
+def test_peak_between_unequal_steps_is_that_of_a_parabola():
+    """Expect a parabola's vertex; of a sine at most 2e-5 less, where the largest sample lacks 6e-4."""
     never = np.zeros_like(TIMES, bool)
     parabola, sine = np.maximum(2.0 - (TIMES - 1.01) ** 2, 0.0), np.maximum(np.sin(2 * TIMES), 0.0)
     np.testing.assert_allclose(largest(parabola, TIMES, never), 2.0, rtol=1e-12)
@@ -32,8 +32,8 @@ def test_between_unequal_steps():
     assert sine.max(axis=0).min() < 1 - 6e-4
 
 
-def test_no_crest_across_a_jump():
-    """Nor one that begins or ends at 0."""
+def test_peak_is_not_interpolated_across_a_jump():
+    """Include a crest that begins or ends at 0."""
     curve = np.array([[1.0, 1.0, 0.0], [1.1, 1.1, 3.0], [3.0, 3.0, 2.5], [2.5, 2.5, 0.0]])
     times = np.arange(1.0, 5.0)[:, None] + np.zeros(3)
     jumps = np.zeros_like(curve, bool)

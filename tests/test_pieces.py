@@ -1,4 +1,4 @@
-"""Finished pieces: as they were to the bit, or none; of other inputs, other code, or damaged ones nothing."""
+"""Checkpoints: read back to the bit or not at all; none of other inputs, other code, or damaged."""
 
 import math
 import struct
@@ -22,7 +22,7 @@ NUMBERS = [0.1, -0.0, 5e-324, math.inf, -math.inf, math.nan, 1.7976931348623157e
 POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.0]]), None)
 
 
-def test_every_bit_comes_back():
+def test_checkpoint_returns_every_bit():
     found = decode(encode(NUMBERS), list[float])
     assert [struct.pack("d", one) for one in found] == [struct.pack("d", one) for one in NUMBERS]
     point = decode(encode(POINT), Point)
@@ -36,12 +36,12 @@ def test_every_bit_comes_back():
 
 
 @pytest.mark.parametrize("thing", [print, object(), np.array([print]), {"a": lambda: 1}])
-def test_what_is_no_data_is_not_kept(thing):
+def test_checkpoint_of_what_is_no_data_is_not_saved(thing):
     with pytest.raises(TypeError):
         encode(thing)
 
 
-def test_a_piece_is_read_by_those_who_would_compute_the_same(tmp_path, monkeypatch):
+def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch):
     inputs = {"seed": 1, "limit": math.inf, "gains": POINT}
     Pieces(tmp_path).write("one", inputs, POINT)
     reader = Pieces(tmp_path, resume=True)
@@ -61,7 +61,7 @@ def test_a_piece_is_read_by_those_who_would_compute_the_same(tmp_path, monkeypat
     assert reader.read("one", inputs, Point) is not None
 
 
-def test_no_flipped_bit_is_taken(tmp_path):
+def test_checkpoint_with_a_flipped_bit_is_not_used(tmp_path):
     Pieces(tmp_path).write("one", 1, POINT)
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
@@ -76,7 +76,7 @@ def test_no_flipped_bit_is_taken(tmp_path):
         assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
 
 
-def test_steps_are_made_once_and_removed_when_the_whole_is_kept(tmp_path):
+def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
     made = []
 
     def run(stop, resume=True):
@@ -101,7 +101,7 @@ def test_steps_are_made_once_and_removed_when_the_whole_is_kept(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
-def test_what_cannot_be_kept_costs_nothing_else(tmp_path):
+def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
     (tmp_path / "taken").touch()
     for place in (tmp_path / "taken", tmp_path / "link"):
         kept = Pieces(place)
@@ -116,7 +116,7 @@ def test_what_cannot_be_kept_costs_nothing_else(tmp_path):
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_names_that_look_alike_are_told_apart(tmp_path):
+def test_checkpoint_names_that_look_alike_are_distinguished(tmp_path):
     written = Pieces(tmp_path)
     names = ["a b", "a-b", "../a", "A" * 300, "A" * 301, "ä", "ö"]
     for number, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""The rig's plant in plain floats: against the oracle, against jax's loop, against closed forms."""
+"""Rig plant in plain floats: against the oracle, jax's loop and closed forms."""
 
 import math
 import time
@@ -35,7 +35,7 @@ LAGGED = 1e-7
 
 
 @pytest.mark.parametrize("name", AGAINST_THE_ORACLE)
-def test_every_contact_against_the_oracle(name):
+def test_plant_agrees_with_the_oracle_in_every_contact(name):
     case = CASES[name]
     mechanism = validated(case.mechanism)
     gains = nominal_gains(mechanism, case.compensator, **case.gains)
@@ -60,7 +60,7 @@ BUILT_IN = [
 
 
 @pytest.mark.parametrize("name", [*BUILT_IN, "limited", "suite-elastoplastic"])
-def test_every_built_in_mechanism_as_simulated(name):
+def test_plant_agrees_with_simulation_for_every_builtin(name):
     overrides = ()
     if name == "suite-elastoplastic":
         assert load(name).mechanism.rig.force_sensor.delay == 0.008  # both delays are whole periods
@@ -120,7 +120,7 @@ def on_rig(simulator, **rig):
 
 @pytest.mark.parametrize("model", SIMULATORS)
 @pytest.mark.parametrize("latency", [0, 1])
-def test_uniform_motion_is_followed_by_a_constant_lag(model, latency):
+def test_plant_follows_uniform_motion_with_a_constant_lag(model, latency):
     simulator, lag = SIMULATORS[model]
     mechanism = on_rig(
         {**simulator, "delay": 0.0037}, command_latency=latency, position_sensor={"delay": 0.0009}
@@ -134,7 +134,7 @@ def test_uniform_motion_is_followed_by_a_constant_lag(model, latency):
         plant.move(position + 0.001 * velocity)
 
 
-def test_a_staircase_is_followed_in_its_steady_state():
+def test_plant_follows_a_staircase_in_its_steady_state():
     mechanism = on_rig({**SIMULATORS["second order"][0], "delay": 0.0037}, command_hold="zoh")
     plant, velocity = Plant(mechanism), 0.005
     plant.begin(-1.0, velocity, -1.0, 0)
@@ -146,12 +146,12 @@ def test_a_staircase_is_followed_in_its_steady_state():
 
 
 @pytest.mark.parametrize("delay, intervals, place", [(0.0, 0, 1.0), (0.003, 3, 1.0), (0.0032, 3, 0.8)])
-def test_delays_are_split_at_the_ticks(delay, intervals, place):
+def test_plant_splits_delays_at_the_ticks(delay, intervals, place):
     assert split_delay(delay, 0.001) == (intervals, pytest.approx(place, abs=1e-12))
     assert split_delay(0.1 + 0.2, 0.1)[0] == 3
 
 
-def test_sensors_in_free_flight():
+def test_plant_sensors_in_free_flight():
     sensor = {"noise_std": 0.5, "bias": 2.0}
     mechanism = on_rig({"model": "ideal"}, force_sensor=sensor, position_sensor={"noise_std": 1e-6})
     plant = Plant(mechanism, seed=3)
@@ -166,7 +166,7 @@ def test_sensors_in_free_flight():
 
 
 @pytest.mark.parametrize("name", ["rig-300kg", "rattling"])
-def test_noisy_contacts_as_good_as_without_noise_on_average(name):
+def test_noisy_contacts_are_as_good_on_average_as_without_noise(name):
     mechanism = load(name, ("rig.force_sensor.noise_std=0.2", "approach.contacts=1")).mechanism
     quiet = load(name, ("approach.contacts=1",)).mechanism
     gains = literature_gains(mechanism, "phase_lead")
@@ -177,13 +177,13 @@ def test_noisy_contacts_as_good_as_without_noise_on_average(name):
     assert np.mean(found) == pytest.approx(expected.restitution, abs=4 * spread / 8**0.5 + 1e-3)
 
 
-def test_the_runtime_has_every_law_that_is_played():
+def test_runtime_has_every_law_that_the_plant_runs():
     assert {case.compensator for case in CASES.values()} <= set(COMPENSATORS)
 
 
 @pytest.mark.benchmark
 @pytest.mark.parametrize("name", [*builtin_names(), "lag"])
-def test_time_of_a_tick(name):
+def test_plant_tick_takes_little_time(name):
     overrides = ("rig.force_sensor.time_constant=0.002",) if name == "lag" else ()
     mechanism = load("varying" if name == "lag" else name, overrides).mechanism
     plant, velocity = Plant(mechanism), mechanism.approach.velocity

@@ -1,4 +1,4 @@
-"""What a mechanism file means, which meanings are warned of, and which runs are refused before they begin."""
+"""Plausibility of a mechanism file: its summary, its warnings, and runs refused before they begin."""
 
 import math
 
@@ -30,7 +30,7 @@ def behind(**simulator):
 
 
 @pytest.mark.parametrize("name", [*builtin_names(), *suite_names()])
-def test_no_built_in_mechanism_is_warned_of(name):
+def test_builtin_mechanisms_give_no_warning(name):
     mechanism = jaxhil.load(name)
     found = meaning(mechanism)
     assert found.warnings == ()
@@ -40,7 +40,7 @@ def test_no_built_in_mechanism_is_warned_of(name):
     check_run(mechanism, drawn=True)
 
 
-def test_the_line_says_what_the_file_means():
+def test_summary_line_states_what_the_file_means():
     assert meaning(rig(rig__force_sensor__range=200.0)).line("mine") == (
         "mine: equivalent mass 300 kg; contact at 3 Hz, 1/333 of the control rate (1000 Hz) and 0.29 of the "
         "motion simulator's bandwidth (10.5 Hz); peak force 28.3 N (0.14 of the sensor's range (200 N)); "
@@ -59,7 +59,7 @@ def test_the_line_says_what_the_file_means():
 # Figures.
 
 
-def test_contacts_that_differ_are_listed_once_in_order():
+def test_summary_lists_different_contacts_once_in_order():
     found = meaning(
         jaxhil.load("varying", {"contact.stiffness": [2e5, 1e5, 2e5, 3e5], "approach.contacts": 9})
     )
@@ -77,7 +77,7 @@ def power_law(stiffness, exponent):
     return stiffness * deepest**exponent, duration
 
 
-def test_figures_of_every_kind_of_law_are_those_of_its_contact_in_space():
+def test_summary_of_every_law_is_that_of_its_ideal_contact():
     jaxhil.register(SquaredSpring())
     spring = SPEED * math.sqrt(STIFFNESS * MASS), math.pi * math.sqrt(MASS / STIFFNESS)
     laws = {
@@ -103,7 +103,7 @@ def test_figures_of_every_kind_of_law_are_those_of_its_contact_in_space():
         assert contact.frequency == pytest.approx(1 / (2 * duration), rel=1e-6), law
 
 
-def test_a_damped_spring_has_the_frequency_of_the_spring():
+def test_damped_spring_has_the_frequency_of_the_spring():
     damped = {"contact.damping": [3 * math.sqrt(STIFFNESS * MASS)]}
     for tension in (False, True):
         [contact] = meaning(rig(damped, contact__tension=tension)).contacts
@@ -112,7 +112,7 @@ def test_a_damped_spring_has_the_frequency_of_the_spring():
         assert math.isinf(contact.duration) == tension
 
 
-def test_about_how_long_a_run_takes():
+def test_duration_of_a_run_is_estimated():
     run = jaxhil.simulate("varying", "phase_lead")
     assert run.meaning == meaning(run.mechanism)
     assert run.meaning.duration == pytest.approx(run.time[-1], rel=0.25)
@@ -149,7 +149,7 @@ def test_bandwidth_is_where_the_gain_has_fallen_by_3_db(simulator):
     assert all(gain(share * frequency) > math.sqrt(0.5) for share in np.linspace(0, 0.99, 100))
 
 
-def test_an_ideal_simulator_has_no_bandwidth():
+def test_ideal_simulator_has_no_bandwidth():
     assert bandwidth(build_scenarios(behind(model="ideal")).simulator) == math.inf
 
 
@@ -201,21 +201,21 @@ def test_an_ideal_simulator_has_no_bandwidth():
         ),
     ],
 )
-def test_what_can_hardly_be_meant_is_warned_of(key, plausible, implausible, said):
+def test_implausible_values_give_a_warning(key, plausible, implausible, said):
     others = {"rig.force_sensor.delay": 0.0} if key == "rig.simulator.delay" else {}
     assert meaning(rig(others, **{key: plausible})).warnings == ()
     [warning] = meaning(rig(others, **{key: implausible})).warnings
     assert said in warning and ", expected " in warning and warning.isprintable()
 
 
-def test_the_contact_that_is_implausible_is_named():
+def test_implausible_contact_is_named():
     stiffness = {"contact.stiffness": [1e5, 1e9, 1.0], "approach.contacts": 3}
     fast, slow, late = meaning(rig(stiffness)).warnings
     assert "291 Hz (contact 2), expected at most 100 Hz, 1/10 of the control rate" in fast
     assert "0.00919 Hz (contact 3)" in slow and "less than contact 2 lasts" in late
 
 
-def test_damping_of_a_law_without_damping_is_warned_of():
+def test_damping_of_an_undamped_law_gives_a_warning():
     [warning] = meaning(rig(contact__law="linear", contact__damping=[0.0, 4.0])).warnings
     assert warning == "contact.damping: found 4 N s/m, expected 0: law linear has no damping"
 
@@ -246,7 +246,7 @@ def test_runs_of_too_many_ticks_are_refused():
     assert "contact 1 takes about 0.195 s, 1.9e+06 ticks" in refusal(rig(many))
 
 
-def test_a_flight_that_never_ends_is_refused():
+def test_flight_without_end_is_refused():
     gap = {"contact.clearance": 40.0, "approach.contacts": 2}
     check_run(rig(gap))
     said = refusal(rig(gap, contact__clearance=100.0))
@@ -257,7 +257,7 @@ def test_a_flight_that_never_ends_is_refused():
     check_run(rig(contact__clearance=1e30))
 
 
-def test_draws_count_where_they_are_drawn():
+def test_limit_on_ticks_covers_drawn_values():
     wide = {"distribution": "loguniform", "factor": [1e-6, 1.0]}
     uncertain = rig({"uncertainty": {"rig.control_period": wide}})
     check_run(uncertain)
@@ -287,8 +287,8 @@ def test_simulators_too_fast_for_the_control_period_are_refused(simulator):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
-def test_poles_that_are_allowed_are_propagated_exactly(angle):
-    """Two poles of the magnitude 64 / T, at some angle to the negative axis."""
+def test_accepted_poles_are_propagated_exactly(angle):
+    """Use two poles of the magnitude 64 / T, at some angle to the negative axis."""
     damping = 2 * FASTEST_POLE * math.cos(angle)
     matrix = np.array([[0.0, FASTEST_POLE], [-FASTEST_POLE, -damping]])
     whole = np.zeros((4, 4))
@@ -297,13 +297,13 @@ def test_poles_that_are_allowed_are_propagated_exactly(angle):
     np.testing.assert_allclose(found, expm(whole)[:3], rtol=0, atol=2e-9)
 
 
-def test_poles_count_where_they_are_drawn():
+def test_limit_on_poles_covers_drawn_values():
     drawn = {"rig.simulator.natural_frequency": {"distribution": "uniform", "factor": [1.0, 1e3]}}
     check_run(rig(uncertainty=drawn))
     assert "rig.simulator: found a pole of " in refusal(rig(uncertainty=drawn), drawn=True)
 
 
-def test_velocity_limits_count_where_they_are_drawn():
+def test_limit_on_velocity_covers_drawn_values():
     normal = {"approach.velocity": {"distribution": "normal", "std": 1e-4}}
     narrow = rig({"uncertainty": normal}, rig__simulator__velocity_limit=1.1 * SPEED)
     check_run(narrow)
@@ -312,7 +312,7 @@ def test_velocity_limits_count_where_they_are_drawn():
     check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
 
 
-def test_every_function_refuses_what_would_not_end():
+def test_every_function_refuses_runs_without_end():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):
         with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
@@ -321,7 +321,7 @@ def test_every_function_refuses_what_would_not_end():
         jaxhil.jacobian(endless, by="approach.velocity")
 
 
-def test_tune_says_what_a_mechanism_means_when_asked_to(capsys):
+def test_tune_prints_the_mechanism_summary_on_request(capsys):
     sensor = rig(rig__force_sensor__range=10.0)
     for progress in (False, True):
         with pytest.raises(jaxhil.InputError, match="objective"):
@@ -336,7 +336,7 @@ def test_tune_says_what_a_mechanism_means_when_asked_to(capsys):
 # The commands.
 
 
-def test_simulate_begins_with_the_line(jaxhil):
+def test_simulate_begins_with_the_summary_line(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=10")
     assert ran.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     assert ran.err == (
@@ -358,7 +358,7 @@ def test_simulate_begins_with_the_line(jaxhil):
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_commands_refuse_what_would_not_end_in_one_line(jaxhil, command, tmp_path, monkeypatch):
+def test_commands_refuse_runs_without_end_in_one_line(jaxhil, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil(command, "rig-300kg", "--set", "rig.control_period=1e-9")
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1
@@ -366,14 +366,14 @@ def test_commands_refuse_what_would_not_end_in_one_line(jaxhil, command, tmp_pat
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_commands_take_keys_out(jaxhil, command):
+def test_commands_unset_keys(jaxhil, command):
     ran = jaxhil(command, "rig-300kg", "--set", "name=x", "--unset", "approach.velocity", "--unset", "rig")
     assert ran.code == 2 and ran.err.startswith(
         "jaxhil: rig-300kg: --set name=x --unset approach.velocity rig: approach.velocity: found nothing"
     )
 
 
-def test_a_timeout_says_its_limit(jaxhil):
+def test_timeout_states_its_limit(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=1e-6", "--json")
     assert ran.document["status"] == "timeout"
     assert ran.document["reason"] == "a contact was not over within 10 s, the limit of a contact"

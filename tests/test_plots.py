@@ -1,4 +1,4 @@
-"""Pictures say what they show, come out the same twice, and their reference is the undelayed contact."""
+"""Plots: labels and units, reproducible files, and the ideal contact as reference."""
 
 import ast
 import math
@@ -74,7 +74,7 @@ def labels(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
-def test_errors_have_units_and_a_legend():
+def test_error_plot_has_units_and_a_legend():
     left, right = errors_plot(result(), 0.01).axes
     assert "|e - e*|" in left.get_xlabel() and "share" in left.get_ylabel()
     assert "[Hz]" in right.get_xlabel() and "divergence" in right.get_ylabel()
@@ -103,7 +103,7 @@ def test_contact_frequency_is_that_of_the_linear_contact():
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
-def test_any_limit_and_no_errors_at_all_can_be_drawn(limit, tmp_path):
+def test_error_plot_accepts_any_limit_and_no_errors_at_all(limit, tmp_path):
     save(errors_plot(result((0.5, 0.0, 0.0)), limit), tmp_path / "errors.png")
     made = result()
     nothing = {name: one._replace(good=one.good & False) for name, one in made.outcomes.items()}
@@ -111,7 +111,7 @@ def test_any_limit_and_no_errors_at_all_can_be_drawn(limit, tmp_path):
     save(errors_plot(made, limit), tmp_path / "nothing.png")
 
 
-def test_the_best_start_stands_out():
+def test_best_start_stands_out_in_the_plot():
     (axes,) = loss_plot(result()).axes
     assert "log" == axes.get_yscale() and "step" in axes.get_xlabel() and "rms" in axes.get_ylabel()
     assert set(labels(axes)) == {"start at the literature's gains", "best start", "other starts"}
@@ -131,7 +131,7 @@ def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1
     return made, Front(points, point(0.1, 4.0, False), point(0.012, 3.5, False))
 
 
-def test_a_front_has_units_numbers_and_the_literature_beside():
+def test_front_plot_has_units_numbers_and_the_literature():
     made, drawn = front()
     (axes,) = front_plot(drawn, made, 0.015).axes
     assert (
@@ -151,7 +151,7 @@ def test_a_front_has_units_numbers_and_the_literature_beside():
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
-def test_any_front_can_be_drawn(limit, tmp_path):
+def test_front_plot_accepts_any_front(limit, tmp_path):
     for number, places in enumerate(
         [((0.5, 1.0),) * 2, ((0.0, 1.0), (2.0, 0.9)), ((1e-3, 40.0), (1.0, 1.0))]
     ):
@@ -159,7 +159,7 @@ def test_any_front_can_be_drawn(limit, tmp_path):
         save(front_plot(drawn, made, limit), tmp_path / f"{number}.png")
 
 
-def test_contacts_are_drawn_side_by_side_with_units():
+def test_contact_plot_shows_contacts_side_by_side_with_units():
     figure = contact_plot(pieces(), "title")
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
@@ -169,7 +169,7 @@ def test_contacts_are_drawn_side_by_side_with_units():
     assert "the first 4 of 6 contacts" in contact_plot(pieces(6), "title").get_suptitle()
 
 
-def test_measured_signals_are_drawn_where_asked_for():
+def test_measured_signals_are_plotted_on_request():
     def measured(figure):
         return [line for line in figure.axes[0].lines if line.get_label() == "measured"]
 
@@ -177,25 +177,25 @@ def test_measured_signals_are_drawn_where_asked_for():
     assert len(measured(contact_plot(pieces(1), "title", sensors="tuned"))) == 1
 
 
-def test_a_name_is_text_and_not_a_formula(tmp_path):
+def test_name_in_a_plot_is_text_and_no_formula(tmp_path):
     save(contact_plot(pieces(1), r"$\frac{1$ [bold]"), tmp_path / "plot.png")
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
-def test_equal_data_give_equal_files(suffix, tmp_path):
+def test_equal_data_give_equal_plot_files(suffix, tmp_path):
     for name in ("one", "two"):
         save(loss_plot(result()), tmp_path / f"{name}.{suffix}")
     assert (tmp_path / f"one.{suffix}").read_bytes() == (tmp_path / f"two.{suffix}").read_bytes()
 
 
-def test_colours_and_lines_differ():
+def test_plot_colours_and_line_styles_differ():
     compared = [STYLES[name] for name in ("before", "literature", "tuned")]
     assert len({to_hex(colour) for colour, _, _ in compared}) == 3
     assert len({line for _, line, _ in compared}) == 3
 
 
 @pytest.mark.parametrize("name", ["rig-300kg", "claw-350kg", "layered"])
-def test_motion_in_space_is_the_reference(name):
+def test_reference_motion_is_the_ideal_contact(name):
     mechanism = load(name).mechanism
     scenarios = build_scenarios(mechanism, {"approach.phase": np.full(1, 0.5)})
     velocity = 0.007
@@ -220,8 +220,8 @@ DRAWING = [
 
 
 @pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
-def test_pictures_have_one_palette_and_units(path):
-    """Colours are those of `contact_plot` or greys; axes are named with their unit, unless they count."""
+def test_plots_have_one_palette_and_units(path):
+    """Expect colours of `contact_plot` or greys; axes have a unit, unless they count."""
     counted = ("", "solver step", "contact")
     for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():

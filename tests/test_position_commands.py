@@ -1,4 +1,4 @@
-"""Position commands go on from where the drives are, whatever comes: in Python and, the same bits, in C."""
+"""Position commands continue from the drives' position, whatever comes: in Python and, bit for bit, in C."""
 
 import math
 
@@ -150,14 +150,14 @@ def runs(draw):
 
 
 @given(run=runs())
-def test_no_command_is_further_from_where_the_drives_are_than_the_limits_allow(run):
+def test_position_command_is_no_further_from_the_drives_than_limits_allow(run):
     gain_file, rows = run
     Reference(gain_file).follow(rows, in_both(gain_file, rows))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
-def test_no_command_of_a_million_ticks_is_further_than_the_limits_allow(law):
+def test_position_command_stays_near_the_drives_for_a_million_ticks(law):
     rng = np.random.default_rng([12, LAWS.index(law)])
     made = c99_cases.loaded(law)
     for n in range(1000):
@@ -178,8 +178,8 @@ def plain(law: str = "none", **limits: float) -> GainFile:
 @pytest.mark.parametrize("before", [[], [{"desired": -0.02, "measured": -0.02, "x": -0.02}] * 3])
 @pytest.mark.parametrize("model", [5e-3, 0.02, 1e300, -0.5])
 @pytest.mark.parametrize("drives", [-5e-3, -5e-4, 0.02, 5e-4])
-def test_first_command_against_the_drives_is_no_leap(drives, model, before):
-    """A slip of sign in the model: at once a trip, or a way there within the velocity limit."""
+def test_first_position_command_against_the_drives_does_not_jump(drives, model, before):
+    """Give the model the wrong sign: it trips at once, or moves there within the velocity limit."""
     wrong = {"desired": model, "measured": drives, "x": model}
     sent = in_both(plain(), rows_of(*before, {**wrong, "event": NEXT_CONTACT}, *[wrong] * 400))[len(before) :]
     commands = sent[:, POSITION]
@@ -195,7 +195,7 @@ def test_first_command_against_the_drives_is_no_leap(drives, model, before):
 
 @pytest.mark.parametrize("bad", ["desired", "velocity"])
 @pytest.mark.parametrize("drives", [0.02, -0.02, 5e-4, -40.0])
-def test_model_that_is_no_number_at_first_leaves_the_drives_where_they_are(bad, drives):
+def test_nonfinite_model_position_at_first_leaves_the_drives_where_they_are(bad, drives):
     rows = rows_of(*[{"measured": drives, "x": 0.0, bad: math.nan}] * 3)
     results = in_both(plain(), rows)
     assert int(results[0, RESULT.index("cause")]) == MODEL_NOT_FINITE
@@ -203,8 +203,8 @@ def test_model_that_is_no_number_at_first_leaves_the_drives_where_they_are(bad, 
 
 
 @pytest.mark.parametrize(("drives", "way", "rest"), [(0.02, -1.0, -5e-4), (-0.046, 1.0, -0.0295)])
-def test_retreat_from_outside_the_stroke_comes_back_without_a_leap(drives, way, rest):
-    """From beyond either end, and either surface of a gap of 30 mm."""
+def test_retreat_from_outside_the_stroke_returns_without_a_jump(drives, way, rest):
+    """Begin beyond either end, and beyond either surface of a gap of 30 mm."""
     gain_file = plain()._replace(clearance=0.03)
     results = in_both(gain_file, rows_of(*[{"measured": drives, "x": math.nan}] * 4000))
     commands = results[:, POSITION]
@@ -213,8 +213,11 @@ def test_retreat_from_outside_the_stroke_comes_back_without_a_leap(drives, way, 
     assert np.all(np.abs(np.diff(commands)) <= LIMITED["retreat_velocity"] * PERIOD * (1 + 1e-9))
 
 
-def test_drives_brought_elsewhere_begin_the_next_run_there():
-    """Announced, and before a reading of the new run, the model says where: out of contact alone."""
+def test_drives_moved_elsewhere_begin_the_next_run_there():
+    """Announce the run.
+
+    Before its first reading the model says where it begins, but only out of contact.
+    """
     controller = limited()
     for model, expected in ((-0.03, -0.03), (5e-4, -0.01 + STEP), (0.02, -0.01)):
         controller.reset()
@@ -224,8 +227,8 @@ def test_drives_brought_elsewhere_begin_the_next_run_there():
         assert controller.position_command(model, 0.0, 0.0) == pytest.approx(expected, rel=1e-12)
 
 
-def test_first_reading_of_the_position_is_not_bridged():
-    """There is no good one to go on with, whatever may be bridged later."""
+def test_first_position_reading_is_not_bridged():
+    """Expect this whatever may be bridged later: there is no good reading to continue with."""
     rows = rows_of({"measured": math.nan, "desired": -5e-3, "x": -5e-3}, {"measured": -0.02})
     results = in_both(plain(), rows)
     assert int(results[0, RESULT.index("cause")]) == POSITION_NOT_FINITE
@@ -241,15 +244,15 @@ def test_emergency_stop_before_the_first_command_holds_the_drives():
     ("model", "expected"),
     [(-5e-3, -5e-3), (-5e-4, -5e-4), (5e-4, -5e-4), (math.nan, -5e-4), (1e300, -5e-4), (-1e300, -0.04)],
 )
-def test_before_the_first_reading_no_command_is_in_contact(model, expected):
-    """Nobody knows where the drives are: the model says so, but not into a contact."""
+def test_command_before_the_first_reading_is_never_in_contact(model, expected):
+    """Follow the model while the drives' position is unknown, but not into a contact."""
     results = in_both(plain(), rows_of({"event": COMMAND_FIRST, "x": model, "measured": -5e-3}))
     assert results[0, ANSWER] == pytest.approx(expected, abs=STEP * (1 + 1e-9))
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_drives_that_follow_late_begin_without_a_bump(law):
-    """Within `start_distance`, and out of contact, the first command is the law's own, without a fault."""
+    """Expect the law's own first command, without a fault, within `start_distance` and out of contact."""
     start = {"desired": -4e-4, "velocity": 5e-3, "measured": -5e-4, "x": -3.95e-4, "v": 5e-3}
     gain_file = plain(law, start_distance=5e-4)
     result = in_both(gain_file, rows_of(start))[0]
@@ -263,7 +266,7 @@ def test_drives_that_follow_late_begin_without_a_bump(law):
     assert in_both(gain_file, pressed)[0, POSITION] == pytest.approx(-1e-4 + STEP, rel=1e-12)
 
 
-def test_run_that_begins_off_the_drives_catches_up_within_the_velocity_limit():
+def test_run_that_begins_off_the_drives_catches_up_within_velocity_limit():
     model = {"desired": -0.01, "measured": -0.011, "x": -0.01}
     rows = rows_of(*[{**model, "measured": -0.011 + 1e-7 * n} for n in range(60)])
     results = in_both(plain(), rows)
@@ -272,8 +275,8 @@ def test_run_that_begins_off_the_drives_catches_up_within_the_velocity_limit():
     assert np.all(commands[50:] == -0.01) and not results[-1, TRIPPED]
 
 
-def test_after_reset_the_command_goes_on_from_the_last_one():
-    """A run begins from where the drives read, if they have been moved meanwhile."""
+def test_command_after_reset_continues_from_the_last_one():
+    """Begin the run at the drives' reading if they have been moved meanwhile."""
     here, there = {"desired": -0.01, "measured": -0.01, "x": -0.01}, {"measured": -0.03, "desired": -0.03}
     moved = {**there, "x": -0.03}
     rows = rows_of(here, {**here, "x": math.nan}, {**moved, "event": RESET}, {**moved, "event": NEXT_CONTACT})
@@ -283,7 +286,7 @@ def test_after_reset_the_command_goes_on_from_the_last_one():
 
 
 @pytest.mark.parametrize("error", [ValueError, RuntimeError, ZeroDivisionError])
-def test_law_that_raises_leaves_the_drives_where_they_are(error, monkeypatch):
+def test_exception_in_the_law_leaves_the_drives_where_they_are(error, monkeypatch):
     def fail(*_):
         raise error("gone wrong")
 

@@ -1,4 +1,4 @@
-"""Position lead: with the simulator's exact inverse its lag is gone; what is sent is what is recorded."""
+"""Position lead: the simulator's exact inverse removes its lag; the record is the sent command."""
 
 import functools
 from math import pi
@@ -58,7 +58,7 @@ def restitutions():
     return found.reshape(3, len(PERIODS), -1).mean(axis=-1)
 
 
-def test_the_exact_inverse_leaves_an_error_of_first_order_in_the_period():
+def test_exact_inverse_leaves_an_error_of_first_order_in_the_period():
     error, without, _ = restitutions() - 1
     # Behind the simulator alone the contact diverges, whatever the period.
     assert np.all(without > 0.5)
@@ -68,14 +68,14 @@ def test_the_exact_inverse_leaves_an_error_of_first_order_in_the_period():
     assert abs(2 * error[-1] - error[-2]) < 2e-5
 
 
-def test_a_force_delay_stays():
+def test_position_lead_leaves_the_force_delay():
     found = restitutions()[2]
     expected = delayed_restitution(OMEGA * DELAY)
     assert expected > 1.15
     assert 2 * found[-1] - found[-2] == pytest.approx(expected, abs=2e-4)
 
 
-def test_the_simulator_follows_the_model():
+def test_simulator_follows_the_model_under_position_lead():
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, EXACT, 0.0, period=5e-4))
     led, period = np.array([1, 1, 0, 0]), np.tile([1e-3, 5e-4], 2)
     gains = {name: value * led for name, value in nominal_gains(parsed, "position_lead").items()}
@@ -88,7 +88,7 @@ def test_the_simulator_follows_the_model():
     assert apart[0] < 0.01 and apart[1] == pytest.approx(apart[0] / 2, rel=0.1)
 
 
-def test_derivatives_by_its_gains():
+def test_position_lead_derivatives_by_its_gains():
     law = COMPENSATORS["position_lead"]
     gains = {"position_lead": jnp.asarray(0.02), "acceleration_lead": jnp.asarray(2e-4)}
 
@@ -99,7 +99,7 @@ def test_derivatives_by_its_gains():
     assert jax.jacfwd(sent)(gains) == {"position_lead": 4e-3, "acceleration_lead": pytest.approx(-0.3)}
 
 
-def test_nominal_is_within_bounds():
+def test_position_lead_nominal_gains_are_within_bounds():
     overrides = [
         [],
         ["rig.command_hold=zoh", "rig.command_latency=1"],
@@ -130,7 +130,7 @@ def loaded_gains(simulator=SECOND_ORDER, **keys):
 LIMITED = {**SECOND_ORDER, "velocity_limit": 0.008, "acceleration_limit": 0.5}
 
 
-def test_what_is_sent_is_recorded_before_the_simulator_s_limits():
+def test_sent_command_is_recorded_before_the_simulators_limits():
     loaded = loaded_gains(LIMITED)
     batch = nominal_and_draws(loaded.mechanism, 1, 0)
     _, (lane,) = record_lanes(loaded, batch)
@@ -145,7 +145,7 @@ def test_what_is_sent_is_recorded_before_the_simulator_s_limits():
     assert np.max(np.abs(np.asarray(lane.sent)[:-1] - x)[same_run]) > 0.02 * VELOCITY
 
 
-def test_verification_sees_a_position_command_that_is_wrong(monkeypatch):
+def test_verification_detects_a_wrong_position_command(monkeypatch):
     loaded = loaded_gains()
     good = verify(loaded, scenarios=1)
     assert good.verdict, good.reasons
@@ -165,7 +165,7 @@ def test_verification_sees_a_position_command_that_is_wrong(monkeypatch):
     assert "position command found" in reason
 
 
-def test_limits_of_stroke_and_velocity_are_those_of_what_is_sent():
+def test_stroke_and_velocity_limits_apply_to_the_sent_command():
     loaded = loaded_gains()
     found = calibrate(loaded, scenarios=8, limit=1.0)
     [chunk] = recorded_chunks(loaded, Scenarios("random", 0, 8))
