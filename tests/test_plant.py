@@ -151,7 +151,7 @@ def test_plant_splits_delays_at_the_ticks(delay, intervals, place):
     assert split_delay(0.1 + 0.2, 0.1)[0] == 3
 
 
-def test_plant_sensors_in_free_flight():
+def test_plant_sensors_in_free_flight_have_stated_bias_and_noise():
     sensor = {"noise_std": 0.5, "bias": 2.0}
     mechanism = on_rig({"model": "ideal"}, force_sensor=sensor, position_sensor={"noise_std": 1e-6})
     plant = Plant(mechanism, seed=3)

@@ -1,4 +1,4 @@
-"""The probe: a push on the hardware against its closed form, and what it leaves alone."""
+"""Probe: a push on the hardware against its closed form, and what the probe leaves unchanged."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +14,13 @@ PUSH = Push(jnp.array(3.0), jnp.array(0.05), jnp.array(0.02))
 TIMES = np.array([-0.01, 0.0, 0.04, 0.0433, 0.05, 0.0571, 0.06, 0.065, 0.2])
 
 
-def test_push_is_a_half_sine():
+def test_probe_push_is_a_half_sine():
     expected = 3 * np.maximum(0, np.sin(np.pi * np.clip(TIMES - 0.04, 0, 0.02) / 0.02))
     np.testing.assert_allclose([PUSH.force(jnp.array(t)) for t in TIMES], expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("lag", [1e-3, 0.01, 0.1])
-def test_lagged_push_is_the_convolution_with_the_lag(lag):
+def test_probe_push_behind_a_lag_is_its_convolution_with_the_lag(lag):
     for time in TIMES:
         expected, _ = quad(
             lambda s, time=time: float(PUSH.force(jnp.array(s))) * np.exp(-(time - s) / lag) / lag,
@@ -30,7 +30,7 @@ def test_lagged_push_is_the_convolution_with_the_lag(lag):
         assert float(PUSH.lagged(jnp.array(time), jnp.array(lag))) == pytest.approx(expected, abs=1e-9)
 
 
-def test_without_lag_the_sensor_reads_the_push():
+def test_sensor_without_lag_reads_the_probe_push():
     for time in TIMES:
         reading = PUSH.lagged(jnp.array(time), jnp.array(0.0))
         assert float(reading) == float(PUSH.force(jnp.array(time)))
@@ -58,7 +58,7 @@ def with_push(scenarios, size=0.0, share=0.25, depth=None, span=0.1):
 
 
 @pytest.mark.parametrize("simulator", [IDEAL, SECOND_ORDER], ids=["ideal", "second order"])
-def test_a_push_of_nothing_changes_nothing(simulator):
+def test_probe_push_of_zero_changes_nothing(simulator):
     parsed = validated(mechanism({}, simulator, 0.004))
     scenarios = build_scenarios(parsed)
     plain = recorded(parsed, scenarios)
@@ -67,7 +67,7 @@ def test_a_push_of_nothing_changes_nothing(simulator):
         np.testing.assert_array_equal(getattr(probed, name), getattr(plain, name), err_msg=name)
 
 
-def test_an_early_push_takes_and_a_late_one_gives():
+def test_early_probe_push_takes_energy_and_late_push_gives_energy():
     parsed = validated(mechanism({}, IDEAL, 0.0))
     plain, early, late = (run(parsed, *push).restitution[0, 0] for push in ((0.0,), (5.0, 0.25), (5.0, 0.75)))
     assert early < plain - 1e-3 and late > plain + 1e-3

@@ -1,4 +1,4 @@
-"""Programs kept in files: the same numbers, traced once, remade when anything they depend on changes."""
+"""Compiled programs cached in files: same numbers, traced once, rebuilt if a dependency changes."""
 
 import os
 import sys
@@ -57,12 +57,12 @@ def run(folder, static=STATIC, arguments=VALUES):
     return float(result.total), np.asarray(result.parts)
 
 
-def test_these_are_the_programs_that_users_run():
+def test_cached_programs_are_those_that_users_run():
     assert not is_quick()
     assert "xla_cpu_small_while_loop_byte_threshold" in os.environ["XLA_FLAGS"]
 
 
-def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
+def test_program_is_traced_once_and_gives_same_numbers(tmp_path):
     plain = run(None)
     assert len(traced) == 1
     first, second = run(tmp_path), run(tmp_path)
@@ -73,7 +73,7 @@ def test_a_program_is_traced_once_and_gives_the_same_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-1000], lambda c: b"no" + c])
-def test_a_spoilt_file_is_made_anew(tmp_path, spoil):
+def test_damaged_program_file_is_rebuilt(tmp_path, spoil):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -97,16 +97,16 @@ def check_flips(folder, number, seed):
         assert read_sealed(file) is not None
 
 
-def test_a_flipped_bit_costs_only_the_time_to_trace(tmp_path):
+def test_program_file_with_flipped_bit_costs_only_tracing_time(tmp_path):
     check_flips(tmp_path, 10, seed=0)
 
 
 @pytest.mark.slow
-def test_a_thousand_flipped_bits_cost_only_the_time_to_trace(tmp_path):
+def test_program_file_with_thousand_flipped_bits_costs_only_tracing_time(tmp_path):
     check_flips(tmp_path, 1000, seed=1)
 
 
-def test_other_statics_and_shapes_are_other_programs(tmp_path):
+def test_program_is_another_for_other_statics_and_shapes(tmp_path):
     assert run(tmp_path)[0] == 31.0
     assert run(tmp_path, (HuntCrossley(), 1))[0] == 46.0
     assert run(tmp_path, (KelvinVoigt(), 2))[0] == 32.0
@@ -114,7 +114,7 @@ def test_other_statics_and_shapes_are_other_programs(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_changed_sources_are_another_program(tmp_path, monkeypatch):
+def test_program_is_rebuilt_if_sources_change(tmp_path, monkeypatch):
     run(tmp_path)
     package = tmp_path / "package"
     package.mkdir()
@@ -124,7 +124,7 @@ def test_changed_sources_are_another_program(tmp_path, monkeypatch):
     assert len(traced) == 2
 
 
-def test_a_law_from_elsewhere_is_not_kept(tmp_path):
+def test_program_of_user_registered_law_is_not_cached(tmp_path):
     class Mine(KelvinVoigt):
         pass
 
@@ -136,5 +136,5 @@ def test_a_law_from_elsewhere_is_not_kept(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_costs_no_result(tmp_path):
+def test_program_cache_in_unwritable_folder_costs_no_result(tmp_path):
     assert run(tmp_path / "missing")[0] == 31.0

@@ -1,4 +1,4 @@
-"""Progress of long work, where there is no terminal: what is done, the rate, the time left, now and then."""
+"""Progress of long work without a terminal: work done, rate and remaining time, at intervals."""
 
 import re
 import time
@@ -20,7 +20,7 @@ def lines(capsys):
     return capsys.readouterr().err.splitlines()
 
 
-def test_a_line_says_what_is_done_the_rate_and_the_time_left(clock, capsys):
+def test_progress_line_has_work_done_rate_and_remaining_time(clock, capsys):
     with terminal.progress(64, "mechanisms") as bar:
         bar.tell("first", 0)
         clock[0] += 60
@@ -36,7 +36,7 @@ def test_a_line_says_what_is_done_the_rate_and_the_time_left(clock, capsys):
     assert third == "32 of 64 mechanisms, 16 mechanisms/min, 0:02:00 left, second"
 
 
-def test_what_was_done_before_is_no_part_of_the_rate(clock, capsys):
+def test_progress_rate_excludes_work_done_before(clock, capsys):
     with terminal.progress(40, "results") as bar:
         bar.tell("as kept", 20, 20)
         clock[0] += 100
@@ -44,14 +44,14 @@ def test_what_was_done_before_is_no_part_of_the_rate(clock, capsys):
     assert lines(capsys)[1] == "30 of 40 results, 6 results/min, 0:01:40 left, more"
 
 
-def test_of_one_thing_the_share_is_said(clock, capsys):
+def test_progress_of_a_single_item_is_a_share(clock, capsys):
     with terminal.progress(1, "fronts") as bar:
         clock[0] += 36
         bar.tell("searching", 0.25)
     assert lines(capsys) == ["25 %, 41.7 %/min, 0:01:48 left, searching"]
 
 
-def test_stages_are_counted_as_they_begin(clock, capsys):
+def test_progress_counts_stages_as_they_begin(clock, capsys):
     with terminal.stages(3) as stages:
         for text in ("one", "two", "three"):
             stages.begin(text)
@@ -63,7 +63,7 @@ def test_stages_are_counted_as_they_begin(clock, capsys):
     ]
 
 
-def test_what_is_over_at_once_is_not_said(clock, capsys):
+def test_progress_of_short_work_is_not_printed(clock, capsys):
     with terminal.stages(3) as stages:
         for text in ("one", "two", "three"):
             stages.turn_to(text)
@@ -72,7 +72,7 @@ def test_what_is_over_at_once_is_not_said(clock, capsys):
     assert lines(capsys) == ["2 of 3 stages, 10.9 stages/min, 0:00:06 left, three"]
 
 
-def test_silence_is_broken_with_the_time_by_then(monkeypatch, capsys):
+def test_progress_is_printed_with_elapsed_time_after_silence(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 0.02)
     monkeypatch.setattr(terminal, "SECONDS_OF_SILENCE", 0.03)
     with terminal.progress(10, "scenarios") as bar:
@@ -83,7 +83,7 @@ def test_silence_is_broken_with_the_time_by_then(monkeypatch, capsys):
     assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in found)
 
 
-def test_before_anything_is_known_there_is_the_time(clock, capsys):
+def test_progress_shows_elapsed_time_before_anything_is_known(clock, capsys):
     with terminal.progress(100, "runs") as bar:
         clock[0] += 21
         bar.remind()
@@ -91,7 +91,7 @@ def test_before_anything_is_known_there_is_the_time(clock, capsys):
     assert lines(capsys) == ["0:00:21 so far"]
 
 
-def test_unless_it_is_to_be_shown_there_is_nothing(clock, capsys):
+def test_progress_is_silent_unless_requested(clock, capsys):
     with terminal.progress(2, "parts", shown=False) as bar:
         bar.advance(1, "one")
         clock[0] += 100

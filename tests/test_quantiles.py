@@ -1,4 +1,4 @@
-"""Quantiles of |error|: intervals that cover whatever the distribution, from values or from their bins."""
+"""Quantiles of |error|: intervals that cover for any distribution, from values or from bins."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ from tuning.statistics.quantiles import (
 
 @pytest.mark.parametrize("number", (1, 20, 300, 5000))
 @pytest.mark.parametrize("order", (0.05, 0.5, 0.95, 0.999))
-def test_the_ranks_leave_out_at_most_what_is_stated(number, order):
-    """P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
+def test_quantile_ranks_leave_out_at_most_the_stated_probability(number, order):
+    """Use P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
     low, high = ranks(number, order)
     law = stats.binom(number, order)
     below, above = law.cdf(low - 1), law.sf(high - 1)
@@ -30,7 +30,7 @@ def test_the_ranks_leave_out_at_most_what_is_stated(number, order):
     assert wider[0] <= low and wider[1] >= high
 
 
-def test_ranks_of_sequences_hold_at_all_numbers_at_once():
+def test_quantile_ranks_of_sequences_hold_at_all_numbers_at_once():
     rng = np.random.default_rng(0)
     numbers = np.arange(50, 5001, 50)
     for order in (0.5, 0.95):
@@ -42,8 +42,8 @@ def test_ranks_of_sequences_hold_at_all_numbers_at_once():
 
 
 @pytest.mark.parametrize("order", (0.5, 0.95, 0.99))
-def test_repeated_sweeps_cover_the_quantile(order, capsys):
-    """|error| half normal, its quantile in closed form; from the values, and from the bins of two halves."""
+def test_quantile_intervals_of_repeated_sweeps_cover(order, capsys):
+    """Draw half-normal |error| of known quantile; use the values, and the bins of two halves."""
     truth = stats.halfnorm.ppf(order)
     rng = np.random.default_rng(1)
     exact, binned, widths = [], [], []
@@ -69,8 +69,11 @@ def test_repeated_sweeps_cover_the_quantile(order, capsys):
 
 @pytest.mark.parametrize("order", (0.5, 0.99))
 @pytest.mark.parametrize("sampling", ("independent", "sobol"))
-def test_replicates_cover_the_quantile(order, sampling, capsys):
-    """|u_1 + u_2 - 1|, triangular on 0..1, the quantile 1 - sqrt(1 - q), of 16 replicates of 64 points."""
+def test_quantile_intervals_of_replicates_cover(order, sampling, capsys):
+    """Draw |u_1 + u_2 - 1| for 16 replicates of 64 points.
+
+    It is triangular on 0..1, with the quantile 1 - sqrt(1 - q).
+    """
     truth, rng = 1 - np.sqrt(1 - order), np.random.default_rng(4)
     inside, widths = [], []
     for _ in range(200):
@@ -95,7 +98,7 @@ def test_replicates_cover_the_quantile(order, sampling, capsys):
         assert np.median(widths) < 0.6 * (high - low)
 
 
-def test_replicates_without_results_have_no_bound():
+def test_quantile_of_replicates_without_results_has_no_bound():
     none = np.stack([counts([np.nan] * 10)] * 4)
     interval = replicate_quantile(none, 0.5)
     assert interval.value == np.inf and interval.high == np.inf and interval.low >= EDGES[-2]
@@ -105,8 +108,8 @@ def test_replicates_without_results_have_no_bound():
         replicate_quantile(np.stack([counts([1.0]), counts([1.0, 2.0])]), 0.5)
 
 
-def test_ties_cover_too():
-    """Three values only: the quantile is one of them, and both ends may be."""
+def test_quantile_intervals_cover_ties():
+    """Draw from three values only: the quantile is one of them, and both ends may be."""
     rng = np.random.default_rng(2)
     inside = []
     for _ in range(500):
@@ -115,7 +118,7 @@ def test_ties_cover_too():
     assert np.mean(inside) >= 0.95
 
 
-def test_bins_merge_and_hold_everything():
+def test_quantile_bins_merge_and_hold_every_error():
     assert EDGES[0] == 1e-9 and EDGES[-1] >= 1e3 and BINS == len(EDGES) + 1 < 3000
     assert np.max(EDGES[1:] / EDGES[:-1]) <= 1 + RESOLUTION + 1e-12
     rng = np.random.default_rng(3)
@@ -130,7 +133,7 @@ def test_bins_merge_and_hold_everything():
     np.testing.assert_array_equal(counts(np.float32([0.5])), counts([0.5]))
 
 
-def test_failed_runs_are_the_largest_errors():
+def test_failed_runs_count_as_the_largest_errors():
     values = [1.0] * 90 + [np.nan] * 10
     for interval in (quantile(values, 0.95), binned_quantile(counts(values), 0.95)):
         assert np.isinf(interval.value) and np.isinf(interval.high)
@@ -140,7 +143,7 @@ def test_failed_runs_are_the_largest_errors():
 
 
 @pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(counts([]), 0.5)))
-def test_without_values_nothing_is_known(interval):
+def test_quantile_without_values_is_unknown(interval):
     assert np.isnan(interval.value) and interval.low == 0.0 and np.isinf(interval.high)
 
 
@@ -154,6 +157,6 @@ def test_few_values_do_not_bound_a_far_quantile():
 @pytest.mark.parametrize(
     "number, order, level", ((-1, 0.5, 0.9), (5, 0.0, 0.9), (5, 1.0, 0.9), (5, 0.5, 1.0))
 )
-def test_impossible_orders_are_refused(number, order, level):
+def test_quantile_refuses_impossible_orders(number, order, level):
     with pytest.raises(ValueError, match="number, order, level: found"):
         ranks(number, order, level)

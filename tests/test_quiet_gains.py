@@ -1,4 +1,4 @@
-"""The quietest gains within a limit: against a grid of all gains, beside the least error, in one program."""
+"""Quietest gains within a limit: against a grid of all gains, next to the least error, in one program."""
 
 import math
 from types import SimpleNamespace
@@ -82,7 +82,7 @@ def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
     assert noise_of(result, result.gains) < 0.8 * noise_of(result, accurate.gains)
 
 
-def test_gains_of_least_error_stay_where_none_are_within_the_limit(quiet, validation):
+def test_gains_of_least_error_stay_if_none_are_within_the_limit(quiet, validation):
     result = quiet[0][1]
     accurate = most_accurate(result)
     assert not result.quiet and accurate.rms > tolerance_of(LIMIT, SETTINGS.scenarios or 0)
@@ -97,12 +97,12 @@ def validation():
     return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
 
 
-def test_one_program_serves_both_searches(quiet):
+def test_quiet_and_accurate_searches_share_one_program(quiet):
     assert quiet[1] == 1
 
 
 def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
-    """Return the measure of quietness of every pair of the two gains, with the weights of this task."""
+    """Measure the loudness of every pair of the two gains, with the weights of this task."""
     result = quiet[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)
@@ -119,7 +119,7 @@ def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
     assert loudness[-2] <= 1.03 * loudness[:-2][errors[:-2] <= tolerance].min()
 
 
-def test_figures_without_noise_are_those_of_the_mechanism_without_noise(quiet):
+def test_metrics_without_noise_are_those_of_the_mechanism_without_noise(quiet):
     for rig, result in zip(RIGS, quiet[0], strict=True):
         silent = noisy(*rig[:-1], 0.0)
         seed = SETTINGS.seed + VALIDATION_SEED
@@ -131,7 +131,7 @@ def test_figures_without_noise_are_those_of_the_mechanism_without_noise(quiet):
         assert result.without_noise.rms != result.figures["tuned"].rms
 
 
-def test_mechanisms_without_noise_are_tuned_as_if_quiet_were_not_asked_for():
+def test_mechanisms_without_noise_are_tuned_as_if_quiet_was_not_requested():
     silent = load("varying").mechanism
     assert not is_quiet(build_task(silent, LAW, 4, 0), SETTINGS)
     assert not is_quiet(build_task(MECHANISMS[0], "position_lead", 4, 0), SETTINGS)
@@ -139,7 +139,7 @@ def test_mechanisms_without_noise_are_tuned_as_if_quiet_were_not_asked_for():
 
 
 @pytest.mark.slow
-def test_quiet_gains_that_were_kept_are_the_same(quiet, tmp_path):
+def test_cached_quiet_gains_are_the_same(quiet, tmp_path):
     made = tuned(SETTINGS, pieces=Pieces(tmp_path))
     again = tuned(SETTINGS, pieces=Pieces(tmp_path, resume=True))
     for one, other, known in zip(made, again, quiet[0], strict=True):
@@ -162,7 +162,7 @@ def test_quiet_gains_that_were_kept_are_the_same(quiet, tmp_path):
         ({"divergence_weight": 2.0}, False),
     ],
 )
-def test_what_is_asked_for_is_minimised(options, wanted):
+def test_quiet_search_runs_unless_another_objective_is_requested(options, wanted):
     settings = TuneOptions(**options).settings()
     assert settings.quiet is wanted and settings.objective.tolerance is None
 
@@ -200,7 +200,7 @@ def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), g
         ({"unlike": 0.02}, False, "Bad: too many real contacts are unlike the ideal one; the tuned rms"),
     ],
 )
-def test_verdict_says_what_it_looked_at(changes, good, words):
+def test_verdict_names_the_metrics_it_used(changes, good, words):
     result = result_of(**changes)
     line = tune_verdict.verdict_line(result, 0.01)
     assert tune_verdict.is_good(result, 0.01) is good

@@ -1,5 +1,4 @@
-"""The reference contact against numerical integration and limits; derivatives against
-differences."""
+"""Ideal contact against numerical integration and limits; derivatives against differences."""
 
 import functools
 
@@ -108,7 +107,7 @@ KELVIN_VOIGT = [0.0, 1e-6, 0.05, 0.49, 0.5, 0.51, 0.9, 0.97, 0.985, 1.0, 1.015, 
 
 
 @pytest.mark.parametrize("ratio", KELVIN_VOIGT)
-def test_kelvin_voigt_against_integration(ratio):
+def test_kelvin_voigt_contact_agrees_with_integration(ratio):
     damping = damping_of(ratio)
     expected = integrate(lambda d, w: STIFFNESS * d + damping * w, MASS, VELOCITY, PERIOD / max(1.0, ratio))
     result = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
@@ -116,7 +115,7 @@ def test_kelvin_voigt_against_integration(ratio):
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.05, 0.6, 0.95])
-def test_kelvin_voigt_with_tension_against_integration(ratio):
+def test_kelvin_voigt_contact_with_tension_agrees_with_integration(ratio):
     damping = damping_of(ratio)
     expected = integrate(lambda d, w: STIFFNESS * d + damping * w, MASS, VELOCITY, PERIOD, separation="depth")
     result = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, True)
@@ -131,7 +130,7 @@ def test_overdamped_contact_with_tension_sticks(ratio):
     np.testing.assert_allclose(result.peak_force, 2 * ratio * VELOCITY, rtol=1e-15)
 
 
-def test_kelvin_voigt_is_smooth_through_critical_damping():
+def test_kelvin_voigt_contact_is_smooth_through_critical_damping():
     # e = exp(-2 xi g): at xi = 1, g = 1 and g' = -1/3, so that d(log e)/d(xi) = -4/3.
     ratios = [1 - 1e-9, 1.0, 1 + 1e-9, 0.98 - 1e-13, 0.98 + 1e-13, 1.02 - 1e-13, 1.02 + 1e-13]
     values, columns = zip(*(FREE(np.array([1.0, 1.0, 2 * r, 1.0])) for r in ratios), strict=True)
@@ -163,7 +162,7 @@ def integrate_hunt_crossley(exponent, onset, stiffness, velocity):
 
 
 @pytest.mark.parametrize(("exponent", "onset"), HUNT_CROSSLEY)
-def test_hunt_crossley_against_integration(exponent, onset):
+def test_hunt_crossley_contact_agrees_with_integration(exponent, onset):
     expected = integrate_hunt_crossley(exponent, onset, 1e8, VELOCITY)
     result = evaluate(hunt_crossley, MASS, 1e8, exponent, onset / (1.5 * VELOCITY), VELOCITY)
     assert_close(result, expected, 1e-9)
@@ -181,7 +180,7 @@ def test_hunt_crossley_restitution_solves_the_first_integral(onset):
         np.testing.assert_allclose(e * onset, 1.0, rtol=1e-13)
 
 
-def test_undamped_hertz_contact():
+def test_undamped_hertz_contact_has_closed_form_duration():
     # Duration 2.9432 (M^2 / (k^2 v))^(1/5) (5/4)^(2/5): the classical Beta-function integral.
     depth = (2.5 * MASS * VELOCITY**2 / 2 / 1e8) ** 0.4
     result = evaluate(hunt_crossley, MASS, 1e8, 1.5, 0.0, VELOCITY)
@@ -205,7 +204,7 @@ PIECEWISE_LINEAR = [
 
 
 @pytest.mark.parametrize(("slopes", "depths", "ratio"), PIECEWISE_LINEAR)
-def test_piecewise_linear_against_integration(slopes, depths, ratio):
+def test_piecewise_linear_contact_agrees_with_integration(slopes, depths, ratio):
     slopes = STIFFNESS * np.array(slopes)
     depths = VELOCITY * PERIOD * np.array(depths)
     damping = damping_of(ratio)
@@ -216,7 +215,7 @@ def test_piecewise_linear_against_integration(slopes, depths, ratio):
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.floats(1.0, 3.0), st.floats(-3, 0.8), st.floats(-3, 0))
-def test_hunt_crossley_at_random(exponent, onset, velocity):
+def test_hunt_crossley_contact_agrees_with_integration_at_random(exponent, onset, velocity):
     onset, velocity = 10**onset, 10**velocity
     expected = integrate_hunt_crossley(exponent, onset, 1e7, velocity)
     result = evaluate(hunt_crossley, MASS, 1e7, exponent, onset / (1.5 * velocity), velocity)
@@ -229,7 +228,7 @@ two_steps = st.lists(st.floats(0.05, 0.6), min_size=2, max_size=2)
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(three_slopes, two_steps, st.floats(-3, 0.3))
-def test_piecewise_linear_at_random(slopes, steps, ratio):
+def test_piecewise_linear_contact_agrees_with_integration_at_random(slopes, steps, ratio):
     slopes = STIFFNESS * 10 ** np.array(slopes)
     depths = VELOCITY * PERIOD * np.cumsum(steps)
     damping = damping_of(10**ratio)
@@ -240,7 +239,7 @@ def test_piecewise_linear_at_random(slopes, steps, ratio):
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(two_steps, st.floats(-9, 4))
-def test_equal_slopes_are_kelvin_voigt(steps, ratio):
+def test_piecewise_linear_contact_of_equal_slopes_is_kelvin_voigt(steps, ratio):
     damping = damping_of(10**ratio)
     depths = VELOCITY * PERIOD * np.cumsum(steps) / max(1.0, 10**ratio)
     whole = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
@@ -249,7 +248,7 @@ def test_equal_slopes_are_kelvin_voigt(steps, ratio):
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-12, 1e-3, 0.5, 1 - 1e-9, 1.0, 1 + 1e-9, 7.0, 1e5])
-def test_one_segment_is_kelvin_voigt(ratio):
+def test_piecewise_linear_contact_of_one_segment_is_kelvin_voigt(ratio):
     damping = damping_of(ratio)
     whole = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
     chained = evaluate(piecewise_linear, MASS, [STIFFNESS], [], damping, VELOCITY)
@@ -257,7 +256,7 @@ def test_one_segment_is_kelvin_voigt(ratio):
 
 
 @pytest.mark.parametrize("depth", [0.999999999, 1 - 1e-15, 1.0, 1 + 1e-15, 1.000000001])
-def test_a_depth_that_is_only_grazed(depth):
+def test_piecewise_linear_contact_may_just_reach_a_depth(depth):
     depths = VELOCITY * PERIOD * np.array([0.5, depth])
     result = evaluate(piecewise_linear, MASS, [STIFFNESS] * 3, depths, 0.0, VELOCITY)
     assert_close(result, (1.0, VELOCITY * np.sqrt(MASS * STIFFNESS), np.pi * PERIOD), 1e-12)
@@ -304,7 +303,7 @@ DERIVATIVES = [
 
 
 @pytest.mark.parametrize(("function", "parameters"), DERIVATIVES)
-def test_derivatives_against_differences(function, parameters):
+def test_ideal_contact_derivatives_agree_with_differences(function, parameters):
     parameters = np.array(parameters)
     _, columns = function(parameters)
     for index, column in enumerate(np.asarray(columns)):
@@ -325,7 +324,7 @@ def test_derivatives_against_differences(function, parameters):
         (BUFFER, [2.0, 3.0, 9.0, 20.0, 0.1, 0.2, 0.0, 0.5], 6),
     ],
 )
-def test_derivative_by_damping_without_damping(function, parameters, index):
+def test_ideal_contact_without_damping_has_derivative_by_damping(function, parameters, index):
     parameters = np.array(parameters)
     value, columns = function(parameters)
     np.testing.assert_allclose(value[0], 1.0, rtol=1e-14)
@@ -339,7 +338,7 @@ def test_derivative_by_damping_without_damping(function, parameters, index):
 
 @pytest.mark.parametrize("function", [FREE, HELD, POWER, BUFFER])
 @pytest.mark.parametrize("damping", [0.0, 1e-300, 1e-16, 1e-8, 0.5, 1.0, 2 - 1e-15, 2.0, 2 + 4e-15, 1e3, 1e6])
-def test_nothing_is_nan(function, damping):
+def test_ideal_contact_is_never_nan(function, damping):
     parameters = {
         FREE: [1.0, 1.0, damping, 1.0],
         HELD: [1.0, 1.0, damping, 1.0],
@@ -352,7 +351,7 @@ def test_nothing_is_nan(function, damping):
     assert 0 <= value[0] <= 1 + 1e-14
 
 
-def test_batches_keep_shape_and_single_precision_under_strict_promotion():
+def test_ideal_contact_keeps_shape_and_single_precision_of_batches():
     batch = jnp.linspace(0.0, 3.0, 6, dtype=jnp.float32).reshape(2, 3)
     one = jnp.ones_like(batch)
     segments, edges = jnp.stack([one, 3 * one, 5 * one]), jnp.stack([0.3 * one, 0.5 * one])

@@ -1,4 +1,4 @@
-"""The motion in space by integration: closed forms, order of convergence, pushes, paths, derivatives."""
+"""Motion of the ideal contact by integration: closed forms, convergence, pushes, paths, derivatives."""
 
 import functools
 
@@ -75,7 +75,7 @@ def integrated(name, values, tolerance=TOLERANCE, **options):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_closed_forms(case):
+def test_integrated_contact_agrees_with_closed_forms(case):
     found, expected = integrated(*CASES[case])
     np.testing.assert_allclose(found.restitution, expected.restitution, rtol=0, atol=2e-8)
     np.testing.assert_allclose(found.peak_force, expected.peak_force, rtol=2e-8)
@@ -84,7 +84,11 @@ def test_closed_forms(case):
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "piecewise_linear"])
 def test_error_falls_with_the_tolerance(case):
-    """A step of order 5 whose error is E is as long as E^(1/5): the sum of their errors falls as E^(4/5)."""
+    """Expect errors to fall as E^(4/5).
+
+    A step of order 5 whose error is E is as long as E^(1/5), so that the sum of the errors of all steps falls
+    as E^(4/5).
+    """
     tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
     errors = []
     for tolerance in tolerances:
@@ -94,7 +98,7 @@ def test_error_falls_with_the_tolerance(case):
     assert errors[-1] < 1e-9
 
 
-def test_bodies_that_stick_never_separate():
+def test_sticking_bodies_never_separate():
     found, _ = integrated("kelvin_voigt", {"damping": 3 * CRITICAL, "tension": True})
     assert np.all(np.isinf(found.duration))
     assert np.all(found.restitution < 1e-6)
@@ -110,8 +114,8 @@ def pulse(start, length, height):
     return push
 
 
-def test_push_against_scipy():
-    """A pulse at all times of a damped contact: before, at and after the turning point and the separation."""
+def test_pushed_contact_agrees_with_scipy():
+    """Push at all times of a damped contact: before, at and after the turning point and the separation."""
     starts, length, height = np.linspace(0.0, 0.21, LANES), 0.02, 6.0
     damping = 0.05 * CRITICAL
     push = pulse(jnp.asarray(starts), length, height)
@@ -158,8 +162,8 @@ def test_push_after_the_contact_adds_its_impulse():
     np.testing.assert_allclose(found.duration, alone.duration, rtol=1e-9)
 
 
-def test_trajectory_of_linear_contact():
-    """x = v sin(omega t) / omega, then uniform motion; times in any order."""
+def test_trajectory_of_linear_contact_is_the_closed_form():
+    """Use x = v sin(omega t) / omega, then uniform motion; times in any order."""
     times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
     times = times[:, None] * np.ones(LANES)
     found, _ = integrated("linear", {}, times=jnp.asarray(times))
@@ -176,8 +180,8 @@ def test_trajectory_of_linear_contact():
     "case, tolerance",
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
 )
-def test_derivatives_of_the_closed_forms(case, tolerance):
-    """Where a step has a kink inside, its derivative is that of a force a bit off: short as it is."""
+def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance):
+    """Allow for steps with a kink inside: their derivative is that of a slightly different force."""
     name, values = CASES[case]
     law, parameters = LAWS[name], contact(**values)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
@@ -198,7 +202,7 @@ def test_derivatives_of_the_closed_forms(case, tolerance):
     np.testing.assert_array_less(np.abs(found - expected) / np.stack(size)[..., None], tolerance)
 
 
-def test_single_precision_and_vmap():
+def test_integrated_contact_in_single_precision_and_under_vmap():
     law, parameters = LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
     mass, velocity = (np.full(LANES, value, np.float32) for value in (MASS, VELOCITY))
 

@@ -1,4 +1,4 @@
-"""Laws from outside the package: registered, simulated, differentiated; refused where they will not do."""
+"""User-registered laws: registered, simulated and differentiated, or refused."""
 
 import math
 
@@ -25,8 +25,8 @@ def registered():
         jaxhil.register(law)  # as a notebook's cell that runs twice
 
 
-def test_a_compensator_from_elsewhere_is_simulated(registered):
-    """Its lead is that of the built-in phase lead, without a filter: they differ by little."""
+def test_user_registered_compensator_is_simulated(registered):
+    """Give it the lead of the built-in phase lead, without the filter: the results differ little."""
     mechanism = jaxhil.load("varying", TWO)
     plain, none = jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": 0.0}), jaxhil.simulate(mechanism)
     assert [c.restitution for c in plain.contacts] == [c.restitution for c in none.contacts]
@@ -47,7 +47,7 @@ def test_a_compensator_from_elsewhere_is_simulated(registered):
     np.testing.assert_allclose(slope, (high - low) / (2 * step), rtol=1e-5)
 
 
-def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_reference(registered):
+def test_user_registered_contact_law_agrees_with_its_integrated_ideal_contact(registered):
     own = {"contact": {"law": "squared_spring", "stiffness": [1e8]}, "approach.contacts": 1}
     prompt = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "uncertainty": {}}
     mechanism = jaxhil.load("rig-300kg", own | prompt)
@@ -64,7 +64,7 @@ def test_a_contact_law_from_elsewhere_is_simulated_against_its_integrated_refere
     np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
 
 
-def test_what_a_contact_law_does_not_state_is_refused(registered):
+def test_incomplete_contact_law_is_refused(registered):
     mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
     for needs, method in (
         (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),
@@ -77,12 +77,12 @@ def test_what_a_contact_law_does_not_state_is_refused(registered):
     assert "contact.law: found 'none', expected one of linear, " in refusal(laws.contact_law, "none")
 
 
-def test_contact_laws_state_a_key_that_they_share_alike():
+def test_contact_laws_must_describe_a_shared_key_alike():
     for law in laws.LAWS.values():
         assert all(laws.KEYS[key.name] == key for key in law.keys or ())
 
 
-def test_what_cannot_be_registered_is_refused(registered):
+def test_unusable_law_is_not_registered(registered):
     class Unnamed(SquaredSpring):
         name = ""
 
@@ -133,8 +133,8 @@ def test_what_cannot_be_registered_is_refused(registered):
     jaxhil.register(ScaledLead())
 
 
-def test_a_law_that_is_defined_anew_is_the_one_that_runs():
-    """No compiled program of the first is served for the second."""
+def test_redefined_law_is_the_one_that_runs():
+    """Check that no compiled program of the first law serves the second."""
 
     def defined(share):
         class Share(ScaledLead):

@@ -1,4 +1,4 @@
-"""The page for a review board: what it refuses, that names stay text, and how it behaves in a browser."""
+"""Report page for a review board: refusals, names as text, and behaviour in a browser."""
 
 import html
 import json
@@ -84,7 +84,7 @@ def put(tmp_path):
     return write
 
 
-def test_names_stay_text(put):
+def test_names_in_the_report_stay_text(put):
     places = [
         put(identified(), folder="a"),
         put(mapped(), "map.json", "b"),
@@ -100,7 +100,7 @@ def test_names_stay_text(put):
     assert "script-src 'sha256-" in page and "default-src 'none'" in page
 
 
-def test_verdict_is_that_of_the_requirements(put):
+def test_report_verdict_is_that_of_the_requirements(put):
     made = tuning.report(put(identified(effect=0.02, verdict="bad")))
     assert made.verdict == "bad" and "Bad: not every requirement is met." in made.html.decode()
     [one] = made.requirements
@@ -124,13 +124,13 @@ def test_verdict_is_that_of_the_requirements(put):
         ({"schema": "jaxhil/gains/1"}, "sha256: found nothing"),
     ],
 )
-def test_foreign_results_are_refused_in_one_line(jaxhil, put, tmp_path, document, said):
+def test_third_party_results_are_refused_in_one_line(jaxhil, put, tmp_path, document, said):
     ended = jaxhil("report", put(document), "-o", tmp_path / "page.html")
     assert ended.code == 2 and said in ended.err and ended.err.count("\n") == 1
     assert not (tmp_path / "page.html").exists()
 
 
-def test_arguments_are_checked(jaxhil, put, tmp_path):
+def test_report_arguments_are_checked(jaxhil, put, tmp_path):
     one = put(identified())
     for arguments, said in (
         ([], "found nothing"),
@@ -168,7 +168,7 @@ def whole(results, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_all_that_is_known_is_there(whole):
+def test_report_holds_all_that_is_known(whole):
     text = whole.read_text(encoding="utf-8")
     for place in ("requirements", "assumptions", "gains", "runs", "errors", "drivers", "watchdog", "map",
                   "reproduction", "sign-off"):  # fmt: skip
@@ -178,7 +178,7 @@ def test_all_that_is_known_is_there(whole):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
-def test_the_page_opens_offline(whole, browser, width):
+def test_report_page_opens_offline(whole, browser, width):
     assert browser.open(whole, width) == ([], [], [])
     seen = browser.evaluate(LAYOUT)
     assert seen["faults"] == [] and seen["texts"] > 100
@@ -189,7 +189,7 @@ SHOWN = "[...document.querySelectorAll('.trace')].filter(one => one.checkVisibil
 
 
 @pytest.mark.slow
-def test_a_click_on_a_scenario_shows_its_trace(whole, browser):
+def test_click_on_a_scenario_shows_its_trace(whole, browser):
     browser.open(whole, 1440)
     first = browser.evaluate(SHOWN)
     links = browser.evaluate(
@@ -203,7 +203,7 @@ def test_a_click_on_a_scenario_shows_its_trace(whole, browser):
 
 
 @pytest.mark.slow
-def test_pictures_are_magnified(whole, browser):
+def test_report_pictures_can_be_magnified(whole, browser):
     browser.open(whole, 1440)
     seen = "+document.querySelector('.picture svg').getAttribute('viewBox').split(' ')[2]"
     before = browser.evaluate(seen)
@@ -212,8 +212,11 @@ def test_pictures_are_magnified(whole, browser):
 
 
 @pytest.mark.slow
-def test_the_page_is_accessible(whole, browser):
-    """axe-core finds nothing serious; it would take minutes in the pictures, which have names as a whole."""
+def test_report_page_is_accessible(whole, browser):
+    """Expect no serious finding of axe-core.
+
+    Pictures are left out, which would take minutes; each has a name as a whole.
+    """
     package = pytest.importorskip("axe_core_python")
     axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
     for width in WIDTHS:
@@ -226,8 +229,8 @@ def test_the_page_is_accessible(whole, browser):
 
 
 @pytest.mark.slow
-def test_no_figure_is_cut_on_paper(whole, browser):
-    """All that stands on a page fits on one, and nothing is broken between two."""
+def test_report_on_paper_cuts_no_picture(whole, browser):
+    """Expect everything that stands on a page to fit on it, and nothing to be broken between two."""
     browser.open(whole, 1440)
     pages, faults = browser.printed(*A4)
     assert pages > 3 and faults == []

@@ -1,4 +1,4 @@
-"""`jaxhil tune` and `compare` stopped at any moment: resumed, they end as if nothing had happened."""
+"""`jaxhil tune` and `compare` stopped at any moment: resumed, they end as without interruption."""
 
 import json
 import math
@@ -99,7 +99,7 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
 
 
 @pytest.mark.slow
-def test_a_run_resumed_ends_as_if_nothing_had_happened(jaxhil, files, whole, tmp_path):
+def test_resumed_run_ends_as_without_interruption(jaxhil, files, whole, tmp_path):
     expected, every = whole
     # Rounds of the search, the search, and a result each.
     assert every >= 2 + FILES
@@ -113,7 +113,7 @@ def test_a_run_resumed_ends_as_if_nothing_had_happened(jaxhil, files, whole, tmp
 
 
 @pytest.mark.slow
-def test_wherever_it_is_interrupted(jaxhil, files, whole, tmp_path):
+def test_run_resumes_after_interruption_at_any_checkpoint(jaxhil, files, whole, tmp_path):
     expected, every = whole
     for stop in range(1, every + 1):
         for after in (False, True):
@@ -123,7 +123,7 @@ def test_wherever_it_is_interrupted(jaxhil, files, whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_pieces_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path):
+def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path):
     out = tmp_path / "out"
     jaxhil("tune", files, "-o", out, *TINY)
     some = [files / f"m{number}.toml" for number in range(FILES - 1)]
@@ -136,8 +136,8 @@ def test_pieces_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path)
 
 
 @pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
-def test_a_result_kept_is_the_result(tmp_path, number):
-    """All of it, to the bit, what pictures are made of too."""
+def test_checkpointed_result_is_the_result(tmp_path, number):
+    """Compare all of it to the bit, including what pictures are made of."""
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
     made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path)))
     read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path, resume=True)))
@@ -163,7 +163,7 @@ def assert_same(one, other):
 
 
 @pytest.mark.slow
-def test_a_front_is_kept_too(jaxhil, tmp_path):
+def test_front_is_checkpointed_too(jaxhil, tmp_path):
     arguments = ["tune", "rig-300kg", "-o", tmp_path, *TINY, "--pareto", "2"]
     with pytest.MonkeyPatch.context() as patched:
         Writes(patched, stop=8)
@@ -183,8 +183,8 @@ class Scene(NamedTuple):
     mechanism: Mechanism
 
 
-def test_a_comparison_goes_on_with_what_is_missing(tmp_path, monkeypatch):
-    """Figures are made up here; grouping, keeping and reading them are not."""
+def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
+    """Make up the metrics; group, save and read them as usual."""
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]
     groups = [[mechanisms[i] for i in group] for group, _ in common_programs(mechanisms)]
@@ -220,7 +220,7 @@ def test_a_comparison_goes_on_with_what_is_missing(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
-def test_a_process_that_is_killed_loses_nothing(jaxhil, files, whole, tmp_path, signal_number):
+def test_killed_process_loses_nothing(jaxhil, files, whole, tmp_path, signal_number):
     program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
     out = tmp_path / "out"
     command = [sys.executable, "-c", program, "tune", str(files), "-o", str(out), *TINY, "--resume"]

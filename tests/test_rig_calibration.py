@@ -1,4 +1,4 @@
-"""Limits for the rig, calibrated: the watchdog's audit, what it expects, misses and stops in vain."""
+"""Calibrated limits for the rig: the watchdog's audit, its expectation, missed runs and false stops."""
 
 import functools
 import math
@@ -82,7 +82,7 @@ def watch(limits, signals, rules, lane):
 
 
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_the_audit_is_the_watchdogs_to_the_bit(sided):
+def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
     rules, _ = watchdog_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
     chunk, slots = recorded(sided), 8
     audited = audit_contacts(chunk.signals, rules, slots)
@@ -115,7 +115,7 @@ def test_the_audit_is_the_watchdogs_to_the_bit(sided):
     assert contacts == np.sum(np.isfinite(audited.restitution)) >= 2 * LANES
 
 
-def test_it_audits_the_restitution_that_the_loop_tells():
+def test_calibration_audits_the_restitution_that_the_loop_reports():
     rules, distance = watchdog_rules(ONE_SIDED)
     chunk = recorded(1)
     judged = judge_chunk(chunk, rules, distance)
@@ -126,8 +126,8 @@ def test_it_audits_the_restitution_that_the_loop_tells():
     assert np.max(judged.audited.imbalance[ended]) < 1e-11
 
 
-def test_audit_of_a_law_with_a_status_begins_when_the_law_acts():
-    """The surface lies 1 mm nearer than specified: neither position ever passes it."""
+def test_audit_of_a_law_with_status_begins_when_the_law_acts():
+    """Place the surface 1 mm nearer than specified: neither position ever passes the specified one."""
     nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
     assert watchdog_rules(nearer)[0].has_status and not watchdog_rules(ONE_SIDED)[0].has_status
     (chunk,) = recorded_chunks(nearer, Scenarios("random", 1, 8))
@@ -136,7 +136,7 @@ def test_audit_of_a_law_with_a_status_begins_when_the_law_acts():
     np.testing.assert_allclose(audited.restitution, chunk.contacts.restitution[:2], atol=1e-6)
 
 
-def test_every_limit_is_there_and_loads(calibrated):
+def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
     limits = calibrated[0].limits
     assert list(limits) == list(LIMITS)
     # From how far a rig approaches one surface is its own affair.
@@ -155,7 +155,7 @@ def test_every_limit_is_there_and_loads(calibrated):
     assert 0 < limits["measured_highest"] < 0.01
 
 
-def test_a_long_approach_is_no_fault(calibrated):
+def test_long_approach_is_no_fault(calibrated):
     controller = limited_controller(ONE_SIDED, limits_section(calibrated[0].limits))
     velocity, period = ONE_SIDED.mechanism.approach.velocity, ONE_SIDED.mechanism.rig.control_period
     for tick in range(5000):
@@ -165,8 +165,8 @@ def test_a_long_approach_is_no_fault(calibrated):
         assert controller.faults == 0
 
 
-def test_contacts_without_a_force_are_over_though_the_law_s_output_hardly_decays(calibrated):
-    """In and out of contact, out for less time than the output is given to die out."""
+def test_contacts_without_force_end_though_the_law_output_hardly_decays(calibrated):
+    """Alternate contact and flight, with less flight than the output is given to die out."""
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
     def faults(output):
@@ -181,7 +181,7 @@ def test_contacts_without_a_force_are_over_though_the_law_s_output_hardly_decays
     assert CONTACT_TOO_LONG in faults(1e-3) and CONTACT_TOO_LONG not in faults(1e-9)
 
 
-def test_limits_of_the_rig_s_own_stay_and_count():
+def test_rig_specific_limits_are_preserved_and_count():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
     found = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: found.limits[name] for name in small} == small
@@ -190,7 +190,7 @@ def test_limits_of_the_rig_s_own_stay_and_count():
     assert rate["alarms"] == rate["runs"] > 0
 
 
-def test_the_controller_stops_what_is_bad_and_nothing_that_is_good(calibrated):
+def test_controller_stops_bad_runs_and_no_good_run(calibrated):
     (limits, rates), chunk = calibrated
     rules, distance = watchdog_rules(ONE_SIDED)
     judged = judge_chunk(chunk, rules, distance)
@@ -212,15 +212,15 @@ def test_the_controller_stops_what_is_bad_and_nothing_that_is_good(calibrated):
     assert rates["missed_alarms"]["runs"] > 10 and 0 < rates["missed_alarms"]["high"] < 0.3
 
 
-def test_known_damping_needs_no_identified_one(calibrated):
+def test_specified_damping_requires_no_identified_damping(calibrated):
     rates = calibrated[0].rates
     assert rates["terms"] == ["1", "p", "pp", "ppp"]
     assert rates["expectation_largest"] < 2e-3 and rates["restitution_margin"] == 0.75 * LIMIT
     assert rates["widened_from"] is None and rates["noticed_from"]["error"] < LIMIT
 
 
-def test_unknown_damping_is_distinguished_from_delay_by_nothing():
-    """The margin is widened until good runs pass, at a price that is stated."""
+def test_unspecified_damping_is_not_distinguished_from_delay():
+    """Expect a margin that is widened until good runs pass, at a stated price."""
     loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})
     rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES).rates
     assert "z" in rates["terms"]
@@ -239,14 +239,14 @@ def test_unknown_damping_is_distinguished_from_delay_by_nothing():
     assert rates["widened_from"] is None and rates["reasons"][0].startswith("false alarms: ")
 
 
-def test_an_undamped_contact_is_to_return_all():
+def test_undamped_contact_is_expected_to_return_all_energy():
     rng = np.random.default_rng(0)
     features = Features(*rng.uniform(1.0, 2.0, (3, 100)))
     fitted = fit_expectation(features, np.ones(100), np.arange(100), 350.0, 1e-4)
     assert fitted.coefficients == {**dict.fromkeys(TERMS, 0.0), "1": pytest.approx(1.0)}
 
 
-def test_a_known_polynomial_is_found():
+def test_calibration_finds_a_known_polynomial():
     rng = np.random.default_rng(1)
     features = Features(
         1e5 * rng.uniform(0.5, 2, 400), 300 * rng.uniform(0.5, 2, 400), rng.uniform(4e-3, 6e-3, 400)
@@ -262,7 +262,7 @@ def test_a_known_polynomial_is_found():
     assert np.sum(inside) > 300 and np.max(np.abs(again - expected[inside])) < 1e-9
 
 
-def test_a_store_is_run_again(tmp_path):
+def test_calibration_runs_a_store_again(tmp_path):
     document = case(2, "response_error")
     manifest = sweep_manifest(document, scenarios=LANES, limit=LIMIT)
     store = open_store(tmp_path / "store", manifest, resume=False)
@@ -286,8 +286,8 @@ def test_a_store_is_run_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_of_a_hundred_thousand_scenarios_none_is_missed():
-    """The built-in claw, gains a little off the literature's, so that many runs are good and many are not."""
+def test_calibration_misses_none_of_a_hundred_thousand_scenarios():
+    """Use the built-in claw and gains near the literature's, so that many runs are good and many are not."""
     parsed = load("claw-350kg").mechanism
     law = literature_gains(parsed, "response_error")
     law |= {"response_error": 0.93 * law["response_error"], "phase_lead": 1.1 * law["phase_lead"]}
@@ -321,7 +321,7 @@ def signals(**columns):
     return Signals(**every, live=live, begins=begins)
 
 
-def test_the_extent_of_a_run():
+def test_extent_of_a_run_has_its_largest_and_smallest_values():
     made = signals(
         force=[0.0, 0.5, 0.5, 0.5, 7.0, -9.0],
         measured=[-4.0, -3.0, 1.0, 3.0, 3.0, 4.0],
@@ -352,15 +352,15 @@ def test_the_extent_of_a_run():
 
 
 @pytest.mark.parametrize(("force", "travel"), [(0.0, 1.5 + 0.5), (5.0, 1.5 + 0.5 + 0.5 + 0.3 + 0.5)])
-def test_extent_counts_no_force_only_on_the_way_into_a_contact(force, travel):
-    """As the runtime's guard does: a damped mechanism comes out of it without a force."""
+def test_extent_counts_missing_force_only_on_the_way_into_a_contact(force, travel):
+    """Count as the runtime's guard does: a damped mechanism leaves the contact without a force."""
     flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
     made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
     found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
     assert float(found.force_stuck[0]) == pytest.approx(travel)
 
 
-def test_margins_are_on_good_runs_alone(calibrated):
+def test_margins_are_set_by_good_runs_alone(calibrated):
     _, chunk = calibrated
     rules, distance = watchdog_rules(ONE_SIDED)
     judged = judge_chunk(chunk, rules, distance)
@@ -370,6 +370,6 @@ def test_margins_are_on_good_runs_alone(calibrated):
 
 
 @pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
-def test_impossible_choices_are_refused(keywords):
+def test_calibration_refuses_impossible_choices(keywords):
     with pytest.raises(InputError, match=r"found .*, allowed"):
         calibrate(ONE_SIDED, **keywords)

@@ -1,4 +1,4 @@
-"""The rig's loop in six degrees of freedom: one axis as its oracle, momentum, and a world turned and boosted.
+"""Rig's loop in six degrees of freedom: one axis as oracle, momentum, and a rotated and boosted world.
 
 One program; its lanes are the cases. All have the rig of claw-350kg, but for the delays of two.
 """
@@ -155,7 +155,7 @@ def energy_error(seen, lane, mass, speed):
     ("integrator", "hold", "latency"),
     [("semi_implicit_euler", "linear", 0), ("zoh", "zoh", 1), ("explicit_euler", "linear", 1)],
 )
-def test_a_central_contact_is_that_of_one_axis(integrator, hold, latency):
+def test_central_contact_is_that_of_one_axis(integrator, hold, latency):
     changes = {"rig.integrator": integrator, "rig.command_hold": hold, "rig.command_latency": latency}
     expected = package.simulate(package.load("claw-350kg", changes), "none").contacts[0].restitution
     found = simulated(integrator, hold, latency, 16)
@@ -163,8 +163,8 @@ def test_a_central_contact_is_that_of_one_axis(integrator, hold, latency):
     np.testing.assert_allclose(energy_error(found, CENTRAL, 350, 0.005), expected**2 - 1, rtol=1e-9)
 
 
-def test_off_the_line_it_is_that_of_the_effective_mass(seen):
-    """To first order in the rotation during the contact: ten times slower, ten times nearer."""
+def test_contact_off_the_line_is_that_of_the_effective_mass(seen):
+    """Compare to first order in the rotation during the contact: ten times slower, ten times nearer."""
     mass = effective_mass()
     assert mass < 300
     expected = energy_error(seen, LIGHT, mass, 5e-3)
@@ -182,7 +182,7 @@ def test_momentum_is_constant_on_the_rig(seen):
     assert np.max(np.abs(seen["force"][OBLIQUE, :, 0])) > 1
 
 
-def test_the_world_may_be_turned_and_boosted(seen):
+def test_six_axis_contact_is_invariant_to_rotation_and_boost_of_the_world(seen):
     for key in ("force", "moment"):
         one, other = seen[key][OBLIQUE], seen[key][ELSEWHERE]
         np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(one)))

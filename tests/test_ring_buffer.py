@@ -12,7 +12,7 @@ SAMPLES, LANES = 8, 3
 
 
 @given(st.integers(0, 40), st.lists(st.integers(0, SAMPLES - 1), min_size=LANES, max_size=LANES))
-def test_a_ring_gives_back_its_last_samples(extra, ticks):
+def test_ring_buffer_returns_its_last_samples(extra, ticks):
     history = np.random.default_rng(extra).normal(size=(SAMPLES + extra, LANES))
     ring = jnp.zeros((SAMPLES, LANES))
     for tick, sample in enumerate(history):
@@ -23,8 +23,8 @@ def test_a_ring_gives_back_its_last_samples(extra, ticks):
 
 
 @given(st.integers(0, 40), st.integers(0, SAMPLES - 1), st.integers(0, SAMPLES - 1))
-def test_what_is_not_known_is_otherwise(newest, ticks, last):
-    """Where all lanes look back alike, and where one does not."""
+def test_ring_buffer_returns_default_for_unknown_samples(newest, ticks, last):
+    """Cover lanes that all look back alike, and one that does not."""
     ring = jnp.asarray(np.random.default_rng(newest).normal(size=(SAMPLES, LANES)))
     ticks, known = np.array([ticks, ticks, last], np.int32), np.array([True, False, True])
     otherwise = np.arange(LANES, dtype=float)
@@ -33,7 +33,7 @@ def test_what_is_not_known_is_otherwise(newest, ticks, last):
     np.testing.assert_array_equal(read, np.where(known, samples, otherwise))
 
 
-def test_written_in_turn_or_at_once_is_the_same():
+def test_ring_buffer_written_in_turn_or_at_once_is_the_same():
     generator = np.random.default_rng(1)
     rings = {name: jnp.asarray(generator.normal(size=(SAMPLES, LANES))) for name in "abc"}
     values = {name: jnp.asarray(generator.normal(size=LANES)) for name in "abc"}
@@ -42,7 +42,7 @@ def test_written_in_turn_or_at_once_is_the_same():
         jax.tree.map(np.testing.assert_array_equal, write_in_turn(rings, tick, values), one_by_one)
 
 
-def test_a_tie_changes_no_value_and_no_derivative():
+def test_ring_buffer_tie_changes_no_value_and_no_derivative():
     value, read = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, -0.0, jnp.inf])
     np.testing.assert_array_equal(depend_on(value, read), value)
     tangents = jnp.ones(3), 5 * jnp.ones(3)

@@ -1,4 +1,4 @@
-"""The loop against the event-accurate oracle over the registry of cases; what a batch promises its lanes.
+"""Loop against the event-accurate oracle over the registry of cases; promises of a batch to its lanes.
 
 Where nothing but linear systems and samples of a memoryless law is involved the two agree to rounding; what
 is read off between samples (peak, work, a sensor's lag) has the errors stated below.
@@ -68,7 +68,7 @@ def both(name):
 
 
 @every_case
-def test_motion_of_every_contact(name):
+def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
     accuracy = ACCURACY.get(name, 1e-11)
     for found, expected in both(name):
         assert found["status"] == OK and expected["status"] == "over"
@@ -86,7 +86,7 @@ def test_motion_of_every_contact(name):
         )
 
 
-def test_drives_that_have_caught_up_fall_short_no_more():
+def test_shortfall_is_zero_once_the_drives_have_caught_up():
     rattling, always = (
         [found["position_shortfall"] for found in cases.loop_contacts(name)]
         for name in ("rattling, faster than the drives at first", "velocity limit")
@@ -95,7 +95,7 @@ def test_drives_that_have_caught_up_fall_short_no_more():
 
 
 @every_case
-def test_peak_of_the_real_force(name):
+def test_rollout_peak_force_agrees_with_oracle(name):
     # Dry friction changes sides at the deepest point, which lies between samples.
     accuracy = 1e-3 if "preload" in name else 1e-4
     for found, expected in both(name):
@@ -103,7 +103,7 @@ def test_peak_of_the_real_force(name):
 
 
 @every_case
-def test_work_of_the_real_force(name):
+def test_rollout_work_agrees_with_oracle(name):
     for found, expected in both(name):
         accuracy = expected["work_in"] * WORK_ACCURACY.get(name, 3e-5)
         if CASES[name].mechanism["rig"]["simulator"]["model"] == "ideal" and name not in WORK_ACCURACY:
@@ -115,14 +115,14 @@ def test_work_of_the_real_force(name):
 @pytest.mark.parametrize(
     "name", [one for one in slow_if_seldom if "clearance" not in CASES[one.values[0]].mechanism["contact"]]
 )
-def test_first_contact_is_over_at_the_oracles_tick(name):
+def test_rollout_first_contact_ends_at_the_oracles_tick(name):
     ticks, length = cases.loop_contacts(name)[0]["ticks"], stretch_length(cases.batches()[name].loop)
     assert 0 < ticks - cases.oracle_contacts(name)[0]["end_tick"] <= length
 
 
 @pytest.mark.slow
-def test_lag_at_every_control_period():
-    """Contact at 5 Hz, elastic and heavily damped, under the compensation that a lag upsets most."""
+def test_rollout_with_sensor_lag_agrees_at_every_control_period():
+    """Use contact at 5 Hz, elastic and heavily damped, with the compensation that a lag upsets most."""
     periods = (0.25e-3, 1e-3, 2e-3, 4e-3)
     lagged = {
         (ratio, period): Case(
@@ -157,7 +157,7 @@ def recorded():
 
 
 @pytest.mark.parametrize("name", RECORDED)
-def test_every_tick_of_the_first_contact(recorded, name):
+def test_rollout_agrees_with_oracle_at_every_tick_of_the_first_contact(recorded, name):
     batch, _, ticks = recorded
     lane = batch.names.index(name)
     expected = cases.run_oracle(CASES[name], contacts=1, record=True)[0]["signals"]
@@ -173,7 +173,7 @@ def test_every_tick_of_the_first_contact(recorded, name):
         np.testing.assert_allclose(found[:count, lane], expected[key][:count], rtol=0, atol=1e-11 * scale)
 
 
-def test_recorded_run_says_what_the_metrics_say(recorded):
+def test_recorded_run_agrees_with_its_metrics(recorded):
     batch, metrics, ticks = recorded
     rolled = batch.run()
     # The recording ends before the later contacts do.
@@ -234,7 +234,7 @@ def mixed():
     return batch, run, jax.tree.map(np.asarray, run(batch.loop, batch.gains, batch.scenario))
 
 
-def test_status_of_every_lane(mixed):
+def test_rollout_reports_a_status_for_every_lane(mixed):
     batch, _, metrics = mixed
     assert dict(zip(batch.names, metrics.status[0].tolist(), strict=True)) == {
         "plain": OK,
@@ -254,7 +254,7 @@ def test_status_of_every_lane(mixed):
 
 
 @pytest.mark.parametrize("name", ["varying", "rattling"])
-def test_a_position_that_nobody_reads_changes_no_bit(name):
+def test_position_reading_that_nobody_uses_changes_no_bit(name):
     drawn = load(name).mechanism
     scenario = build_scenarios(drawn, draw(drawn, 5, 1))
     loop = build_loop(drawn, "none", scenario)
@@ -268,7 +268,7 @@ def test_a_position_that_nobody_reads_changes_no_bit(name):
     jax.tree.map(np.testing.assert_array_equal, metrics, run(True, scenario))
 
 
-def test_padding_is_inert(mixed):
+def test_padding_lanes_are_inert(mixed):
     batch, run, metrics = mixed
     lane = batch.names.index("padding")
     for name, values in metrics._asdict().items():
@@ -287,7 +287,7 @@ def test_padding_is_inert(mixed):
         np.testing.assert_array_equal(np.asarray(found)[:, 0], expected[:, 0])
 
 
-def test_another_mechanism_uses_the_same_program(mixed):
+def test_rollout_of_another_mechanism_uses_the_same_program(mixed):
     batch, run, _ = mixed
     other = validated(
         mechanism(
@@ -357,7 +357,7 @@ def test_noise_belongs_to_the_lane_not_to_the_batch(noisy_run):
     assert np.all(np.abs(other.restitution[0] - together.restitution[0]) > 1e-6)
 
 
-def test_noise_is_white(noise):
+def test_sensor_noise_is_white(noise):
     for values, deviation in zip(noise, (2.0, 1e-6), strict=True):
         count = values.size
         assert values.std() == pytest.approx(deviation, rel=4 / np.sqrt(2 * count))
@@ -372,7 +372,7 @@ def test_noise_is_white(noise):
     assert abs(np.mean(noise[0] * noise[1]) / 2e-6) < 4 / np.sqrt(count)
 
 
-def test_a_contact_meets_the_same_noise_however_long_the_one_before(noise):
+def test_noise_of_a_contact_does_not_depend_on_the_length_of_the_last(noise):
     loop, gains, scenario = noisy_batch(6)
     begins = []
     for softer in (1.0, 0.5):
@@ -388,7 +388,7 @@ def test_a_contact_meets_the_same_noise_however_long_the_one_before(noise):
 
 
 @pytest.mark.parametrize("lane", [0, 3])
-def test_noisy_contacts_against_the_oracle(noisy_run, noise, lane):
+def test_rollout_of_noisy_contacts_agrees_with_oracle(noisy_run, noise, lane):
     phase = np.linspace(0, 1, 9)[lane]
     case = Case({**NOISY, "approach": {**NOISY["approach"], "phase": phase}}, "response_error", NOISY_GAINS)
     force, position = (list(values[..., lane]) for values in noise)

@@ -53,7 +53,7 @@ def found():
     return [np.asarray(part) for part in everything(jnp.asarray(THETA), jnp.asarray(RATE))]
 
 
-def test_exponential_and_rotation_are_scipys(found):
+def test_exponential_and_rotation_agree_with_scipy(found):
     turns = Rotation.from_rotvec(THETA.T)
     sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * found[0], axis=0))
     np.testing.assert_allclose(found[0], sign * np.roll(turns.as_quat(), 1, axis=1).T, atol=4e-16)
@@ -64,7 +64,7 @@ def test_exponential_and_rotation_are_scipys(found):
     np.testing.assert_allclose(found[8], RATE, rtol=1e-12, atol=1e-13)
 
 
-def test_logarithm_undoes_the_exponential(found):
+def test_logarithm_inverts_the_exponential(found):
     np.testing.assert_allclose(found[2][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     np.testing.assert_allclose(found[7][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     # Half a turn either way is the same rotation.
@@ -73,7 +73,7 @@ def test_logarithm_undoes_the_exponential(found):
 
 
 def test_left_jacobian_is_the_mean_rotation(found):
-    """Jl(theta) is the mean of exp(s theta) over s in [0, 1]: the upper right block of an exponential."""
+    """Compare with the mean of exp(s theta) over s in [0, 1], the upper right block of an exponential."""
     for column in range(THETA.shape[1]):
         x, y, z = THETA[:, column]
         hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -82,8 +82,8 @@ def test_left_jacobian_is_the_mean_rotation(found):
     np.testing.assert_allclose(found[4], RATE, rtol=1e-12, atol=1e-13)
 
 
-def test_turns_of_many_radians():
-    """Where series end and half turns are counted: twice half a turn and more, and next to each."""
+def test_rotations_of_many_radians_agree_with_scipy():
+    """Cover the limits of the series and multiples of half a turn, exactly and next to each."""
     angles = np.r_[np.pi * np.arange(1, 9) + 1e-7, np.pi * np.arange(1, 9) - 1e-7, np.linspace(3, 400, 24)]
     found = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
     turns = Rotation.from_rotvec((AXES * angles).T)
@@ -96,7 +96,7 @@ def test_turns_of_many_radians():
 
 
 @pytest.mark.slow
-def test_derivatives_at_no_rotation_are_those_of_the_series():
+def test_rotation_derivatives_at_zero_are_those_of_the_series():
     rate = Vector(*jnp.asarray([0.3, -0.2, 0.5]))
 
     def there_and_back(theta):
@@ -117,8 +117,8 @@ def test_derivatives_at_no_rotation_are_those_of_the_series():
 
 
 @pytest.mark.slow
-def test_derivatives_up_to_the_third_order_along_a_ray():
-    """Each against central differences of the one before, on both sides of where series begin."""
+def test_rotation_derivatives_to_third_order_agree_along_a_ray():
+    """Compare each with central differences of the lower order, on both sides of the limit of the series."""
     angles = jnp.asarray([0.0, 1e-8, 0.1, 0.19, 0.2, 0.21, 0.49, 0.5, 0.51, 1.5, 3.0])
     axis, rate = (vector(jnp.asarray(part)[:, :11]) for part in (AXES, RATE))
 

@@ -1,4 +1,4 @@
-"""Many problems through one program: the same optima as alone, hopeless starts left, bad ones harmless."""
+"""Many problems in one program: same optima as alone, hopeless starts dropped, failures isolated."""
 
 import numpy as np
 import pytest
@@ -57,14 +57,14 @@ def test_every_start_is_accounted_for(solved):
     assert any(start.status == GIVEN_UP for starts in solved for start in starts)
 
 
-def test_each_task_ends_as_it_does_alone(tasks, solved):
+def test_every_task_ends_as_it_does_alone(tasks, solved):
     for task, together in zip(tasks, solved, strict=True):
         (alone,) = solve_tasks([task], spread([task]), STEPS)
         best = min(start.rms for start in alone)
         assert min(start.rms for start in together) == pytest.approx(best, rel=1e-6)
 
 
-def test_a_task_that_fails_harms_no_other(tasks, solved):
+def test_failed_task_harms_no_other(tasks, solved):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = rounds.dataclasses.replace(tasks[1], scenarios=broken)
     starts = solve_tasks([tasks[0], sick, tasks[2]], spread(tasks), STEPS)
@@ -73,8 +73,8 @@ def test_a_task_that_fails_harms_no_other(tasks, solved):
     assert all(start.rms == pytest.approx(3.0) or not np.isfinite(start.rms) for start in starts[1])
 
 
-def test_the_objective_is_what_is_lowered(tasks):
-    """Where a squared divergence counts 16 times, less diverges; both objectives in one call."""
+def test_solver_lowers_the_requested_objective(tasks):
+    """Weigh a squared divergence 16 times, so that less diverges; both objectives in one call."""
     objectives = [RMS, Objective(divergence_weight=16.0)]
     plain, cautious = (
         min(starts, key=lambda start: start.rms)
@@ -86,7 +86,7 @@ def test_the_objective_is_what_is_lowered(tasks):
     assert np.maximum(errors[1], 0).sum() < np.maximum(errors[0], 0).sum()
 
 
-def test_the_search_sees_what_the_solver_sees(tasks, solved, validation):
+def test_global_search_uses_the_objective_of_the_solver(tasks, solved, validation):
     for index, starts in enumerate(solved):
         coordinates = np.stack([start.coordinates for start in starts])
         values = validation.losses(RMS, [index], coordinates[None])[0]
@@ -96,7 +96,7 @@ def test_the_search_sees_what_the_solver_sees(tasks, solved, validation):
 
 
 def test_every_task_is_searched_under_its_own_objective(tasks, validation):
-    """The values, starts and ends of tasks together are those that each has alone under its objective."""
+    """Compare the values, starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=4.0), Objective(noise_weight=0.01), Objective(noise_weight=0.1)]
     points = np.random.default_rng(0).random((2, 5, 2))
     together = validation.losses(several, [2, 0], points)
@@ -113,7 +113,7 @@ def restitution_errors_of(task, gains):
     return outcome.error[outcome.wanted]
 
 
-def test_every_device_has_as_many_of_the_long_ones():
-    """Places of a call are cut into one stretch for each of the two devices."""
+def test_long_tasks_are_spread_evenly_over_devices():
+    """Divide the slots of a call into one contiguous part for each of the two devices."""
     np.testing.assert_array_equal(rounds.sharded(8), [0, 2, 4, 6, 1, 3, 5, 7])
     np.testing.assert_array_equal(rounds.sharded(3), [0, 1, 2])

@@ -1,4 +1,4 @@
-"""The runtime's controller from run to run: what repeats, what is forgotten, what trips it, where it runs."""
+"""Runtime controller from run to run: repeatability, reset, trips, and where it runs."""
 
 import json
 import math
@@ -18,7 +18,7 @@ RUNTIME = Path(jaxhil.rig.__file__).parent
 
 
 @pytest.mark.parametrize("name", sorted(GAINS))
-def test_runs_repeat_bit_for_bit_after_reset(name):
+def test_controller_repeats_runs_bit_for_bit_after_reset(name):
     ticks = readings(300)
     controller = Controller.from_dict(gain_document(name))
     first = run(controller, ticks)
@@ -30,7 +30,7 @@ def test_runs_repeat_bit_for_bit_after_reset(name):
     assert all(type(value) is float for value in first)
 
 
-def test_numpy_scalars_and_integers_give_the_same_plain_floats():
+def test_controller_returns_same_floats_for_numpy_scalars_and_integers():
     ticks = readings(200)
     document = gain_document()
     plain = run(Controller.from_dict(document), ticks)
@@ -40,7 +40,7 @@ def test_numpy_scalars_and_integers_give_the_same_plain_floats():
     assert all(type(value) is float for value in scalars)
 
 
-def test_reset_forgets_and_next_contact_keeps_what_was_identified():
+def test_controller_reset_forgets_and_next_contact_keeps_identification():
     ticks = readings(300)
     controller = Controller.from_dict(gain_document())
     run(controller, ticks)
@@ -63,7 +63,7 @@ def test_reset_forgets_and_next_contact_keeps_what_was_identified():
 @pytest.mark.parametrize("name", sorted(GAINS))
 @pytest.mark.parametrize("position", range(5))
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_input_that_is_not_finite_trips_until_reset(name, position, value):
+def test_controller_trips_on_nonfinite_input_until_reset(name, position, value):
     controller = Controller.from_dict(gain_document(name))
     readings = (100.0, 1e-3, 0.0, 1e-3)
     healthy = controller.step(*readings, 0.0)
@@ -83,19 +83,19 @@ def test_input_that_is_not_finite_trips_until_reset(name, position, value):
     assert controller.step(*readings, 0.004) == healthy
 
 
-def test_input_that_is_no_number_trips():
+def test_controller_trips_on_input_that_is_no_number():
     controller = Controller.from_dict(gain_document())
     assert controller.step(None, 0.0, 0.0, 0.0) == 0.0  # type: ignore[arg-type]
     assert controller.status == "tripped: force_not_finite (force_measured is null)"
 
 
-def test_force_that_overflows_trips():
+def test_controller_trips_on_force_that_overflows():
     controller = Controller.from_dict(gain_document("virtual_contact"))
     assert controller.step(0.0, 1e-3, 1.7e308, 0.0) == 0.0
     assert controller.status == "tripped: command_not_finite"
 
 
-def test_position_command_that_is_not_finite_trips_and_holds():
+def test_controller_trips_on_nonfinite_position_command_and_holds():
     controller = Controller.from_dict(gain_document())
     assert controller.position_command(-0.02, 0.005, 0.0) == -0.02
     assert controller.position_command(math.nan, 0.005, 0.0) == -0.02
@@ -103,7 +103,7 @@ def test_position_command_that_is_not_finite_trips_and_holds():
     assert controller.step(10.0, 0.0, 0.0, 0.0) == 0.0
 
 
-def test_missed_ticks_are_counted():
+def test_controller_counts_missed_ticks():
     controller = Controller.from_dict(gain_document("none"))
     for time in (0.0, 0.001, 0.0024, 0.0034, 0.0054, 0.0094):
         controller.step(1.0, 0.0, 0.0, 0.0, time)
@@ -128,7 +128,7 @@ def test_controllers_share_no_state():
     assert interleaved == alone
 
 
-def test_runs_where_only_the_standard_library_can_be_imported(tmp_path):
+def test_controller_runs_with_the_standard_library_alone(tmp_path):
     path = tmp_path / "gains.json"
     path.write_text(json.dumps(gain_document()))
     program = f"""
@@ -154,7 +154,7 @@ print(repr(controller.step(100.0, 1e-3, 0.0, 1e-3)))
     assert shown.stderr == ""
 
 
-def test_former_name_of_the_package_is_still_imported():
+def test_former_package_name_can_still_be_imported():
     program = (
         "import warnings\nwarnings.simplefilter('ignore')\n"
         "import jaxhil.runtime, jaxhil.rig\nfrom jaxhil.runtime import Controller\n"

@@ -1,4 +1,4 @@
-"""What the runtime's controller makes of a gain file: one that does not fit is refused with one line."""
+"""Gain files in the runtime's controller: a file that does not fit is refused with one line."""
 
 import json
 import math
@@ -53,7 +53,7 @@ JSON_VALUES = st.recursive(
 
 @given(place=st.sampled_from(SIGNED), value=JSON_VALUES, remove=st.booleans())
 @settings(max_examples=300, deadline=None)
-def test_any_mutation_of_one_field_is_refused(place, value, remove):
+def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
     name, path = place
     document = gain_document(name)
     container, key = at(document, path[:-1]), path[-1]
@@ -68,7 +68,7 @@ def test_any_mutation_of_one_field_is_refused(place, value, remove):
 
 @given(value=JSON_VALUES, path=st.sampled_from([p for n, p in SIGNED if n == "response_error"]))
 @settings(max_examples=300, deadline=None)
-def test_mutations_signed_anew_load_or_are_refused_with_one_line(path, value):
+def test_gain_file_mutated_and_signed_anew_loads_or_is_refused_in_one_line(path, value):
     document = gain_document()
     at(document, path[:-1])[path[-1]] = value
     try:
@@ -85,7 +85,7 @@ def test_mutations_signed_anew_load_or_are_refused_with_one_line(path, value):
 
 
 @pytest.mark.parametrize("name", sorted(GAINS))
-def test_file_and_dictionary_give_the_same_controller(name, tmp_path):
+def test_gain_file_and_dictionary_give_the_same_controller(name, tmp_path):
     document = gain_document(name)
     path = tmp_path / "gains.json"
     path.write_text(json.dumps(document, indent=2), encoding="utf-8")
@@ -93,7 +93,7 @@ def test_file_and_dictionary_give_the_same_controller(name, tmp_path):
     assert run(Controller.from_file(path), ticks) == run(Controller.from_dict(document), ticks)
 
 
-def test_digest_covers_content_but_not_date_and_timings():
+def test_gain_file_digest_covers_content_but_not_date_and_timings():
     document = gain_document()
     stated = document["sha256"]
     document["created"], document["timings"] = "later", {}
@@ -153,17 +153,17 @@ def change(*path_and_value: Any) -> dict[str, Any]:
         (("mechanism", "contact", "clearance", -1.0), ["mechanism.contact.clearance", "-1.0"]),
     ],
 )
-def test_content_that_does_not_fit_is_refused_by_key(edit, words):
+def test_gain_file_that_does_not_fit_is_refused_by_key(edit, words):
     refused(change(*edit), *words)
 
 
-def test_a_delay_of_too_many_periods_is_refused():
+def test_gain_file_with_delay_of_too_many_periods_is_refused():
     document = gain_document(control_period=1e-5)
     document["gains"]["identification_delay"] |= {"value": 1.5, "upper": 1.5}
     refused(sign(document), "gains", "periods, allowed 0 to 100000")
 
 
-def test_schema_and_digest_are_checked_before_the_rest():
+def test_gain_file_schema_and_digest_are_checked_first():
     refused({}, "schema", "nothing")
     refused([], "a list")
     refused({"schema": "jaxhil/gains/2"}, "'jaxhil/gains/2'", "'jaxhil/gains/1'")
@@ -174,7 +174,7 @@ def test_schema_and_digest_are_checked_before_the_rest():
     refused({**document, "seed": {1, 2}}, "JSON")
 
 
-def test_nesting_is_limited():
+def test_gain_file_nesting_is_limited():
     deep: Any = 0
     for _ in range(3000):
         deep = [deep]
@@ -204,7 +204,7 @@ def test_nesting_is_limited():
     ],
     ids=lambda value: None if isinstance(value, str) else repr(value[:12]),
 )
-def test_unreadable_content_is_refused_with_one_printable_line(content, word, tmp_path):
+def test_unreadable_gain_file_is_refused_with_one_printable_line(content, word, tmp_path):
     path = tmp_path / "gains.json"
     path.write_bytes(content)
     with pytest.raises(GainFileError, match=word) as caught:
@@ -213,13 +213,13 @@ def test_unreadable_content_is_refused_with_one_printable_line(content, word, tm
     assert message.isprintable() and message.startswith(str(path)) and len(message) < 500
 
 
-def test_unreadable_paths_are_refused(tmp_path):
+def test_unreadable_gain_file_paths_are_refused(tmp_path):
     for path in (tmp_path / "absent\n.json", tmp_path, "nul\0byte"):
         with pytest.raises(GainFileError, match="cannot be read") as caught:
             Controller.from_file(path)
         assert str(caught.value).isprintable()
 
 
-def test_whole_numbers_are_numbers():
+def test_gain_file_accepts_whole_numbers():
     document = change("gains", "initial_stiffness", "value", 90000)
     assert Controller.from_dict(document).identified == (90000.0, 50.0)

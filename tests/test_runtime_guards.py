@@ -1,4 +1,4 @@
-"""The runtime's guards: every fault on its tick, its reaction, and outputs that stay inside their limits."""
+"""Guards of the runtime: every fault on its tick, its reaction, and outputs within their limits."""
 
 import itertools
 import math
@@ -42,7 +42,7 @@ def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
     return start + 5e-6 * ticks
 
 
-def test_the_table_of_faults_has_one_bit_and_one_name_each():
+def test_fault_table_has_one_bit_and_one_name_per_fault():
     assert [fault.bit for fault in FAULTS] == [1 << n for n in range(len(FAULTS))]
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
     assert names(FORCE_SLEW | TARE) == ["force_slew", "tare"]
@@ -73,7 +73,7 @@ def test_bad_readings_are_bridged_then_trip(fault):
     assert controller.seen == controller.cause == fault
 
 
-def test_a_good_reading_ends_the_bridging():
+def test_good_reading_ends_the_bridging():
     controller = limited()
     for n in range(30):
         position = -1e-4 + 5e-6 * n
@@ -83,7 +83,7 @@ def test_a_good_reading_ends_the_bridging():
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_force_that_does_not_change_in_contact_is_stuck(side):
+def test_force_that_is_constant_in_contact_is_stuck(side):
     controller = limited()
     document = gain_document("none")
     assert "clearance" not in document["mechanism"]["contact"]
@@ -101,7 +101,7 @@ def test_force_that_does_not_change_in_contact_is_stuck(side):
         assert first is None
 
 
-def test_position_that_does_not_change_while_the_model_moves_is_stuck():
+def test_position_that_is_constant_while_the_model_moves_is_stuck():
     controller = limited()
     fly(controller, 30)
     for n in range(30, 60):
@@ -127,7 +127,7 @@ def test_force_out_of_contact_is_flagged_once_contact_has_settled():
         assert controller.faults == 0
 
 
-def test_late_and_missed_ticks_and_a_clock_that_stands():
+def test_late_and_missed_ticks_and_stopped_clock_are_detected():
     controller = limited()
     seen = []
     for time in (0.0, 1e-3, 2.3e-3, 3.3e-3, 5.3e-3, 9.3e-3):
@@ -144,7 +144,7 @@ def test_late_and_missed_ticks_and_a_clock_that_stands():
         assert controller.cause == CLOCK
 
 
-def test_tare_takes_the_bias_from_every_reading_until_the_next():
+def test_tare_removes_the_bias_from_every_reading_until_the_next_tare():
     controller = limited()
     spread = [1.5 * math.sin(n) for n in range(50)]
     assert [controller.tare(12.0 + value) for value in spread] == [False] * 49 + [True]
@@ -160,7 +160,7 @@ def test_tare_takes_the_bias_from_every_reading_until_the_next():
 
 
 @pytest.mark.parametrize("readings", [[25.0], [0.0, 9.0], [math.nan], [1999.0, 2001.0]])
-def test_tare_that_will_not_do_trips(readings):
+def test_unusable_tare_trips(readings):
     controller = limited()
     for n in range(50):
         if controller.tare(readings[n % len(readings)]):
@@ -179,7 +179,7 @@ def test_force_limit_trips_and_the_force_fades():
     assert forces == [*(1000.0 - 100.0 * (n + 1) for n in range(10)), 0.0, 0.0]
 
 
-def test_force_slew_is_cut_and_trips_if_it_goes_on():
+def test_force_slew_is_limited_and_trips_if_it_persists():
     controller = limited()
     assert [controller.step(250.0, 1e-4 * n, 0.0, 1e-4 * n) for n in range(3)] == [100.0, 200.0, 250.0]
     assert controller.seen == FORCE_SLEW and not controller.tripped
@@ -189,7 +189,7 @@ def test_force_slew_is_cut_and_trips_if_it_goes_on():
     assert forces == [100.0, 200.0, 300.0, 400.0, 300.0, 200.0]
 
 
-def test_stroke_trips_and_the_command_stops_inside():
+def test_stroke_limit_trips_and_the_command_stops_inside():
     controller = limited()
     sent = []
     for n in range(30):
@@ -202,7 +202,7 @@ def test_stroke_trips_and_the_command_stops_inside():
 
 
 @pytest.mark.parametrize("start", [1e-3, -1e-5, -0.01])
-def test_after_a_trip_the_command_brakes_and_rests_out_of_contact(start):
+def test_command_after_a_trip_brakes_and_rests_out_of_contact(start):
     controller = limited()
     sent, resting = [], False
     for n in range(3000):
@@ -224,7 +224,7 @@ def test_after_a_trip_the_command_brakes_and_rests_out_of_contact(start):
     assert start < -5e-4 or sent[-1] > -5e-4 - length
 
 
-def test_velocity_limit_is_cut_and_trips_if_it_goes_on():
+def test_velocity_is_limited_and_trips_if_excess_persists():
     controller = limited()
     controller.step(0.0, -0.02, 0.0, -0.02)
     assert controller.position_command(-0.02, 0.0, 0.0) == -0.02
@@ -235,7 +235,7 @@ def test_velocity_limit_is_cut_and_trips_if_it_goes_on():
     assert controller.cause == VELOCITY_LIMIT
 
 
-def test_reset_after_a_trip_is_without_a_bump():
+def test_reset_after_a_trip_makes_no_bump():
     controller = limited()
     fly(controller, 20)
     controller.emergency_stop(True)
@@ -261,7 +261,7 @@ def test_reset_after_a_trip_is_without_a_bump():
     assert controller.cause == VELOCITY_LIMIT
 
 
-def test_next_contact_begins_where_the_model_begins_but_not_after_a_trip():
+def test_next_contact_begins_at_the_model_but_not_after_a_trip():
     controller = limited()
     fly(controller, 20)
     controller.next_contact()
@@ -273,7 +273,7 @@ def test_next_contact_begins_where_the_model_begins_but_not_after_a_trip():
     assert abs(controller.position_command(-0.01, 5e-3, 0.0) + 0.03) < 1e-4
 
 
-def test_without_limits_a_gain_file_gives_the_law_within_the_outermost_limits():
+def test_gain_file_without_limits_gives_the_law_within_outermost_limits():
     for values in (None, {}, dict.fromkeys(LIMITED)):
         document = gain_document("none")
         if values is not None:
@@ -298,7 +298,7 @@ def test_without_limits_a_gain_file_gives_the_law_within_the_outermost_limits():
         ((0.0, 0.0, 0.0, 0.0), (0.011, 0.0, 0.0), VELOCITY_LIMIT),
     ],
 )
-def test_without_limits_what_is_beyond_the_outermost_trips(reading, moved, cause):
+def test_gain_file_without_limits_trips_beyond_outermost_limits(reading, moved, cause):
     controller = Controller.from_dict(gain_document("phase_lead"))
     controller.step(0.0, 0.0, 0.0, 0.0)
     assert controller.position_command(0.0, 0.0, 0.0) == 0.0

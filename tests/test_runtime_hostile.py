@@ -1,4 +1,4 @@
-"""Whatever a controller is given, its commands are finite and within limits, and its memory does not grow."""
+"""Hostile input of a controller: commands stay finite and within limits, memory does not grow."""
 
 import math
 import random
@@ -22,7 +22,7 @@ calls = st.lists(
 
 
 @given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error"]))
-def test_outputs_are_finite_and_inside_their_limits_whatever_comes(calls, name):
+def test_controller_outputs_are_finite_and_within_limits_for_any_input(calls, name):
     controller = limited(name)
     force, sent = 0.0, None
     for call, values in calls:
@@ -52,7 +52,7 @@ def test_outputs_are_finite_and_inside_their_limits_whatever_comes(calls, name):
 
 
 @pytest.mark.parametrize("name", ["none", "phase_lead", "response_error"])
-def test_memory_does_not_grow(name):
+def test_controller_memory_does_not_grow(name):
     controller = limited(name)
     rng = random.Random(1)
     ticks = [(rng.gauss(0, 1), -0.02 + 1e-9 * n, 5e-3, -0.02 + 1e-9 * n) for n in range(1000)]

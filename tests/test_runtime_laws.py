@@ -1,4 +1,4 @@
-"""The runtime's laws and their parts against plain matrix equations and transfer functions."""
+"""Compensators of the runtime and their parts against matrix equations and transfer functions."""
 
 import math
 from typing import Any
@@ -128,7 +128,7 @@ def test_no_compensation_returns_the_measured_force():
 
 
 def test_phase_lead_is_the_tustin_transfer_function():
-    """The response to a sine settles on the discrete transfer function's gain and phase."""
+    """Compare the steady response to a sine with the discrete transfer function's gain and phase."""
     lead, lag, period, omega = 0.008, 0.001, 0.001, 40.0
     controller = Controller.from_dict(gain_document("phase_lead", phase_lead=lead, lead_filter=lag))
     output = [controller.step(math.sin(omega * n * period), 0.0, 0.0, 0.0) for n in range(400)]
@@ -157,13 +157,13 @@ def test_response_error_agrees_with_matrix_equations(delay, clearance):
 
 
 @pytest.mark.parametrize("name", sorted(set(GAINS) - {"position_lead"}))
-def test_a_law_that_leads_the_force_commands_the_position_itself(name):
+def test_law_that_leads_the_force_commands_the_position_itself(name):
     controller = Controller.from_dict(gain_document(name))
     controller.step(0.0, 0.25, 3.0, 0.25)
     assert controller.position_command(0.25, 3.0, -7.0) == 0.25
 
 
-def test_response_term_acts_where_the_aligned_position_is_in_contact():
+def test_response_term_acts_while_the_aligned_position_is_in_contact():
     controller = Controller.from_dict(gain_document(identification_delay=0.0, initial_stiffness=1e5))
     # No force, so nothing is identified: only the side of the surface decides, and for how long.
     for measured, stiffness in [(-1e-4, 0.0), (1e-4, 9e4), (-1e-9, 0.0), (0.0, 0.0), (1e-9, 9e4)]:
@@ -218,7 +218,7 @@ def test_delay_line_keeps_whole_delays_whole():
         assert delayed[whole:] == pytest.approx([float(n % 2) for n in range(100 - whole)], abs=2e-9)
 
 
-def test_delay_line_refuses_an_absurd_delay():
+def test_delay_line_refuses_excessive_delay():
     with pytest.raises(ValueError, match="periods"):
         DelayLine(1e9, 1e-3)
 
@@ -226,7 +226,7 @@ def test_delay_line_refuses_an_absurd_delay():
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
 def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
-    """With its bound on the covariance."""
+    """Include the bound on its covariance."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])
@@ -244,8 +244,8 @@ def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
     np.testing.assert_allclose(covariance_of(identification), expected, rtol=0, atol=1e-9 * scale)
 
 
-def test_covariance_does_not_wind_up():
-    """Held still, a contact tells nothing of the damping, nor one without depth of the stiffness."""
+def test_identification_covariance_does_not_wind_up():
+    """Hold the contact still, which shows no damping, and at no depth, which shows no stiffness."""
     for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
         identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
         for _ in range(100_000):

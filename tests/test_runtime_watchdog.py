@@ -1,4 +1,4 @@
-"""The runtime's watchdog: contacts audited before the next begins, the cause named, energies in balance."""
+"""Watchdog of the runtime: contacts audited before the next begins, causes, and energies."""
 
 import itertools
 import math
@@ -63,7 +63,7 @@ def restitution_of(late: int) -> float:
     return abs(velocities[-1]) / SPEED
 
 
-def test_good_contacts_pass():
+def test_watchdog_passes_good_contacts():
     controller = watched()
     n, positions, _ = bounce(controller)
     assert n == 3000 and positions[-1] < 0 and controller.seen == 0
@@ -74,7 +74,7 @@ def test_good_contacts_pass():
     assert abs(watchdog.balance) < 1e-13 * MASS * SPEED**2
 
 
-def test_divergence_is_stopped_once_the_contact_is_over():
+def test_watchdog_stops_divergence_once_the_contact_has_ended():
     divergence = restitution_of(3)
     assert divergence > 1.08
     controller = watched()
@@ -87,7 +87,7 @@ def test_divergence_is_stopped_once_the_contact_is_over():
     assert n - left in (4, 5, 6)
 
 
-def test_margin_decides():
+def test_watchdog_margin_decides():
     for late in (1, 2, 3):
         error = restitution_of(late) - 1.0
         assert error > 0.01
@@ -97,7 +97,7 @@ def test_margin_decides():
             assert (controller.cause == RESTITUTION) is caught
 
 
-def test_every_contact_between_two_surfaces_is_audited():
+def test_watchdog_audits_every_contact_between_two_surfaces():
     controller = watched(2e-3, restitution_margin=0.5)
     _, _, velocities = bounce(controller, clearance=2e-3, late=1, ticks=6000)
     turns = sum(a * b < 0 for a, b in itertools.pairwise(velocities))
@@ -109,7 +109,7 @@ def test_every_contact_between_two_surfaces_is_audited():
     assert min(positions) > -2e-3
 
 
-def test_a_contact_under_way_is_audited_when_the_next_is_announced():
+def test_watchdog_audits_contact_under_way_when_the_next_is_announced():
     controller = watched(settling=5.0)
     bounce(controller, late=3, ticks=300)
     assert not controller.tripped
@@ -122,7 +122,7 @@ def test_a_contact_under_way_is_audited_when_the_next_is_announced():
     assert not controller.tripped and controller._watchdog.contacts == 1
 
 
-def test_a_model_that_does_not_integrate_its_force_is_found():
+def test_watchdog_detects_a_model_that_does_not_integrate_its_force():
     controller = watched(restitution_margin=1.0)
     position, velocity = -1e-4, SPEED
     for n in range(500):
@@ -132,7 +132,7 @@ def test_a_model_that_does_not_integrate_its_force_is_found():
     assert controller.cause == ENERGY_BALANCE
 
 
-def test_a_contact_that_does_not_end_trips():
+def test_watchdog_trips_on_a_contact_that_does_not_end():
     controller = watched(longest_contact=0.05)
     n, positions, _ = bounce(controller)
     assert controller.cause == CONTACT_TOO_LONG
@@ -173,8 +173,8 @@ def test_expectation_is_its_polynomial_within_its_ranges():
         assert Expectation(limits).restitution(stiffness, -1e9, 1.0, 300.0) == pytest.approx(end, rel=1e-12)
 
 
-def test_no_contact_is_over_while_it_is_touched():
-    """Without a time to settle in: not where the force crosses 0 on the way back either."""
+def test_contact_does_not_end_while_it_is_touched():
+    """Allow no settling time: the contact does not end where the force crosses 0 on the way back either."""
     controller = watched(settling=0.0, energy_balance=1e9, restitution_margin=1e9)
     position, velocity, audited = -1e-4, SPEED, []
     for n in range(300):

@@ -1,4 +1,4 @@
-"""The self-test passes what was exported, and names file, line and value of whatever was changed."""
+"""Self-test of an export: it passes unchanged files, and names file, line and value of any change."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
     return ran.returncode, ran.stdout, ran.stderr
 
 
-def test_passes_where_nothing_is_installed(folder):
+def test_selftest_passes_where_nothing_is_installed(folder):
     code, out, err = in_a_bare_process(folder)
     assert (code, err) == (0, "")
     assert out.splitlines()[-1] == "PASSED" and "FAIL" not in out
@@ -52,7 +52,7 @@ def test_passes_where_nothing_is_installed(folder):
     assert not (folder / "__pycache__").exists()
 
 
-def test_uses_nothing_that_a_rig_lacks(folder):
+def test_selftest_uses_nothing_that_a_rig_lacks(folder):
     program = (
         "import runpy, sys\ntry: runpy.run_path(sys.argv.pop(1), run_name='__main__')\n"
         "except SystemExit as stop: assert not stop.code, stop.code\n"
@@ -72,7 +72,7 @@ def mutated(source, content):
     return content[:place] + new.encode() + content[place + 1 :], content.count(b"\n", 0, place) + 1
 
 
-def test_any_character_changed_is_named_by_file_and_line(files, folder):
+def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
     source = random.Random(5)
     names = [name for name, content in files.items() if is_text(content) and name != "selftest.py"]
     assert {"gains.json", "vectors.csv", "jaxhil_runtime.py", "manifest.json", "README.md"} <= {*names}
@@ -93,7 +93,7 @@ def test_any_character_changed_is_named_by_file_and_line(files, folder):
     assert run_selftest(folder)[0]
 
 
-def test_the_manifest_names_its_own_line(files, folder):
+def test_selftest_manifest_names_its_own_line(files, folder):
     lines = files["manifest.json"].split(b"\n")
     for number in range(1, len(lines) - 4):
         changed = [*lines]
@@ -103,7 +103,7 @@ def test_the_manifest_names_its_own_line(files, folder):
         assert not good and f"FAIL  manifest.json: line {number + 1}: differs" in out, out
 
 
-def test_a_change_of_the_self_test_itself_never_passes(files, folder):
+def test_selftest_never_passes_a_change_of_itself(files, folder):
     source = random.Random(6)
     content = files["selftest.py"]
     program = content.index(b"def main")
@@ -117,7 +117,7 @@ def test_a_change_of_the_self_test_itself_never_passes(files, folder):
         assert code != 0 and "selftest.py" in out + err, (changed, out, err)
 
 
-def test_the_guard_against_its_own_damage_holds_where_it_is_thin(files, folder):
+def test_selftest_detects_damage_at_the_weak_points_of_its_guard(files, folder):
     content = files["selftest.py"].decode()
     for old, new in [
         ('if __name__ == "__main__":', 'if __name__ == "__main_":'),
@@ -136,7 +136,7 @@ def test_the_guard_against_its_own_damage_holds_where_it_is_thin(files, folder):
         assert code != 0 and "FAIL  selftest.py" in out + err, (old, out, err)
 
 
-def test_every_digit_of_every_gain_counts(files, folder):
+def test_selftest_counts_every_digit_of_every_gain(files, folder):
     document = json.loads(files["gains.json"])
     text = files["gains.json"].decode()
     values = {f"gains.{name}.value": one["value"] for name, one in document["gains"].items()}
@@ -157,7 +157,7 @@ def test_every_digit_of_every_gain_counts(files, folder):
             assert f"line {text.count(chr(10), 0, at) + 1}: differs" in out
 
 
-def test_a_changed_command_is_named_with_what_the_controller_commands(files, folder):
+def test_selftest_names_a_changed_command_and_the_controllers_command(files, folder):
     lines = files["vectors.csv"].decode().split("\n")
     force = selftest.COLUMNS.split(",").index("force_command")
     number = next(n for n, line in enumerate(lines[1:], start=1) if float(line.split(",")[force]) > 1)
@@ -174,8 +174,8 @@ def test_a_changed_command_is_named_with_what_the_controller_commands(files, fol
     assert f"line {number + 1}, run 0: force_command: found {expected}, expected {stated}" in out
 
 
-def test_vectors_are_replayed_even_if_every_file_fits_the_manifest(files, folder):
-    """What a wrong port of the controller would look like."""
+def test_selftest_replays_vectors_even_if_every_file_fits_the_manifest(files, folder):
+    """Cover what a wrong port of the controller would look like."""
     document = json.loads(files["gains.json"])
     runtime = files["jaxhil_runtime.py"]
     for old, new in [(b"2.0 * lag - period", b"2.0 * lag + period"), (b"held = 0", b"held = 1")]:
@@ -191,7 +191,7 @@ def test_vectors_are_replayed_even_if_every_file_fits_the_manifest(files, folder
 
 
 @pytest.mark.parametrize("share, good", [(1e-12, True), (3e-11, False)])
-def test_simulated_forces_are_met_to_a_fraction_of_their_range(files, folder, share, good):
+def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, folder, share, good):
     document = json.loads(files["gains.json"])
     rows = [line.split(",") for line in files["vectors.csv"].decode().split("\n")[1:-1]]
     forces = [float(row[-1]) for row in rows if row[-1] != "nan"]
@@ -206,7 +206,7 @@ def test_simulated_forces_are_met_to_a_fraction_of_their_range(files, folder, sh
     assert good or f"FAIL  vectors.csv: line {tick + 2}: run 0: force" in out
 
 
-def test_bits_are_bits():
+def test_selftest_compares_numbers_bit_by_bit():
     assert selftest.same_bits(float("nan"), -float("nan"))
     assert not selftest.same_bits(0.0, -0.0)
     assert not selftest.same_bits(0.1 + 0.2, 0.3)
@@ -219,7 +219,7 @@ def test_bits_are_bits():
 @pytest.mark.parametrize(
     "garbage", [b"", b"\x00\xff\xfe" * 999, b"[" * 100_000, b"{}", b"raise SystemExit(0)\n", None, "folder"]
 )
-def test_garbage_ends_in_one_line_a_check(folder, name, garbage):
+def test_selftest_reports_garbage_in_one_line_a_check(folder, name, garbage):
     (folder / name).unlink()
     if garbage == "folder":
         (folder / name).mkdir()
@@ -230,7 +230,7 @@ def test_garbage_ends_in_one_line_a_check(folder, name, garbage):
     assert all(re.match("self-test of|ok    |FAIL  |FAILED", line) for line in out.splitlines()), out
 
 
-def test_garbage_that_the_manifest_fits_is_reported_too(files, folder):
+def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
     document = json.loads(files["gains.json"])
     for name, text, reason in [
         ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be run: SystemExit"),
@@ -248,7 +248,7 @@ def test_garbage_that_the_manifest_fits_is_reported_too(files, folder):
         assert not good and f"FAIL  {name}: " in out and reason in out, out
 
 
-def test_files_too_many_and_too_few_are_named(files, folder):
+def test_selftest_names_surplus_and_missing_files(files, folder):
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("mine")
     (folder / "__pycache__").mkdir()
@@ -261,19 +261,19 @@ def test_files_too_many_and_too_few_are_named(files, folder):
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 
 
-def test_other_line_endings_are_reported_as_such(files, folder):
+def test_selftest_reports_other_line_endings(files, folder):
     (folder / "gains.csv").write_bytes(files["gains.csv"].replace(b"\n", b"\r\n"))
     good, out = run_selftest(folder)
     assert not good and "FAIL  gains.csv: its line endings differ from those exported" in out
 
 
-def test_words_it_does_not_know_are_refused(folder):
+def test_selftest_refuses_unknown_arguments(folder):
     code, out, err = in_a_bare_process(folder, "--fast")
     assert (code, out, err) == (1, "", "usage: python selftest.py [--c]\n")
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_c_controller_is_compiled_and_run(files, folder, monkeypatch):
+def test_selftest_compiles_and_runs_the_c_controller(files, folder, monkeypatch):
     good, out = run_selftest(folder, "--c")
     assert good and re.search(rf"ok    c99: vectors.csv: {TICKS + 60} ticks, the same bit for bit", out), out
     document = json.loads(files["gains.json"])

@@ -1,4 +1,4 @@
-"""How far each gain may move before the objective rises, against closed forms."""
+"""Tolerance of each gain before the objective rises, against closed forms."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def quadratic():
     return np.array([[300.0, 300.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
-def test_gains_move_as_far_as_the_loss_allows():
+def test_gains_may_move_as_far_as_the_loss_allows():
     jacobian, loss = np.array([[50.0, 0.0], [0.0, 20.0]]), 0.5
     found = sensitivity(jacobian, loss)
     # d^2 J^2 / 2 = rise * loss, in a box of one.
@@ -22,7 +22,7 @@ def test_gains_move_as_far_as_the_loss_allows():
     np.testing.assert_allclose(found.together, found.alone, rtol=1e-12)
 
 
-def test_gains_that_make_up_for_each_other_are_free_together():
+def test_gains_that_compensate_each_other_are_free_together():
     found = sensitivity(quadratic(), 0.5)
     assert found.alone[0] == pytest.approx(found.alone[1], rel=1e-4)
     assert found.alone[0] < 1e-3
@@ -30,7 +30,7 @@ def test_gains_that_make_up_for_each_other_are_free_together():
     assert found.together[2] == found.alone[2] == 1
 
 
-def test_the_loss_rises_by_as_much_where_gains_move_as_far_as_they_may():
+def test_loss_rises_as_stated_at_the_tolerance_of_gains():
     generator = np.random.default_rng(7)
     jacobian, residuals = 40 * generator.standard_normal((9, 4)), generator.standard_normal(9)
     # At the optimum of a linear least-squares problem, the residuals are orthogonal to J.

@@ -1,6 +1,4 @@
-"""How far the motion simulator's limits bind in a contact: nothing, to the bit, where they do not, else what
-the oracle finds.
-"""
+"""Shortfall of the motion simulator behind its limits: exactly 0 if none binds, else the oracle's."""
 
 import dataclasses
 import functools
@@ -91,14 +89,14 @@ def shortfalls_found(request, batch):
     return found
 
 
-def test_a_limit_that_does_not_bind_is_no_shortfall_to_the_bit(shortfalls_found):
+def test_limit_that_does_not_bind_gives_no_shortfall_to_the_bit(shortfalls_found):
     assert {name for name, shortfalls in shortfalls_found.items() if np.all(shortfalls > 0)} == set(BINDING)
     for name in set(shortfalls_found) - set(BINDING):
         np.testing.assert_array_equal(shortfalls_found[name], 0, err_msg=name)
 
 
 @pytest.mark.parametrize("name", BINDING)
-def test_shortfall_is_the_oracles(shortfalls_found, name):
+def test_shortfall_agrees_with_oracle(shortfalls_found, name):
     expected = oracle_shortfalls(name)
     assert min(expected) > 1e-6
     accuracy = 1e-10 if shortfalls_found[name].dtype == "float64" else 1e-3
@@ -123,7 +121,7 @@ def test_shortfall_broadcasts_over_trailing_axes(batch):
     np.testing.assert_allclose(found[:, :6], batch.run().position_shortfall[:2], rtol=1e-12)
 
 
-def test_what_falls_short_is_the_command_of_a_law_that_leads():
+def test_shortfall_of_a_leading_law_is_that_of_its_command():
     lead = 0.008
     laned = {times: limited(times * VELOCITY, 300.0) for times in (1.05, 20.0)}
     leading = cases.build_batch(laned)
@@ -137,7 +135,7 @@ def test_what_falls_short_is_the_command_of_a_law_that_leads():
             assert metrics.position_shortfall[number, lane] == pytest.approx(shortfall, rel=1e-9, abs=0)
 
 
-def test_a_loop_without_limits_keeps_nothing_of_them(batch):
+def test_loop_without_limits_keeps_no_shortfall_state(batch):
     free = cases.build_batch({"": CONTACTS["none"]})
     assert batch.loop.has_limits and not free.loop.has_limits
     for one in (batch, free):

@@ -1,4 +1,4 @@
-"""Commands of README and guide print what stands below them; figures stand below the command that does."""
+"""Commands of README and guide print what stands below them; plots stand below their command."""
 
 import os
 import re
@@ -27,8 +27,8 @@ ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_figures_stand_below_the_command_that_prints_them(page):
-    """Between a block of figures and the heading above it there is the command, or the script."""
+def test_plots_stand_below_the_command_that_prints_them(page):
+    """Look for the command, or the script, between a block of plots and the heading above it."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text" and re.search(r"\d\.\d", block[2]):
@@ -45,8 +45,8 @@ def shown(page):
 
 
 @pytest.mark.slow
-def test_commands_print_what_is_shown(tmp_path):
-    """Words and lines; of numbers, which follow a solver, those that differ are printed."""
+def test_shown_commands_print_what_is_shown(tmp_path):
+    """Compare words and lines; print the numbers that differ, which depend on a solver."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "110"}
     names = {"jaxhil": [sys.executable, "-m", "tuning"], "python": [sys.executable]}
@@ -72,8 +72,8 @@ def test_commands_print_what_is_shown(tmp_path):
 
 
 @pytest.mark.slow
-def test_logs_tell_what_is_shown(tmp_path):
-    """The first day of the page on logs, of the rig that it names."""
+def test_logs_commands_print_what_is_shown(tmp_path):
+    """Run the first day of the page on logs, with the rig that the page names."""
     (tmp_path / "day1").mkdir()
     write(tmp_path / "day1", campaigns.campaign("clean", 0))
     environment = {**os.environ, "COLUMNS": "110"}

@@ -1,4 +1,4 @@
-"""Gain files that were changed and signed anew: refused with one line, or good within the bounds of the code.
+"""Gain files changed and signed anew: refused in one line, or within the bounds of the code.
 
 What loads is driven by whatever sensors and models may give, in Python and in C, which agree to the bit.
 """
@@ -147,19 +147,19 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
     return counts
 
 
-def test_signed_mutations_are_refused_or_stay_within_the_code_s_bounds(tmp_path):
+def test_signed_mutations_are_refused_or_stay_within_the_codes_bounds(tmp_path):
     counts = check(500, 0, tmp_path / "gains.json", COMPILED)
     assert counts["loaded"] > 50 and counts["refused"] > 200, counts
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_signed_mutations(tmp_path):
+def test_signed_mutations_a_hundred_thousand_are_refused_or_within_bounds(tmp_path):
     counts = check(100_000, 1, tmp_path / "gains.json", {*COMPENSATORS})
     print(counts)
     assert counts["loaded"] > 10_000 and counts["refused"] > 40_000
 
 
-def test_a_thousand_bits_that_fall_over_load_no_other_content(tmp_path):
+def test_thousand_flipped_bits_load_no_other_content(tmp_path):
     path = tmp_path / "gains.json"
     document = gain_document()
     document["limits"] = {name: {"value": one, "unit": LIMITS[name].unit} for name, one in LIMITED.items()}

@@ -1,4 +1,4 @@
-"""Signed bundles: whose a bundle is, `verify --key` proves, and OpenSSL says the same."""
+"""Signed bundles: `verify --key` proves who signed a bundle, and OpenSSL agrees."""
 
 import json
 import random
@@ -52,8 +52,8 @@ def folder(key, tmp_path):
     return placed(tmp_path / "bundle", {**files, "manifest.sig": signature})
 
 
-def test_a_signature_is_that_of_rfc_8032(tmp_path):
-    """Section 7.1, test 2."""
+def test_signature_is_that_of_rfc_8032(tmp_path):
+    """Use section 7.1, test 2."""
     secret = "4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb"
     signature = (
         "92a009a9f0d4cab8720e820b5f642540a2b27b5416503f8fb3762223ebdb69da"
@@ -64,7 +64,7 @@ def test_a_signature_is_that_of_rfc_8032(tmp_path):
     assert signer(tmp_path / "key.pem")(b"\x72").hex() == signature
 
 
-def test_without_the_key_nothing_is_said_to_be_proved(folder):
+def test_verify_without_key_claims_no_proof(folder):
     checked = check_bundle(folder)
     assert checked.reasons == [] and checked.signature.startswith("there is one; only verification with")
     good, out = run_selftest(folder)
@@ -75,7 +75,7 @@ def test_without_the_key_nothing_is_said_to_be_proved(folder):
     assert good and "note  manifest.json: is not signed" in out
 
 
-def test_another_key_or_another_manifest_is_refused(key, folder, tmp_path):
+def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
     by_key = verifier(key[1])
     assert check_bundle(folder, by_key).signature == "by the key given"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
@@ -91,7 +91,7 @@ def test_another_key_or_another_manifest_is_refused(key, folder, tmp_path):
 
 
 @pytest.mark.parametrize("flips", [60, pytest.param(1000, marks=pytest.mark.slow)])
-def test_no_flipped_bit_of_a_signature_or_of_what_it_signs_passes(key, folder, flips):
+def test_verify_detects_any_flipped_bit_of_signature_or_signed_content(key, folder, flips):
     source, by_key = random.Random(flips), verifier(key[1])
     for turn in range(flips):
         path = folder / ("manifest.sig", "manifest.json")[turn % 2]
@@ -104,15 +104,15 @@ def test_no_flipped_bit_of_a_signature_or_of_what_it_signs_passes(key, folder, f
 
 
 @pytest.mark.parametrize("size", [0, 63, 64, 65])
-def test_what_is_no_signature_proves_nothing(key, folder, size):
+def test_invalid_signature_proves_nothing(key, folder, size):
     (folder / "manifest.sig").write_bytes(bytes(size))
     assert check_bundle(folder, verifier(key[1])).reasons[0].startswith("manifest.sig: found ")
     assert (check_bundle(folder).reasons == []) is run_selftest(folder)[0] is (size <= 64)
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl")
-def test_openssl_makes_the_keys_and_proves_the_signature(tmp_path):
-    """By the commands of the guide."""
+def test_openssl_makes_the_keys_and_verifies_the_signature(tmp_path):
+    """Run the commands of the guide."""
     for command in (
         "openssl genpkey -algorithm ed25519 -out key.pem",
         "openssl pkey -in key.pem -pubout -out public.pem",
@@ -127,7 +127,7 @@ def test_openssl_makes_the_keys_and_proves_the_signature(tmp_path):
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode != 0
 
 
-def test_keys_that_will_not_do_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
+def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
     pair = Ed25519PrivateKey.generate()
     other = generate_private_key(65537, 2048)
     kept = tmp_path / "kept.pem"
@@ -160,7 +160,7 @@ def test_keys_that_will_not_do_are_refused_in_one_line(key, folder, tmp_path, ja
     assert (ran.code, ran.out) == (2, "") and not (tmp_path / "new").exists()
 
 
-def test_without_the_package_one_line_says_how_to_get_it(key, folder, monkeypatch):
+def test_missing_signing_package_is_reported_in_one_line(key, folder, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
     for read, file in ((signer, key[0]), (verifier, key[1])):

@@ -1,4 +1,4 @@
-"""What tuning runs: one of a large law is compiled apart from the loops around it, and computes the same."""
+"""Simulations that tuning runs: a large law is compiled apart from the loops, with the same results."""
 
 import re
 from typing import ClassVar

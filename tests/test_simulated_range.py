@@ -1,4 +1,4 @@
-"""Figures of a contact over the whole legal range of mechanisms, against the event-accurate oracle."""
+"""Metrics of a contact over the whole range of mechanisms, against the event-accurate oracle."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[
 
 
 @pytest.mark.parametrize("number", [33, pytest.param(38, marks=pytest.mark.slow)])
-def test_contacts_of_drawn_mechanisms(number):
+def test_contacts_of_drawn_mechanisms_agree_with_oracle(number):
     compared = compare(Form(number), seed=number, lanes=3, longest=16)
     assert len(compared) >= 2
     for mechanism, difference in compared:
@@ -41,8 +41,8 @@ def test_contacts_of_drawn_mechanisms(number):
 
 
 @pytest.mark.slow
-def test_contacts_over_the_whole_legal_range():
-    """300 mechanisms that end well and that the oracle vouches for."""
+def test_contacts_over_the_whole_range_agree_with_oracle():
+    """Draw 300 mechanisms that end well and that the oracle vouches for."""
     compared = []
     for number in range(FORMS):
         compared += compare(Form(number), seed=number, lanes=LANES, longest=60)

@@ -1,4 +1,4 @@
-"""The runtime in one file does what the package does, whatever the package grows into."""
+"""Runtime in one file: it does what the package does, whatever the package grows into."""
 
 import importlib
 import json
@@ -31,7 +31,7 @@ def loaded(folder):
     return namespace
 
 
-def test_holds_one_law_and_nothing_beside_what_it_says_it_needs(exported):
+def test_single_file_holds_one_law_and_only_what_it_needs(exported):
     compensator, folder = exported
     head = (folder / "jaxhil_runtime.py").read_text().partition("# ---- ")[0]
     assert "nothing else to install" in head
@@ -46,14 +46,14 @@ def test_holds_one_law_and_nothing_beside_what_it_says_it_needs(exported):
     assert (ran.returncode, ran.stdout.split(), ran.stderr) == (0, [compensator], "")
 
 
-def test_has_no_name_too_many_or_too_few(exported):
+def test_single_file_has_no_surplus_or_missing_name(exported):
     _, folder = exported
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E9", str(folder)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout
 
 
-def test_commands_are_the_package_s_to_the_bit(exported):
+def test_single_file_commands_are_the_packages_to_the_bit(exported):
     compensator, folder = exported
     document = gain_document(compensator)
     ours, other = Controller.from_dict(document), loaded(folder)["Controller"].from_dict(document)
@@ -72,7 +72,7 @@ def test_commands_are_the_package_s_to_the_bit(exported):
     assert other.identified == ours.identified
 
 
-def test_keeps_comments_and_says_what_each_part_is(exported):
+def test_single_file_keeps_comments_and_labels_each_part(exported):
     _, folder = exported
     text = (folder / "jaxhil_runtime.py").read_text()
     assert "# ---- jaxhil.rig.controller ---" in text
@@ -124,7 +124,7 @@ def run_source(text):
     return namespace
 
 
-def test_a_law_brings_along_what_it_imports_and_no_other_law(package):
+def test_single_file_holds_what_a_law_imports_and_no_other_law(package):
     made = package(
         shared="import math as m\nSHARED = 4 * m.floor(1.5)  # a comment stays\n",
         second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"
@@ -152,7 +152,7 @@ def test_a_law_brings_along_what_it_imports_and_no_other_law(package):
         ("for register in (): pass\n", "register: found in .*registry and in .*controller"),
     ],
 )
-def test_what_cannot_be_in_one_file_is_refused(package, controller, reason):
+def test_single_file_refuses_what_it_cannot_hold(package, controller, reason):
     made = package()
     folder = Path(made.__file__).parent
     (folder / "circle.py").write_text(f"from {made.__name__}.controller import B\n")
@@ -162,6 +162,6 @@ def test_what_cannot_be_in_one_file_is_refused(package, controller, reason):
         runtime_source("first", made)
 
 
-def test_an_unknown_compensator_is_a_key_error():
+def test_single_file_of_unknown_compensator_is_a_key_error():
     with pytest.raises(KeyError):
         runtime_source("no such law")

@@ -1,4 +1,4 @@
-"""The documentation site: nothing is missing in its generated pages; it is built, and opened in a browser."""
+"""Documentation site: generated pages are complete; the site is built, and opened in a browser."""
 
 import dataclasses
 import os
@@ -50,7 +50,7 @@ def reference():
 @pytest.mark.parametrize(
     ("page", "kind"), [("mechanism_file", Mechanism), ("mechanism_file_six_axes", SixAxisMechanism)]
 )
-def test_every_key_of_the_mechanism_file_is_there(reference, page, kind):
+def test_site_has_every_key_of_the_mechanism_file(reference, page, kind):
     text = reference[f"reference/{page}.md"]
     for table in tables(kind):
         part = text[text.index(f"## `[{table.path}]`") :] if table.path else text
@@ -61,14 +61,14 @@ def test_every_key_of_the_mechanism_file_is_there(reference, page, kind):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_is_there(jaxhil, reference, command):
+def test_site_has_every_option(jaxhil, reference, command):
     text = reference["reference/commands.md"]
     [part] = re.findall(rf"^## jaxhil {command}$(.*?)(?=^## |\Z)", text, re.M | re.S)
     options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", jaxhil(command, "--help").out.split("options")[1]))
     assert options - {"-h", "--help"} <= set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", part))
 
 
-def test_options_that_the_guide_names_are_there(reference):
+def test_options_named_in_the_guide_exist(reference):
     parts = dict(
         re.findall(r"^## jaxhil (\w+)$(.*?)(?=^## |\Z)", reference["reference/commands.md"], re.M | re.S)
     )
@@ -87,8 +87,8 @@ def test_options_that_the_guide_names_are_there(reference):
     assert seen > 50
 
 
-def test_what_is_not_explained_fails_the_build(reference, monkeypatch):
-    """An option without help, a gain without unit."""
+def test_site_build_fails_for_undocumented_options_and_gains(reference, monkeypatch):
+    """Use an option without help, and a gain without unit."""
     module = sys.modules["reference"]
 
     @dataclasses.dataclass
@@ -104,7 +104,7 @@ def test_what_is_not_explained_fails_the_build(reference, monkeypatch):
         module._row_of_gain(gain._replace(unit=""), jaxhil.load("varying"))
 
 
-def test_every_gain_is_there(reference):
+def test_site_has_every_gain(reference):
     text = reference["reference/gains.md"]
     for name, law in COMPENSATORS.items():
         [part] = re.findall(rf"^### {name}$(.*?)(?=^### |\Z)", text, re.M | re.S)
@@ -112,8 +112,8 @@ def test_every_gain_is_there(reference):
         assert listed == [(one.name, one.unit) for one in law.gains]
 
 
-def test_messages_are_those_that_users_see(jaxhil, reference):
-    """A refusal that is met stands on the page, `…` where something is filled in."""
+def test_site_messages_are_those_that_users_see(jaxhil, reference):
+    """Find a refusal on the page, with `…` where something is filled in."""
     lines = re.findall(r"^(.*….*)$", reference["reference/messages.md"], re.M)
     patterns = [re.compile(".*".join(map(re.escape, line.split("…"))) + "$") for line in lines]
     for arguments in (
@@ -125,8 +125,8 @@ def test_messages_are_those_that_users_see(jaxhil, reference):
         assert any(pattern.match(said) for pattern in patterns), said
 
 
-def test_every_page_and_notebook_is_in_the_navigation():
-    """`mkdocs build` is strict: a file that the navigation lacks fails it."""
+def test_site_navigation_has_every_page_and_notebook():
+    """Build strictly: `mkdocs build` fails for a file that the navigation lacks."""
 
     def leaves(entry):
         if isinstance(entry, str):
@@ -143,7 +143,7 @@ def test_every_page_and_notebook_is_in_the_navigation():
     assert there == {path for path in listed if (folder / path).exists()}
 
 
-def test_versions_agree():
+def test_site_versions_agree():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
@@ -185,7 +185,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_every_link_leads_somewhere(site):
+def test_site_links_all_lead_somewhere(site):
     pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
     assert len(pages) > 20
     for path, page in pages.items():
@@ -200,7 +200,7 @@ def test_every_link_leads_somewhere(site):
 
 
 @pytest.mark.slow
-def test_the_browser_finds_what_is_wrong(browser, tmp_path):
+def test_browser_finds_faults_of_a_page(browser, tmp_path):
     path = tmp_path / "bad.html"
     path.write_text(BAD)
     opened = browser.open(path, 375)
@@ -216,8 +216,8 @@ def test_the_browser_finds_what_is_wrong(browser, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
-def test_every_page_opens_offline(site, browser, width):
-    """No error, nothing from elsewhere, no picture missing, nothing too wide, no text on another."""
+def test_site_pages_open_offline(site, browser, width):
+    """Expect no error, external request, missing picture, excess width or overlapping text."""
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
         assert browser.open(path, width) == ([], [], []), name
@@ -226,7 +226,7 @@ def test_every_page_opens_offline(site, browser, width):
 
 
 @pytest.mark.slow
-def test_nothing_is_cut_on_paper(site, browser):
+def test_site_on_paper_cuts_nothing(site, browser):
     for path in sorted(site.rglob("*.html")):
         browser.open(path, max(WIDTHS))
         pages, faults = browser.printed(*A4)
@@ -234,8 +234,8 @@ def test_nothing_is_cut_on_paper(site, browser):
 
 
 @pytest.mark.slow
-def test_every_page_is_accessible(site, browser):
-    """axe-core finds nothing serious; of the notebooks, which are alike and long, in one."""
+def test_site_pages_are_accessible(site, browser):
+    """Expect no serious finding of axe-core; check one notebook, as they are alike and long."""
     package = pytest.importorskip("axe_core_python")
     axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
     notebooks = sorted(site.glob("0*.html"))
@@ -249,7 +249,7 @@ def test_every_page_is_accessible(site, browser):
 
 
 @pytest.mark.slow
-def test_the_search_finds_a_key_offline(site, browser):
+def test_site_search_finds_a_key_offline(site, browser):
     browser.open(site / "index.html", 1440)
     found = """new Promise(done => {
       const field = document.querySelector("[data-md-component=search-query]");

@@ -1,4 +1,4 @@
-"""Derivatives through the whole loop in six axes: of both errors, by what a rig and a contact have.
+"""Derivatives through the whole six-axis loop: of both errors, by numbers of a rig and of a contact.
 
 Half of the lanes are a probe in a drogue, half a ring of three points on a plane: one program has both. The
 first lane of each is straight on the axis: not turned, without slip.
@@ -104,9 +104,11 @@ def passes_over(start):
     return (touches & on_wall).any(axis=0) & (touches & ~on_wall).any(axis=0)
 
 
-def test_both_errors_have_derivatives():
-    """Those of central differences, of order four, to 1e-4 on 98 % of lanes; an event is known of the others,
-    and none is NaN."""
+def test_six_axis_errors_have_derivatives():
+    """Compare with central differences of order four, to 1e-4 on 98 % of lanes.
+
+    The other lanes have a known event, and none is NaN.
+    """
     ones, start = jnp.ones(len(BY)), started(*drawn())
     static = {"integrator": "semi_implicit_euler", "hold": "linear", "latency": 0}
     loop = build_loop(scenario(ones, start), **static)

@@ -1,4 +1,4 @@
-"""Episodes in six axes: judged on one axis by its own figures, and in space by closed forms.
+"""Six-axis episodes: compared with one axis by its own metrics, and with closed forms.
 
 One program; its lanes are the cases: a central contact of claw-350kg, an oblique one far off the line through
 the centres of mass, the same in a run that begins earlier, and with a biased sensor, and a miss.
@@ -70,7 +70,7 @@ def judged():
     return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, given))
 
 
-def test_a_central_episode_is_that_of_one_axis(judged):
+def test_central_episode_is_that_of_one_axis(judged):
     expected = package.simulate("claw-350kg", "none").contacts[0]
     found = judged.metrics
 
@@ -91,7 +91,7 @@ def test_a_central_episode_is_that_of_one_axis(judged):
     np.testing.assert_allclose(of("normal"), [0, 0, 1], atol=1e-12)
 
 
-def test_aside_all_three_parts_have_a_share(judged):
+def test_oblique_episode_has_all_three_error_parts(judged):
     found = judged.metrics
 
     def of(name):
@@ -104,8 +104,8 @@ def test_aside_all_three_parts_have_a_share(judged):
     assert 100 < of("effective_mass") < 300
 
 
-def test_an_episode_does_not_know_when_its_run_began(judged):
-    """All its figures are the same, wherever the looks at what is over fall."""
+def test_episode_does_not_depend_on_the_start_of_its_run(judged):
+    """Expect the same metrics, whichever ticks the check for the end falls on."""
     for name, figure in judged.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-10, err_msg=name)
@@ -123,8 +123,8 @@ def followed(loop, given, ticks):
     return seen.forces[0].touch.depth[:, 0], *jax.vmap(of)(seen.states)
 
 
-def test_an_episode_lasts_from_the_last_free_tick_to_the_first_that_is_over(judged):
-    """The bias, by which the wrench never dies out, moves the numerical model before and after."""
+def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(judged):
+    """Include a bias, by which the wrench never dies out and the numerical model moves before and after."""
     given = scenario()
     depths, own, energy = (
         np.asarray(one)[:, BIASED] for one in followed(build_loop(given, **STATIC), given, 400)
@@ -136,7 +136,7 @@ def test_an_episode_lasts_from_the_last_free_tick_to_the_first_that_is_over(judg
     np.testing.assert_allclose(judged.metrics.energy_change[0, BIASED], change, rtol=1e-10)
 
 
-def test_a_miss_is_one(judged):
+def test_episode_without_contact_is_a_miss(judged):
     found = judged.metrics
     assert STATUS_NAMES[found.status[0, AWAY]] == "miss"
     assert np.isnan(found.energy_error[0, AWAY]) and found.touches[0, AWAY] == 0

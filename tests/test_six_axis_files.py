@@ -1,4 +1,4 @@
-"""Mechanism files of six axes: what they say, and what is refused, in one line."""
+"""Mechanism files of six axes: their content, and refusals in one line."""
 
 import copy
 import json
@@ -30,7 +30,7 @@ def refusal(*overrides, name="probe-drogue", unset=()):
 
 
 @pytest.mark.parametrize("name", RAW)
-def test_builtins_are_read_and_say_where_their_numbers_are_from(name):
+def test_six_axis_builtins_are_read_and_state_their_sources(name):
     mechanism = load_any(name).mechanism
     assert mechanism.name == name and mechanism.uncertainty
     assert "assumed" in mechanism.source
@@ -38,7 +38,7 @@ def test_builtins_are_read_and_say_where_their_numbers_are_from(name):
     assert any_from_builtins(json.loads(text), name) == mechanism
 
 
-def test_six_numbers_may_be_said_as_one_or_two():
+def test_six_values_may_be_given_as_one_or_two():
     simulator = load_any("probe-drogue").mechanism.rig.simulator
     assert simulator.damping_ratio == [0.8] * 6
     assert simulator.natural_frequency == [14.0] * 3 + [11.0] * 3
@@ -101,7 +101,7 @@ def test_six_numbers_may_be_said_as_one_or_two():
          "a z component as far as 0.1, allowed draws below 0 m/s"),
     ],
 )  # fmt: skip
-def test_unusable_values_are_named(override, reason):
+def test_unusable_six_axis_values_are_named(override, reason):
     assert reason in refusal(override)
 
 
@@ -141,7 +141,7 @@ def test_unusable_latches_and_simulators_are_named(name, changes, reason):
     assert reason in refusal(changes, name=name)
 
 
-def test_shapes_that_cannot_touch():
+def test_shapes_that_cannot_touch_are_refused():
     capsule = {"shape": "capsule", "from": [0, 0, 0], "to": [0, 0, 1], "radius": 0.1}
     raw = copy.deepcopy(RAW["probe-drogue"])
     raw["contact"]["tip"]["chaser"] = capsule
@@ -154,7 +154,7 @@ def test_shapes_that_cannot_touch():
     assert any_from_builtins(raw, "f")
 
 
-def test_a_start_stands_instead_of_an_approach():
+def test_start_replaces_the_approach():
     start = {"start.target": BODY, "start.chaser": {**BODY, "position": [0, 0, 3]}}
     with pytest.raises(InputError, match=r"start: found \[approach\] beside it, allowed one of the two"):
         load_any("probe-drogue", start)
@@ -168,7 +168,7 @@ def test_a_start_stands_instead_of_an_approach():
         load_any("probe-drogue", {**start, "approach": None})
 
 
-def test_the_start_that_the_guide_shows_is_read():
+def test_start_shown_in_the_guide_is_read():
     text = (Path(__file__).parents[1] / "notebooks" / "guide" / "six_axes.md").read_text(encoding="utf-8")
     shown = re.search(r"^```toml\n(\[start\].*?)^```", text, re.M | re.S)
     assert shown is not None
@@ -177,7 +177,7 @@ def test_the_start_that_the_guide_shows_is_read():
     assert start.duration == 1.2 and start.chaser.position == [0.06, -0.05, 2.21]
 
 
-def test_all_can_be_uncertain_lists_and_inertias_included():
+def test_six_axis_values_can_all_be_uncertain_including_lists_and_inertias():
     entry = {"distribution": "uniform", "factor": [0.9, 1.1]}
     mechanism = load_any("petals").mechanism
     uncertain = {
@@ -200,7 +200,7 @@ def test_all_can_be_uncertain_lists_and_inertias_included():
     assert 0.008 < np.std(drawn["rig.force_sensor.crosstalk"]) < 0.012
 
 
-def test_commands_of_one_axis_say_so():
+def test_commands_of_one_axis_refuse_six_axis_files():
     with pytest.raises(
         InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, allowed jaxhil"
     ):
@@ -227,8 +227,8 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 
 @settings(deadline=None, max_examples=40)
 @given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
-def test_any_table_is_read_or_refused_in_one_line(place, junk, sibling):
-    """One value replaced by another: of any kind, or by one from elsewhere in the files."""
+def test_any_six_axis_table_is_read_or_refused_in_one_line(place, junk, sibling):
+    """Replace one value by another one of any kind, or by one from another place in the files."""
     name, path = place
     for value in (junk, at(RAW[sibling[0]], sibling[1])):
         raw = copy.deepcopy(RAW[name])

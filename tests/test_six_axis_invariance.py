@@ -1,4 +1,4 @@
-"""In space it matters neither where the interface frames are, nor which body is called the target.
+"""Invariance of six-axis contact to the interface frames and to which body is called the target.
 
 A probe in a drogue and a ball on a plane, off-centre and oblique, with friction: once the bodies are swapped,
 and the drogue is the chaser's; once T and C are elsewhere on their bodies, turned, and the shapes are said
@@ -72,7 +72,7 @@ def close(found, expected, before):
             np.testing.assert_allclose(a, b, atol=1e-9 * max(changed, 0.01), rtol=0)
 
 
-def test_frames_and_names_of_the_bodies_do_not_matter():
+def test_contact_is_invariant_to_frames_and_names_of_the_bodies():
     pair, points = bodies(), place([[0.0], [0.0], [0.0]], BATCH)
     before = start(pair)
     drogue = Drogue(0.75 * ONE, 0.04 * ONE, 0 * ONE)

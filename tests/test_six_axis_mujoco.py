@@ -1,4 +1,4 @@
-"""In space against MuJoCo: a free top, a tether, three tethers at once. Skipped where there is no `mujoco`.
+"""Six-axis motion against MuJoCo: a free top, a tether, three tethers. Skipped without `mujoco`.
 
 A tether is slack up to its length and a spring beyond: MuJoCo's tendon with a dead band, and here a point of
 the chaser within a sphere on the target. MuJoCo's contacts are no measure: a stiffness in N/m is not theirs.
@@ -33,7 +33,7 @@ ENDS = [
 
 
 @pytest.mark.parametrize("tethers", [0, 1, 3])
-def test_twists_are_mujocos(tethers):
+def test_twists_agree_with_mujoco(tethers):
     duration = DURATION if tethers else 5.0
     found, expected = ours(tethers, duration), mujocos(tethers, duration)
     assert (expected[5] < 0.03) == (tethers > 0)  # the chaser's velocity along z, 0.05 m/s without tethers

@@ -1,4 +1,4 @@
-"""Rig and space in six axes against an implementation of their own (`six_axis_oracle`).
+"""Rig and ideal contact in six axes against an independent implementation (`six_axis_oracle`).
 
 Off-centre and oblique, with friction, unequal delays: a probe in a drogue, three points of a ring on a plane,
 and the probe on a sensor that carries its tool.
@@ -117,7 +117,7 @@ def close(states, expected, tolerance):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_rig_is_that_of_another_implementation(name):
+def test_six_axis_rig_agrees_with_independent_implementation(name):
     case = started(CASES[name])
     given = as_scenario(case)
     loop = build_loop(
@@ -135,7 +135,7 @@ def test_the_rig_is_that_of_another_implementation(name):
 
 
 @pytest.mark.parametrize("name", ["probe", "ring"])
-def test_space_is_that_of_another_implementation(name):
+def test_six_axis_ideal_contact_agrees_with_independent_implementation(name):
     case = started(CASES[name])
     given = as_scenario(case)
     time = lanes(TICKS * PERIOD, BATCH)

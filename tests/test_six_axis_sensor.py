@@ -1,4 +1,4 @@
-"""The six-axis sensor: a tool of many particles, readings taken back, and what wrong numbers leave over."""
+"""Six-axis sensor: a tool of many particles, compensated readings, and the effect of wrong parameters."""
 
 import jax
 import jax.numpy as jnp
@@ -66,8 +66,8 @@ def close(found, expected, **tolerances):
 
 
 @pytest.mark.slow
-def test_a_tool_is_its_particles():
-    """Each is carried along by the motion, and pushes with its weight less its inertia."""
+def test_tool_wrench_is_that_of_its_particles():
+    """Let the motion carry each particle, which pushes with its weight less its inertia."""
 
     def places(time):
         at = along(time)
@@ -87,7 +87,7 @@ def test_a_tool_is_its_particles():
 
 
 @pytest.mark.slow
-def test_with_its_own_numbers_right_the_controller_finds_the_contact():
+def test_controller_with_correct_tool_parameters_finds_the_contact():
     pose, twist, acceleration = moving()
     load = tool_load(tool(), pose, twist, acceleration, triple(GRAVITY))
     reading = read_moving(wrench(), load, pose)
@@ -102,8 +102,8 @@ def test_with_its_own_numbers_right_the_controller_finds_the_contact():
     close(read_fixed(wrench(), pose), list(-at_chaser.ravel()), rtol=1e-12)
 
 
-def test_wrong_numbers_leave_gravity_over():
-    """A share of the weight for the mass, and the weight times the angle for the attitude."""
+def test_wrong_tool_parameters_leave_part_of_gravity():
+    """Expect a share of the weight for the mass, and the weight times the angle for the attitude."""
     still = Twist(triple([0.0] * 3), triple([0.0] * 3))
     level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
     down = triple([0.0, 0.0, -9.80665])
@@ -120,7 +120,7 @@ def test_wrong_numbers_leave_gravity_over():
 
 
 @pytest.mark.slow
-def test_a_sample_is_mixed_then_biased_then_rounded():
+def test_sensor_sample_is_mixed_then_biased_then_rounded():
     mixing = np.eye(6)
     mixing[0, 2], mixing[4, 1] = 0.01, -0.02
     zero = np.zeros(6)

@@ -1,4 +1,4 @@
-"""Six axes swept: a scenario again to the bit, and the same rows and gains on a cluster, whoever dies."""
+"""Six-axis sweeps: scenarios repeat to the bit; rows and gains on a cluster do not change if a worker dies."""
 
 import json
 
@@ -38,7 +38,7 @@ def here(gains):
     return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
 
 
-def test_a_scenario_runs_again_to_the_bit(here, jaxhil, tmp_path):
+def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
     ran = jaxhil("replay", here.folder, 7, "--json", "--plot", tmp_path / "7.png")
     assert ran.code == 0, ran.err
     document, row = json.loads(ran.out), read_row(read_store(here.folder), 7)
@@ -59,7 +59,7 @@ def test_a_scenario_runs_again_to_the_bit(here, jaxhil, tmp_path):
     assert not touching[-1]
 
 
-def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
+def test_six_axis_cluster_gives_the_same_rows_though_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
         killed_meanwhile(monkeypatch, Workers, cluster, first, "run")
@@ -70,7 +70,7 @@ def test_a_cluster_makes_the_same_rows_though_a_worker_is_killed(here, gains, tm
         assert there.document[name] == here.document[name]
 
 
-def test_a_cluster_tunes_to_the_same_gains_though_a_worker_is_killed(tmp_path, monkeypatch):
+def test_six_axis_cluster_gives_the_same_gains_though_a_worker_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(tune_all, "BLOCK", 1)
     mechanisms = [package.load(NAME, {"target.mass": mass, "name": f"{mass}"}) for mass in (1e3, 2e3, 3e3)]
     few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}

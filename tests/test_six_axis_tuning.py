@@ -1,4 +1,4 @@
-"""Six axes tuned and swept from end to end: gain file, store, report; and what says that six axes lack it."""
+"""Six axes tuned and swept end to end: gain file, store and report; refusals of what six axes lack."""
 
 import json
 
@@ -18,11 +18,11 @@ from tuning.front_door.tune_options import TuneOptions
 SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
 
 
-def test_the_laws_of_six_axes_are_known_to_the_front_door():
+def test_six_axis_laws_are_known_to_the_public_interface():
     assert tuple(SIX_AXES) == arguments.SIX_AXES
 
 
-def test_each_channel_has_its_own_lead():
+def test_every_channel_has_its_own_lead():
     mechanism = load_any("petals").mechanism
     law = SIX_AXES["phase_lead_per_axis"]
     gains = literature_gains(mechanism, law.name)
@@ -32,7 +32,7 @@ def test_each_channel_has_its_own_lead():
     assert leads == [0.0037] * 3 + [0.02] + [0.0037] * 2
 
 
-def test_the_front_door_takes_six_axes():
+def test_public_interface_accepts_six_axes():
     mechanism = package.load("petals", {"target.mass": 2000.0})
     assert (
         mechanism.target.mass == 2000.0 and mechanism == load_any("petals", {"target.mass": 2000.0}).mechanism
@@ -50,7 +50,7 @@ def test_the_front_door_takes_six_axes():
         assert reason in str(caught.value) and str(caught.value).isprintable()
 
 
-def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
+def test_unsupported_six_axis_features_are_refused_in_one_line(jaxhil, tmp_path):
     path = tmp_path / "gains.json"
     for given, reason in (
         (
@@ -71,7 +71,7 @@ def test_what_six_axes_do_not_have_is_said_in_one_line(jaxhil, tmp_path):
     assert not path.exists()
 
 
-def test_a_lead_for_each_axis_is_tuned_like_any_law():
+def test_lead_for_each_axis_is_tuned_like_any_law():
     options = TuneOptions(compensator="phase_lead_per_axis", scenarios=4)
     assert (
         options.settings().objective
@@ -90,7 +90,7 @@ def tuned(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_tuning_lowers_both_errors(tuned):
+def test_six_axis_tuning_lowers_both_errors(tuned):
     found, path = tuned
     for error in ("energy_error", "twist_error"):
         figures = found.parts[error]
@@ -118,7 +118,7 @@ def test_equal_leads_of_all_axes_are_one_lead():
 
 
 @pytest.mark.slow
-def test_gains_of_six_axes_do_not_reach_a_controller_of_one(tuned, jaxhil, tmp_path):
+def test_gains_of_six_axes_are_refused_by_a_controller_of_one(tuned, jaxhil, tmp_path):
     from jaxhil.rig import Controller, GainFileError
 
     _, path = tuned
@@ -130,7 +130,7 @@ def test_gains_of_six_axes_do_not_reach_a_controller_of_one(tuned, jaxhil, tmp_p
 
 
 @pytest.mark.slow
-def test_sweep_and_report(tuned, jaxhil, tmp_path):
+def test_six_axis_sweep_and_report(tuned, jaxhil, tmp_path):
     _, path = tuned
     store, page = tmp_path / "store", tmp_path / "page.html"
     ran = jaxhil("sweep", path, "--scenarios", 64, "--chunk", 32, "--limit", 0.3, "-o", store, "--json")
@@ -153,8 +153,8 @@ def test_sweep_and_report(tuned, jaxhil, tmp_path):
 
 
 @pytest.mark.slow
-def test_derivatives_reach_through_the_loop():
-    """Of what tuning minimises, by both gains: those of central differences."""
+def test_six_axis_derivatives_pass_through_the_loop():
+    """Compare derivatives of the tuning objective by both gains with central differences."""
     from jaxhil.mechanism.uncertainty import quasi_random
     from jaxhil.simulation.environment import computing
     from jaxhil.sixdof.six_axes import SIX_AXES

@@ -1,4 +1,4 @@
-"""Numbers in another unit than the file's are told of, with the unit that is asked for."""
+"""Plausible units: numbers in another unit than the file's are reported, with the requested unit."""
 
 import pytest
 
@@ -11,7 +11,7 @@ def told(name, changes):
 
 
 @pytest.mark.parametrize("name", six_axis_names())
-def test_builtins_are_plausible(name):
+def test_six_axis_builtins_are_plausible(name):
     assert told(name, {}) == ()
 
 
@@ -36,6 +36,6 @@ def test_builtins_are_plausible(name):
         ({"rig.force_sensor.tool.com": [10.0, 20.0, 150.0]}, "tool.com: found 152 m, expected at most 2 m"),
     ],
 )
-def test_what_is_far_from_any_docking_is_told_of(changes, reason):
+def test_values_far_from_any_docking_are_reported(changes, reason):
     warnings = told("probe-drogue", changes)
     assert any(reason in warning for warning in warnings), warnings

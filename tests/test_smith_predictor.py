@@ -25,7 +25,7 @@ def expected_decay(share, lag, delay):
     return decay(characteristic_root(equation))
 
 
-def test_the_figures_of_the_model_s_description():
+def test_smith_predictor_restitution_is_that_of_the_guide():
     lag, delay = LAGS[0]
     assert np.exp(expected_decay(1.0, lag, delay)) == pytest.approx(1.014, abs=5e-4)
 
@@ -37,7 +37,7 @@ def test_the_figures_of_the_model_s_description():
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_the_loop_grows_as_its_root(name):
+def test_smith_predictor_loop_grows_as_its_root(name):
     lag, delay = LAGS.T
     gains = {"phase_lead": delay, "simulator_lag": lag}
     found = without_period(name, 2.5, gains, simulator__delay=lag, force_sensor__delay=delay)
@@ -48,7 +48,7 @@ def test_the_loop_grows_as_its_root(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_a_single_contact_is_left_with_about_that(name):
+def test_smith_predictor_restitution_of_a_single_contact_is_near_its_root(name):
     period, phase = grid([5e-4, 2.5e-4], (np.arange(8) + 0.5) / 8)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=2.5e-4))
     lag, delay = LAGS[0]
@@ -63,7 +63,7 @@ def test_a_single_contact_is_left_with_about_that(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_amplification_of_noise(name):
+def test_noise_amplification_of_smith_predictor(name):
     check_amplification(
         name,
         [
@@ -75,14 +75,14 @@ def test_amplification_of_noise(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_without_a_lag_it_is_phase_lead(name):
+def test_smith_predictor_without_lag_is_phase_lead(name):
     made = load("rig-300kg").mechanism
     gains = {"phase_lead": 0.008, "lead_filter": 0.001}
     amplified = pareto_amplification(made, name, gains | {"simulator_lag": 0.0})
     assert amplified == pytest.approx(pareto_amplification(made, "phase_lead", gains), rel=1e-13)
 
 
-def test_nominal_is_within_bounds():
+def test_smith_predictor_nominal_gains_are_within_bounds():
     for name in builtin_names():
         for override in [[], ["rig.control_period=0.004", "rig.force_sensor.delay=0.3"]]:
             made = load(name, override).mechanism

@@ -35,7 +35,7 @@ def found(case, number, seed):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_indices_are_those_in_closed_form(case):
+def test_sobol_indices_agree_with_closed_forms(case):
     _, first_order, total = CASES[case]
     indices = found(case, 4096, seed=0)
     np.testing.assert_allclose(indices.first_order.value, first_order, rtol=0, atol=3e-3)
@@ -44,7 +44,7 @@ def test_indices_are_those_in_closed_form(case):
         assert np.all((interval.low <= truth) & (truth <= interval.high)) and np.all(interval.width < 0.1)
 
 
-def test_the_estimates_are_those_of_scipy():
+def test_sobol_estimates_are_those_of_scipy():
     values = ishigami(saltelli_design(3, 512, seed=1))
     a, b, mixed = values[None, :512], values[None, 512:1024], values[1024:].reshape(3, 1, 512)
     expected = stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": mixed}, n=512)
@@ -55,7 +55,7 @@ def test_the_estimates_are_those_of_scipy():
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("number", (64, 256))
-def test_repeated_intervals_cover(case, number, capsys):
+def test_sobol_intervals_of_repeats_cover(case, number, capsys):
     _, first_order, total = CASES[case]
     inside, widths = [], []
     for seed in range(60):
@@ -71,7 +71,7 @@ def test_repeated_intervals_cover(case, number, capsys):
     assert np.mean(inside) >= 0.935
 
 
-def test_an_input_may_have_several_columns():
+def test_sobol_input_may_have_several_columns():
     columns = (1, 3, 1)
     points = saltelli_design(columns, 2048, seed=2)
     assert points.shape == (evaluations(columns, 2048), 5) == (2048 * 5, 5)
@@ -82,7 +82,7 @@ def test_an_input_may_have_several_columns():
     np.testing.assert_allclose(indices.first_order.value, variances / np.sum(variances), atol=3e-3)
 
 
-def test_the_design_is_two_sets_and_their_mixtures():
+def test_saltelli_design_is_two_sets_and_their_mixtures():
     points = saltelli_design(3, 64, seed=3).reshape(5, 64, 3)
     a, b, mixed = points[0], points[1], points[2:]
     assert np.all((points >= 0) & (points < 1))
@@ -97,7 +97,7 @@ def test_the_design_is_two_sets_and_their_mixtures():
     assert not np.array_equal(saltelli_design(3, 64, seed=4), points.reshape(-1, 3))
 
 
-def test_results_are_cut_where_asked():
+def test_sobol_results_are_capped_on_request():
     points = saltelli_design(2, 256, seed=5)
     values = points @ [1.0, 3.0]
     cut = sobol_indices(np.minimum(values, 3.5), 2, 256)
@@ -106,7 +106,7 @@ def test_results_are_cut_where_asked():
     assert not np.array_equal(sobol_indices(values, 2, 256).total.value, cut.total.value)
 
 
-def test_the_scale_does_not_matter():
+def test_sobol_indices_do_not_depend_on_the_scale():
     values = ishigami(saltelli_design(3, 128, seed=6))
     for scale in (1e-200, 1e200):
         for interval, scaled in zip(
@@ -115,7 +115,7 @@ def test_the_scale_does_not_matter():
             np.testing.assert_allclose(interval, scaled, rtol=1e-9, atol=1e-12)
 
 
-def test_where_nothing_varies_nothing_is_known():
+def test_sobol_indices_without_variance_are_unknown():
     for constant in (0.0, 7.3):
         indices = sobol_indices(np.full(5 * 16, constant), 3, 16)
         for interval in indices:
@@ -136,6 +136,6 @@ def test_where_nothing_varies_nothing_is_known():
         (lambda: sobol_indices(np.full(20, np.nan), 3, 4), "not finite"),
     ),
 )
-def test_impossible_designs_are_refused(wrong, words):
+def test_saltelli_design_refuses_impossible_sizes(wrong, words):
     with pytest.raises(ValueError, match=words):
         wrong()

@@ -1,4 +1,4 @@
-"""What results follow from besides the input: it changes when code does, that of a law from elsewhere too."""
+"""Fingerprint of sources: it changes with the code, including that of user-registered laws."""
 
 import importlib
 import sys
@@ -22,7 +22,7 @@ class Mine:
 """
 
 
-def test_every_source_counts(tmp_path, monkeypatch):
+def test_fingerprint_covers_every_source(tmp_path, monkeypatch):
     digests = [sources_sha256()]
     for text in ("one = 1", "one = 2"):
         package = tmp_path / text.replace(" ", "")
@@ -35,7 +35,7 @@ def test_every_source_counts(tmp_path, monkeypatch):
     assert len(set(digests)) == 3 and sources_sha256() == digests[0]
 
 
-def test_a_law_from_elsewhere_counts_with_its_fields(tmp_path, monkeypatch):
+def test_fingerprint_covers_user_registered_law_and_its_fields(tmp_path, monkeypatch):
     assert sources_sha256(*COMPENSATORS.values(), *LAWS.values()) == sources_sha256()
     monkeypatch.syspath_prepend(tmp_path)
     digests = [sources_sha256()]
@@ -49,6 +49,6 @@ def test_a_law_from_elsewhere_counts_with_its_fields(tmp_path, monkeypatch):
     assert len(set(digests)) == 5
 
 
-def test_versions_are_those_that_run():
+def test_fingerprint_versions_are_those_that_run():
     assert versions()["jax"] == jax.__version__ and versions()["numpy"] == numpy.__version__
     assert versions()["python"] == ".".join(map(str, sys.version_info[:3]))

@@ -1,4 +1,4 @@
-"""Environment variables and standard streams under which a command starts, or says in one line why not."""
+"""Environment variables and standard streams with which a command starts, or says in one line why not."""
 
 import json
 import os
@@ -65,7 +65,7 @@ def test_environment_variables_with_which_jax_does_not_start_are_refused(variabl
     assert ran.stdout == ""
 
 
-def test_flags_over_which_xla_ends_raise_in_python():
+def test_flags_that_end_xla_raise_in_python():
     script = "import jaxhil; jaxhil.simulate('rig-300kg')"
     variables = {**os.environ, "PYTHONPATH": ROOT, "XLA_FLAGS": "--xla_nonsense=1"}
     ran = subprocess.run(
@@ -75,7 +75,7 @@ def test_flags_over_which_xla_ends_raise_in_python():
     assert "InputError: XLA_FLAGS: found '--xla_nonsense=1'" in ran.stderr
 
 
-def test_debugging_modes_and_displays_change_no_figure(jaxhil, tmp_path):
+def test_debugging_modes_and_displays_change_no_number(jaxhil, tmp_path):
     ran = run("simulate", "rig-300kg", "--json", "--plot", str(tmp_path / "run.png"), **DEBUGGING)
     assert ran.returncode == 1, ran.stderr
     assert json.loads(ran.stdout) == jaxhil("simulate", "rig-300kg", "--json").document
@@ -98,7 +98,7 @@ def test_flags_of_a_file_are_those_in_it(tmp_path):
     assert environment.flags(str(tmp_path / "flags")) == environment.flags(given)
 
 
-def test_a_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
+def test_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
     monkeypatch.setattr(startup, "_processes", set())
     startup.check_process()
     startup.check_process()
@@ -107,23 +107,23 @@ def test_a_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
         startup.check_process()
 
 
-def test_a_closed_standard_output_is_refused_before_any_work():
+def test_closed_standard_output_is_refused_before_any_work():
     refused(run("simulate", shell=">&-"), "standard output: found it closed")
 
 
-def test_a_full_standard_output_is_told_in_one_line():
+def test_full_standard_output_is_reported_in_one_line():
     refused(run("mechanisms", "--json", shell="> /dev/full"), "standard output: cannot be written: No space")
 
 
 @pytest.mark.parametrize("shell", ["2>&- <&-", "2> /dev/full", "2> >(true)"])
-def test_without_standard_error_the_result_is_the_same(jaxhil, tmp_path, shell):
+def test_result_without_standard_error_is_the_same(jaxhil, tmp_path, shell):
     arguments = "simulate", "rig-300kg", "--json", "--log", str(tmp_path / "log.csv")
     ran = run(*arguments, shell=shell)
     assert (ran.returncode, ran.stderr) == (1, "")
     assert json.loads(ran.stdout) == jaxhil(*arguments).document
 
 
-def test_a_reader_that_has_gone_away_is_no_error(tmp_path):
+def test_reader_that_has_gone_away_is_no_error(tmp_path):
     ran = run(
         "simulate", "rig-300kg", "--log", str(tmp_path / "log.csv"), shell="| true; exit ${PIPESTATUS[0]}"
     )

@@ -1,4 +1,4 @@
-"""The hexapod: a pose and its legs, there and back; equal legs against task space; two robots."""
+"""Hexapod: inverse and forward kinematics; equal legs against task space; two robots."""
 
 import jax
 import jax.numpy as jnp
@@ -33,8 +33,8 @@ def poses():
     return [jnp.asarray(scales * seeded.uniform(-1, 1, (6, 2))) for _ in range(3)]
 
 
-def test_a_pose_and_its_legs_there_and_back():
-    """With rates and accelerations of the legs those of the pose."""
+def test_hexapod_pose_survives_inverse_and_forward_kinematics():
+    """Include rates and accelerations of the legs and of the pose."""
     rig, (at, rate, bend) = hexapod(), poses()
 
     def along(time):
@@ -51,7 +51,7 @@ def test_a_pose_and_its_legs_there_and_back():
     assert np.all(np.asarray(condition(rig, at)) < 100)
 
 
-def test_derivatives_of_the_pose_are_those_of_differences():
+def test_hexapod_pose_derivatives_agree_with_differences():
     rig, (at, *_) = hexapod(), poses()
     legs = rig.command(at)
 
@@ -86,8 +86,8 @@ def moved(kinematics, axes, amplitude):
     return lax.scan(body, hardware, jnp.arange(TICKS, dtype=jnp.int32))[1]
 
 
-def test_equal_legs_are_task_space_for_small_strokes():
-    """Of second order in the stroke."""
+def test_hexapod_of_equal_legs_is_task_space_for_small_strokes():
+    """Expect a difference of second order in the stroke."""
     both = [
         [np.asarray(jax.jit(moved, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
         for one in (hexapod(), TaskSpace())

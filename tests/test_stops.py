@@ -1,4 +1,4 @@
-"""What stops a run on the rig is named: fault, value, limit, contact and time; and what lets the run pass."""
+"""Causes that stop a run on the rig: fault, value, limit, contact and time; and what lets the run pass."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def stop_of(loaded, lane, **limits):
     return gain_file, find_stop(gain_file, lane)
 
 
-def test_no_limits_stop_nothing(loaded, recorded):
+def test_run_without_limits_is_not_stopped(loaded, recorded):
     gain_file, stop = stop_of(loaded, recorded[1])
     assert stop is None and passing_limits(gain_file, recorded[1]) == {}
 
@@ -141,7 +141,7 @@ def test_watchdog_names_restitution_expectation_and_contact(loaded, recorded):
         )
 
 
-def test_last_contact_of_a_run_is_audited_too(loaded, recorded):
+def test_last_contact_of_a_run_is_audited(loaded, recorded):
     metrics, lane = recorded
     one = int(np.flatnonzero(np.asarray(lane.signals.age) == 0)[1])
     first = lane._replace(
@@ -160,7 +160,7 @@ def test_contact_that_lasts_too_long_is_named(loaded, recorded):
     assert list(passing_limits(gain_file, recorded[1])) == ["longest_contact"]
 
 
-def test_verify_names_what_stopped_the_closed_loop(loaded):
+def test_verify_names_the_cause_that_stopped_the_closed_loop(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     report = verify(check_document(limited(loaded, **limits)), scenarios=1)
     assert not report.verdict and report.stop.fault == "restitution" and report.stop.contact == 1
@@ -170,7 +170,7 @@ def test_verify_names_what_stopped_the_closed_loop(loaded):
     assert verify(loaded, scenarios=1).stop is None
 
 
-def test_bundle_says_that_its_limits_stop_the_run_it_was_made_from(loaded):
+def test_bundle_reports_that_its_limits_stop_the_run_it_was_made_from(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     bundle = build_bundle(loaded.document, ["csv"], limits)
     assert bundle.stop.fault == "restitution" and bundle.stop.limit == "restitution_margin"
@@ -178,7 +178,7 @@ def test_bundle_says_that_its_limits_stop_the_run_it_was_made_from(loaded):
     assert again.stop is None and again.passing is None and again.ended[0] is None
 
 
-def test_export_names_the_limit_and_what_to_set(loaded, tmp_path):
+def test_export_names_the_limit_and_the_value_to_set(loaded, tmp_path):
     path = tmp_path / "gains.json"
     found = export(_saved(path, loaded), tmp_path / "bundle", limits={"force_limit": 5.0})
     assert found.verdict == "bad" and found.document["stop"]["limit"] == "force_limit"

@@ -1,4 +1,4 @@
-"""The summary holds every gain and limit, is one file, and says nothing that it does not know."""
+"""Summary page: it holds every gain and limit, is one file, and states nothing that is not known."""
 
 import base64
 import copy
@@ -84,13 +84,13 @@ def page(made):
     return Page(summary_html(made))
 
 
-def test_every_gain_has_a_row_with_its_unit(made, page):
+def test_summary_has_a_row_with_unit_for_every_gain(made, page):
     rows = {row[0]: row for row in page.rows if row}
     for name, one in made["gains"].items():
         assert float(rows[name][1]) == pytest.approx(one["value"], rel=1e-5) and rows[name][2] == one["unit"]
 
 
-def test_every_limit_is_there_or_said_not_to_be(made, page):
+def test_summary_has_every_limit_or_states_its_absence(made, page):
     rows = {row[0]: row for row in page.rows if row}
     text = " ".join(page.texts)
     unset = re.search(r"by the code alone: ([^.]*)\.", text)[1].split(", ")
@@ -104,7 +104,7 @@ def test_every_limit_is_there_or_said_not_to_be(made, page):
     assert {"force_limit", "restitution_margin"} <= {*rows} | {*unset}
 
 
-def test_says_what_for_how_good_and_how_sure(made, page):
+def test_summary_states_purpose_quality_and_confidence(made, page):
     text = " ".join(page.texts)
     for part in (
         *(
@@ -125,14 +125,14 @@ def test_says_what_for_how_good_and_how_sure(made, page):
     assert rows["tuned"][1:] == ["0.005", "1.25", "1.5", "0.375", "1.75", "3"]
 
 
-def test_stands_alone_and_is_the_same_twice(made, page):
+def test_summary_is_self_contained_and_reproducible(made, page):
     assert len(page.references) == 1 and page.references[0].startswith("data:image/png;base64,")
     assert summary_html(made) == summary_html(made)
     content = summary_html(made).decode()
     assert "http" not in content and "@page { size: A4" in content
 
 
-def test_the_picture_is_one(made, page, tmp_path):
+def test_summary_has_one_picture(made, page, tmp_path):
     content = base64.b64decode(page.references[0].partition(",")[2])
     assert content == picture_png(made)
     (tmp_path / "picture.png").write_bytes(content)
@@ -146,27 +146,27 @@ def test_the_picture_is_one(made, page, tmp_path):
     assert all(np.all(edge == 1.0) for edge in edges)
 
 
-def test_the_callers_settings_of_matplotlib_are_not_the_pictures(made):
+def test_summary_picture_ignores_the_callers_matplotlib_settings(made):
     with matplotlib.rc_context({"figure.constrained_layout.use": True, "font.size": 20}):
         inside = picture_png(made)
     assert inside == picture_png(made)
 
 
-def test_rows_fit_on_one_sheet(page):
+def test_summary_rows_fit_on_one_sheet(page):
     # A4 less margins is 275 mm: 3.7 mm a row in the longer column, 110 mm for heading, picture and figures.
     limits = [row for row in page.rows if len(row) == 3]
     gains = [row for row in page.rows if len(row) == 4]
     assert 3.7 * max(len(limits), len(gains)) + 110 + 20 < 275
 
 
-def test_a_name_is_text_and_no_markup(made):
+def test_summary_shows_a_name_as_text_and_no_markup(made):
     hostile = {**made, "mechanism": {**made["mechanism"], "name": "<script>alert('$x_1')</script>\n&"}}
     content = summary_html(hostile)
     assert b"<script" not in content and b"&lt;script&gt;" in content
     Page(content)
 
 
-def test_what_is_not_known_is_not_made_up():
+def test_summary_does_not_invent_unknown_values():
     bare = document("rattling", "none")
     text = " ".join(Page(summary_html(bare)).texts)
     assert "None: the measured force is passed on." in text

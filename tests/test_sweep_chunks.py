@@ -1,4 +1,4 @@
-"""Chunks: rows are the same to the bit whatever the chunks, in either precision, of good runs and bad."""
+"""Chunks of a sweep: the same rows to the bit for any chunks, in either precision, of good and bad runs."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def sweep(request):
     return build_sweep(manifest(case(2, "phase_lead", sensor), 112, sampling=sampling))
 
 
-def test_rows_do_not_depend_on_the_chunks(sweep):
+def test_sweep_rows_do_not_depend_on_the_chunks(sweep):
     whole = run_chunk(sweep, 0, 112)
     assert same_rows(joined([rows for _, rows in run_parts(sweep, range(4))]), whole) == []
     uneven = [run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 80), (80, 112))]
@@ -37,12 +37,12 @@ def test_rows_do_not_depend_on_the_chunks(sweep):
     assert np.ptp(whole["error_1"]) > 1e-3
 
 
-def test_parts_come_one_by_one_in_the_order_asked_for(sweep):
+def test_sweep_chunks_come_one_by_one_in_the_requested_order(sweep):
     assert [part for part, _ in run_parts(sweep, [3, 0])] == [3, 0]
     assert list(run_parts(sweep, [])) == []
 
 
-def test_the_program_serves_whatever_can_be_drawn():
+def test_sweep_program_serves_whatever_can_be_drawn():
     uncertain = {
         "rig.force_sensor.delay": {"distribution": "normal", "std": 0.05},
         "rig.control_period": {"distribution": "uniform", "low": 0.001, "high": 0.002},
@@ -52,7 +52,7 @@ def test_the_program_serves_whatever_can_be_drawn():
     assert few.loop.ring == 512
 
 
-def test_float32_is_near_float64():
+def test_sweep_in_float32_is_near_float64():
     sweep = build_sweep(manifest(precision="float32"))
     single, double = run_chunk(sweep, 0, 32), run_chunk(sweep, 0, 32, "float64")
     assert single["error_1"].dtype == np.float32 and double["error_1"].dtype == np.float64
@@ -61,7 +61,7 @@ def test_float32_is_near_float64():
     assert 0 < np.max(difference) < 1e-4
 
 
-def test_runs_that_fail_are_rows():
+def test_failed_runs_are_rows():
     # A sensor that reads next to nothing: the bodies are never stopped.
     uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
     sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
@@ -72,9 +72,8 @@ def test_runs_that_fail_are_rows():
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-def test_a_simulator_slower_than_the_model_is_saturated(tmp_path, precision):
-    """Without damping or compensation the force only ever pushes back: the model is fastest before the
-    contact or after it."""
+def test_simulator_slower_than_the_model_is_saturated(tmp_path, precision):
+    """Omit damping and compensation: the force only pushes back, so the model is fastest in flight."""
     uncertain = {"rig.simulator.velocity_limit": {"distribution": "loguniform", "low": 0.0055, "high": 0.024}}
     label = manifest(case(uncertainty=uncertain, velocity_limit=0.01), 32, precision=precision)
     sweep = build_sweep(label)

@@ -1,4 +1,4 @@
-"""Sweeps on a dask.distributed cluster whose workers were started by hand: the same rows, whoever dies."""
+"""Sweeps on a dask.distributed cluster with workers started by hand: the same rows, whichever worker dies."""
 
 import os
 import socket
@@ -43,7 +43,7 @@ def whole(tmp_path_factory):
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
-def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_nothing(tmp_path):
+def test_sweep_without_a_scheduler_is_one_line_and_leaves_nothing(tmp_path):
     pytest.importorskip("distributed")
     write_gain_file(tmp_path / "gains.json", case())
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
@@ -55,7 +55,7 @@ def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_nothing(tmp_path):
     ("says", "reason"),
     ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "something else answers")),
 )
-def test_a_port_on_which_no_scheduler_answers_is_one_line(monkeypatch, says, reason):
+def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch, says, reason):
     pytest.importorskip("distributed")
     monkeypatch.setattr("tuning.caches.cluster.WAIT", 0.5)
     waited = Event()
@@ -75,14 +75,14 @@ def test_a_port_on_which_no_scheduler_answers_is_one_line(monkeypatch, says, rea
         answered.result()
 
 
-def test_a_worker_imports_no_jax_before_its_flags_are_set():
+def test_worker_imports_no_jax_before_its_flags_are_set():
     code = "import sys, tuning.caches.worker as w; assert 'jax' not in sys.modules; w.dask_setup(None);"
     code += "import os; assert '--xla_backend_optimization_level=1' in os.environ['XLA_FLAGS']"
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "PYTHONPATH": str(ROOT)})
 
 
-def test_a_worker_of_other_flags_says_how_to_start_it(monkeypatch):
+def test_worker_of_other_flags_says_how_to_start_it(monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("tuning.sweeps.manifest.xla_flags", lambda: "--others")
         asked = encode(manifest(case()))
@@ -91,7 +91,7 @@ def test_a_worker_of_other_flags_says_how_to_start_it(monkeypatch):
 
 
 @pytest.mark.slow
-def test_plain_workers_make_the_same_rows_though_one_is_killed(whole, tmp_path):
+def test_plain_workers_give_the_same_rows_though_one_is_killed(whole, tmp_path):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
 
@@ -105,7 +105,7 @@ def test_plain_workers_make_the_same_rows_though_one_is_killed(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_path):
+def test_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_path):
     (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
     with started(tmp_path) as cluster:
         wrong = cluster.worker("--preload", str(tmp_path / "early.py"))
@@ -118,8 +118,8 @@ def test_a_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_p
 
 
 @pytest.mark.slow
-def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
-    """Every worker dies of its first part, and is started anew."""
+def test_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
+    """Let every worker die of its first chunk, and start anew."""
     few = manifest(case(), scenarios=64, limit=1.5)
     code = "import os, signal, tuning.caches.worker as w\n"
     (tmp_path / "deadly.py").write_text(code + "w.prepare = lambda: os.kill(os.getpid(), signal.SIGKILL)\n")
@@ -131,7 +131,7 @@ def test_a_part_that_kills_its_workers_is_computed_here(tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_that_join_later_have_pieces_too(tmp_path, monkeypatch):
+def test_workers_that_join_later_get_chunks_too(tmp_path, monkeypatch):
     monkeypatch.setattr("tuning.caches.cluster.RECOUNT", 0.5)
     with started(tmp_path) as cluster:
         cluster.worker()
@@ -148,7 +148,7 @@ def test_workers_that_join_later_have_pieces_too(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_without_workers_parts_are_computed_here(tmp_path, monkeypatch):
+def test_sweep_without_workers_is_computed_locally(tmp_path, monkeypatch):
     monkeypatch.setattr("tuning.caches.cluster.PATIENCE", 1.0)
     few = manifest(case(), scenarios=64, limit=1.5)
     with started(tmp_path) as cluster:
@@ -157,7 +157,7 @@ def test_without_workers_parts_are_computed_here(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_dies_is_one_line_and_what_is_there_is_kept(whole, tmp_path):
+def test_scheduler_that_dies_is_one_line_and_finished_chunks_stay(whole, tmp_path):
     with started(tmp_path) as cluster:
         cluster.worker()
 
@@ -172,7 +172,7 @@ def test_a_scheduler_that_dies_is_one_line_and_what_is_there_is_kept(whole, tmp_
 
 
 @pytest.mark.slow
-def test_a_sweep_stops_at_the_same_look(tmp_path):
+def test_sweep_on_a_cluster_stops_at_the_same_look(tmp_path):
     until = manifest(case(), scenarios=300, limit=1.5, until_width=0.25)
     here, tally = rows_of(tmp_path / "here", label=until)
     with started(tmp_path) as cluster:

@@ -1,4 +1,4 @@
-"""Rows of a sweep: what is kept of good runs and of failed ones."""
+"""Rows of a sweep: columns of good runs and of failed ones."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def outcomes(found):
     return [OUTCOMES[place] for place in found["outcome"]]
 
 
-def test_error_of_largest_magnitude_decides():
+def test_error_of_largest_magnitude_decides_the_outcome():
     found = rows([[0.005, 0.002, -0.03], [-0.009, 0.02, 0.02]], [[OK] * 3, [OK] * 3])
     np.testing.assert_array_equal(found["worst_error"], [-0.009, 0.02, -0.03])
     assert outcomes(found) == ["good", "error beyond limit", "error beyond limit"]
@@ -68,7 +68,7 @@ def test_error_of_largest_magnitude_decides():
     np.testing.assert_array_equal(found["index"], [7, 8, 9])
 
 
-def test_a_failed_run_is_a_row_with_a_cause():
+def test_failed_run_is_a_row_with_a_cause():
     errors = [[NAN, 0.5, 0.0, 0.0], [0.0, 0.0, NAN, 0.0]]
     status = [[NON_FINITE, DIVERGED, OK, OK], [NOT_REACHED, NOT_REACHED, TIMEOUT, NOT_REACHED]]
     found = rows(errors, status)
@@ -85,12 +85,12 @@ def test_a_failed_run_is_a_row_with_a_cause():
     np.testing.assert_array_equal(np.isnan(found["peak_force_2"]), [True, True, False, True])
 
 
-def test_a_force_beyond_the_sensors_range_is_saturation():
+def test_force_beyond_the_sensors_range_is_saturation():
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 9.0)) == ["saturated"]
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 11.0)) == ["good"]
 
 
-def test_a_limit_of_the_motion_simulator_that_binds_is_saturation():
+def test_binding_limit_of_the_motion_simulator_is_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
     found = rows(errors, status, shortfall=1e-9)
     # It says more than an error, and less than a contact that does not end; it is known of that one, too.
@@ -119,7 +119,7 @@ def test_real_contact_unlike_the_ideal_one_is_a_failure(ideal, outcome):
     np.testing.assert_array_equal(found["reference_duration_1"], ideal[1])
 
 
-def test_unlike_contact_says_more_than_an_error_and_less_than_saturation():
+def test_unlike_contact_ranks_above_an_error_and_below_saturation():
     errors, status = [[0.5, 0.5], [0.0, 0.0]], [[OK, OK], [OK, OK]]
     assert outcomes(rows(errors, status, ideal=(1.0, 1.0))) == ["unlike the ideal contact"] * 2
     assert outcomes(rows(errors, status, 10.0, 9.0, ideal=(1.0, 1.0))) == ["saturated"] * 2
@@ -157,7 +157,7 @@ def test_columns_and_rows_have_the_same_names():
         ("approach.phase", "1"),
     ],
 )
-def test_units(path, unit):
+def test_sweep_columns_have_units(path, unit):
     assert unit_of(load("varying").mechanism, path) == unit
 
 

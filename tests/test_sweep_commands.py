@@ -1,4 +1,4 @@
-"""`jaxhil sweep` and `jaxhil replay`: exit codes, one JSON document, refusals of one line."""
+"""`jaxhil sweep` and `jaxhil replay`: exit codes, one JSON document, refusals in one line."""
 
 import json
 import resource
@@ -53,7 +53,7 @@ def document(ran):
     return json.loads(ran[1], parse_constant=pytest.fail)
 
 
-def test_sweep_says_what_it_found_in_json(jaxhil, gains, store):
+def test_sweep_prints_its_findings_as_json(jaxhil, gains, store):
     ran = jaxhil("sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume", "--json")
     found = document(ran)
     assert ran[0] == 1 and found["verdict"] == "bad"
@@ -67,15 +67,15 @@ def test_sweep_says_what_it_found_in_json(jaxhil, gains, store):
     }
 
 
-def test_the_acceptable_probability_decides(jaxhil, gains, store):
+def test_sweep_verdict_depends_on_the_acceptable_probability(jaxhil, gains, store):
     again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
     high = document(jaxhil(*again, "--json"))["failure_probability"]["high"]
     assert jaxhil(*again, "--acceptable", high + 1e-6)[0] == 0
     assert jaxhil(*again, "--acceptable", high - 1e-6)[0] == 1
 
 
-def test_no_failure_is_good(jaxhil, gains, tmp_path):
-    """The store is beside the gain file unless a folder is named."""
+def test_sweep_without_failures_is_good(jaxhil, gains, tmp_path):
+    """Expect the store beside the gain file unless a folder is named."""
     shutil.copy(gains, tmp_path / "best.json")
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
@@ -84,7 +84,7 @@ def test_no_failure_is_good(jaxhil, gains, tmp_path):
     assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 
 
-def test_the_last_few_of_a_sobol_sweep_are_outcomes_alone(jaxhil, gains, tmp_path):
+def test_sobol_sweep_leaves_its_last_scenarios_out_of_replicates(jaxhil, gains, tmp_path):
     sobol = ["sweep", gains, *TINY, "--sampling", "sobol", "--limit", "1.5", "-o", tmp_path / "new"]
     ran = jaxhil(*sobol, "--json")
     found = document(ran)
@@ -96,13 +96,13 @@ def test_the_last_few_of_a_sobol_sweep_are_outcomes_alone(jaxhil, gains, tmp_pat
     assert code == 1 and "The last 4 scenarios" in out
 
 
-def test_float32_is_compared_with_float64(jaxhil, gains, tmp_path):
+def test_sweep_compares_float32_with_float64(jaxhil, gains, tmp_path):
     ran = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "n", "--precision", "float32", "--json")
     compared = document(ran)["float32"]
     assert compared["scenarios"] == 64 and 0 < compared["largest_difference"] < 1e-4
 
 
-def test_a_width_stops_the_sweep(jaxhil, gains, tmp_path):
+def test_sweep_stops_at_a_width(jaxhil, gains, tmp_path):
     wide = ["sweep", gains, "--scenarios", "1000", "--chunk", "64", "--limit", "1.5", "-o", tmp_path / "n"]
     wide += ["--until-width", "0.3"]
     ran = jaxhil(*wide, "--json")
@@ -117,7 +117,7 @@ def test_a_width_stops_the_sweep(jaxhil, gains, tmp_path):
     refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep stopped")
 
 
-def test_quantiles_are_reported(jaxhil, gains, store):
+def test_sweep_reports_quantiles(jaxhil, gains, store):
     again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
     found = document(jaxhil(*again, "--json"))["error_quantiles"]
     assert [one["order"] for one in found] == [0.5, 0.95, 0.99, 0.999]
@@ -126,7 +126,7 @@ def test_quantiles_are_reported(jaxhil, gains, store):
     assert "99.9 %" in out and "no bound" in out
 
 
-def test_studies_are_reported(jaxhil, own):
+def test_sweep_reports_studies(jaxhil, own):
     again = [*own[1], "--drivers", "16", "--rare"]
     found = document(jaxhil(*again, "--json"))
     drivers, rare = found["drivers"], found["rare"]
@@ -156,7 +156,7 @@ def no_study(monkeypatch, *names):
         monkeypatch.setattr(f"tuning.sweeps.studies.{name}", lambda *_: pytest.fail("run again"))
 
 
-def test_the_verdict_is_kept_as_it_was_printed(jaxhil, own):
+def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own):
     folder, again = own
     ran = jaxhil(*again, "--json")
     assert (folder / "verdict.json").read_text() == ran[1]
@@ -169,7 +169,7 @@ def test_the_verdict_is_kept_as_it_was_printed(jaxhil, own):
     assert jaxhil("replay", folder, 5)[0] == 0
 
 
-def test_studies_are_run_once(jaxhil, own, quick, monkeypatch):
+def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
     folder, again = own
     first = jaxhil(*again, *STUDIES, "--json")
     assert (folder / "verdict.json").read_text() == first[1] and "as kept" not in first[2]
@@ -183,7 +183,7 @@ def test_studies_are_run_once(jaxhil, own, quick, monkeypatch):
         jaxhil(*again, "--drivers", "32")
 
 
-def test_a_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
+def test_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
     folder, again = own
     jaxhil(*again, *STUDIES)
     new = [*("sweep", gains, *TINY, "-o", tmp_path / "other", "--limit", "1.5"), *STUDIES]
@@ -195,7 +195,7 @@ def test_a_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
     refused(jaxhil(*new), "other", "--resume")
 
 
-def test_an_interruption_keeps_verdict_and_studies_so_far(jaxhil, own, quick, monkeypatch):
+def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick, monkeypatch):
     folder, again = own
     (folder / "verdict.json").unlink()
 
@@ -217,7 +217,7 @@ def test_an_interruption_keeps_verdict_and_studies_so_far(jaxhil, own, quick, mo
     assert found["drivers"] == so_far["drivers"] and found["rare"]["limit"] == 1.6
 
 
-def test_a_damaged_study_is_run_again(jaxhil, own, quick):
+def test_damaged_study_is_run_again(jaxhil, own, quick):
     folder, again = own
     first = jaxhil(*again, *STUDIES, "--json")
     contents = {folder / one: (folder / one).read_bytes() for one in KEPT}
@@ -236,7 +236,7 @@ def unwritable(ran, name):
     return json.loads(out)
 
 
-def test_a_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
+def test_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
     folder, again = own
     (folder / "studies").touch()
     found = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
@@ -248,7 +248,7 @@ def test_a_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
     assert document(jaxhil(*again, *STUDIES, "--json")) == found
 
 
-def test_a_full_disk_costs_no_verdict(jaxhil, own, quick):
+def test_full_disk_costs_no_verdict(jaxhil, own, quick):
     folder, again = own
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -274,7 +274,7 @@ def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
     assert code == 0 and "to the bit" in out
 
 
-def test_replay_finds_out_what_was_changed(jaxhil, gains, tmp_path):
+def test_replay_detects_changes(jaxhil, gains, tmp_path):
     folder = tmp_path / "store"
     jaxhil("sweep", gains, *TINY, "-o", folder)
     opened = read_store(folder)
@@ -288,7 +288,7 @@ def test_replay_finds_out_what_was_changed(jaxhil, gains, tmp_path):
     refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found damage, or a part of something")
 
 
-def test_what_cannot_be_is_refused(jaxhil, gains, store, tmp_path):
+def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_path):
     new = ["-o", tmp_path / "new"]
     refused(jaxhil("sweep", gains, *new, "--scenarios", "0"), "--scenarios", "found 0")
     refused(jaxhil("sweep", gains, *new, "--scenarios", 2**33), "--scenarios", str(2**32))

@@ -1,4 +1,4 @@
-"""Intervals of whole sweeps cover the truth: scenarios drawn, run, judged and counted as the command does.
+"""Coverage of the intervals of whole sweeps: scenarios are drawn, run and counted as the command does.
 
 The truth is known in closed form: a linear contact of speed v, stiffness k and equivalent mass m presses with
 at most v sqrt(k m), so that a force sensor of range R saturates when v > R / sqrt(k m). Of v uniform from low
@@ -66,7 +66,7 @@ def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
 
 
 @pytest.mark.parametrize("truth", TRUTHS)
-def test_stopping_at_a_width_covers_the_truth(truth, capsys):
+def test_intervals_of_sweeps_stopped_at_a_width_cover_the_truth(truth, capsys):
     found = []
     for rows in repeated(truth, "random"):
         tally = empty_tally(1, NUMBER, looked_at=True)

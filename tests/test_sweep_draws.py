@@ -1,4 +1,4 @@
-"""Scenario i is a function of the seed and of i alone."""
+"""Scenario i as a function of the seed and of i alone."""
 
 import jax
 import numpy as np
@@ -24,7 +24,7 @@ def leaves(found, part=slice(None)):
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @given(first=st.integers(0, 2990), number=st.integers(0, 1500))
 @settings(max_examples=25)
-def test_any_chunk_is_a_part_of_the_whole(sampling, first, number):
+def test_drawn_chunk_is_a_part_of_the_whole(sampling, first, number):
     number = min(number, 3000 - first)
     found = leaves(drawn_scenarios(MECHANISM, sampling, 3, first, number))
     expected = leaves(WHOLE[sampling], slice(first, first + number))
@@ -32,7 +32,7 @@ def test_any_chunk_is_a_part_of_the_whole(sampling, first, number):
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_seeds_differ(sampling):
+def test_draws_of_different_seeds_differ(sampling):
     other, _ = drawn_scenarios(MECHANISM, sampling, 4, 0, 100)
     for path, values in WHOLE[sampling][0].items():
         assert not np.any(values[:100] == other[path])
@@ -43,7 +43,7 @@ def test_noise_keys_are_the_seed_and_the_index():
     np.testing.assert_array_equal(scenarios.key, [[9, 9, 9], [70_000, 70_001, 70_002]])
 
 
-def test_each_replicate_is_a_sobol_sequence_and_no_two_are_the_same():
+def test_replicates_are_sobol_sequences_and_no_two_are_the_same():
     points = sobol_points(5, 1, 0, 64 * REPLICATES)
     replicates = points.reshape(64, REPLICATES, 5)
     for replicate in range(REPLICATES):

@@ -1,4 +1,4 @@
-"""Manifests: what is written is read; what was changed is refused in one line."""
+"""Manifests of sweeps: read as they were written; a changed one is refused in one line."""
 
 import json
 
@@ -30,14 +30,14 @@ def refusal(content):
     return message
 
 
-def test_round_trip():
+def test_manifest_survives_a_round_trip():
     assert decode(encode(GOOD), "f") == GOOD
     endless = manifest(limit=0)
     assert decode(encode(endless), "f") == endless and endless.largest_error == 0
     assert GOOD.largest_error == float("inf")
 
 
-def test_a_width_is_kept_where_there_is_one():
+def test_manifest_has_a_width_if_there_is_one():
     # Without it a manifest is what it was before there were any.
     assert b"until_width" not in encode(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
@@ -48,13 +48,13 @@ def test_a_width_is_kept_where_there_is_one():
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_are_refused(content):
+def test_manifest_of_arbitrary_bytes_is_refused(content):
     refusal(content)
 
 
 @given(st.sampled_from(sorted(DOCUMENT)), JSON, st.booleans())
 @settings(max_examples=200)
-def test_any_other_value_is_refused_or_taken_as_signed(key, value, signed):
+def test_manifest_with_another_value_is_refused_or_taken_as_signed(key, value, signed):
     changed = {**DOCUMENT, key: value}
     if signed:
         changed["sha256"] = digest(changed)
@@ -68,14 +68,14 @@ def test_any_other_value_is_refused_or_taken_as_signed(key, value, signed):
         assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
 
 
-def test_missing_and_unknown_keys_are_named():
+def test_manifest_with_missing_or_unknown_keys_names_them():
     assert "seed" in refusal(json.dumps({k: v for k, v in DOCUMENT.items() if k != "seed"}).encode())
     assert "speed" in refusal(json.dumps({**DOCUMENT, "speed": 1}).encode())
     assert "jaxhil/sweep/2" in refusal(b"[]")
     assert "NaN" in refusal(encode(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
 
 
-def test_parts_cover_all_scenarios():
+def test_manifest_parts_cover_all_scenarios():
     assert GOOD.parts == 4
     assert [GOOD.part_rows(part) for part in range(4)] == [(0, 32), (32, 32), (64, 32), (96, 4)]
 
@@ -84,17 +84,17 @@ def test_parts_cover_all_scenarios():
     ("key", "value"),
     [("seed", 1), ("scenarios", 96), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
 )
-def test_what_differs_is_named(key, value):
+def test_manifest_comparison_names_what_differs(key, value):
     (difference,) = differences(manifest(scenarios=112), manifest(**{"scenarios": 112, key: value}))
     assert difference.startswith(f"{key}: found ")
 
 
-def test_a_manifest_of_an_earlier_schema_says_what_to_do():
+def test_manifest_of_an_earlier_schema_says_what_to_do():
     old = json.dumps({**DOCUMENT, "schema": "jaxhil/sweep/1"}).encode()
     assert "allowed jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
 
 
-def test_a_flipped_bit_is_refused_or_changes_nothing_but_the_date():
+def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
     content = encode(GOOD)
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
@@ -107,7 +107,7 @@ def test_a_flipped_bit_is_refused_or_changes_nothing_but_the_date():
             assert msgspec.structs.replace(found, created=GOOD.created) == GOOD
 
 
-def test_other_gains_and_other_code_differ():
+def test_manifest_differs_for_other_gains_and_other_code():
     (difference,) = differences(GOOD, manifest(case(compensator="phase_lead")))
     assert difference.startswith("gains_sha256: ")
     newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"}, sources_sha256="0" * 64)
@@ -118,7 +118,7 @@ def test_other_gains_and_other_code_differ():
     assert not differences(GOOD, manifest()) and not other_code(GOOD, manifest()) and not unlike_here(GOOD)
 
 
-def test_only_flags_that_may_change_a_result_count():
+def test_manifest_covers_only_flags_that_may_change_a_result():
     ours = rounding_flags("--xla_force_host_platform_device_count=8 --b=1 --a=2")
     assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"
     assert rounding_flags("--xla_force_host_platform_device_count=1 --b=1") != rounding_flags("--b=1")

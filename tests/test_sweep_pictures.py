@@ -1,4 +1,4 @@
-"""Pictures of a sweep: what they accumulate is what NumPy finds in the whole, however it is split."""
+"""Plots of a sweep: they accumulate what NumPy finds in the whole, however it is divided."""
 
 import json
 
@@ -74,7 +74,7 @@ def flat(found):
     "cuts",
     [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]],
 )
-def test_any_split_gives_the_same(swept, few_points, cuts):
+def test_sweep_plots_are_the_same_for_any_division(swept, few_points, cuts):
     made, mechanism, rows = swept
     plan = make_plan(made, mechanism, rows)
     whole = accumulated(plan, rows, [(0, NUMBER)])
@@ -82,14 +82,14 @@ def test_any_split_gives_the_same(swept, few_points, cuts):
         np.testing.assert_array_equal(one, other)
 
 
-def test_stiffness_and_force_delay_come_first(usual):
+def test_stiffness_and_force_delay_are_plotted_first(usual):
     made, mechanism, rows = usual
     plan = make_plan(made, mechanism, rows)
     assert [one.label for one in plan.per_contact] == ["contact stiffness [kN/m]", "force delay [ms]"]
     assert all(one.low < np.median(one.values(rows)) < one.high for one in plan.per_contact)
 
 
-def test_else_the_inputs_with_the_strongest_rank_correlation(lost):
+def test_inputs_with_strongest_rank_correlation_are_plotted_otherwise(lost):
     made, mechanism, rows = lost
     assert make_plan(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
     # What drives the error is made known to the plan, against the real one.
@@ -98,7 +98,7 @@ def test_else_the_inputs_with_the_strongest_rank_correlation(lost):
     assert make_plan(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
 
 
-def test_counts_of_cells_are_a_histogram_of_the_whole(usual):
+def test_cell_counts_are_a_histogram_of_the_whole(usual):
     made, mechanism, rows = usual
     plan = make_plan(made, mechanism, rows)
     sizes = accumulated(plan, rows, [(0, NUMBER)]).sizes
@@ -113,7 +113,7 @@ def test_counts_of_cells_are_a_histogram_of_the_whole(usual):
     assert inner.sum() == sizes.sum() == 2 * NUMBER and np.count_nonzero(inner) > 50
 
 
-def test_a_quantile_is_that_of_the_values():
+def test_plotted_quantile_is_that_of_the_values():
     values = np.abs(np.random.default_rng(0).standard_normal(3000)) * 10.0 ** np.linspace(-4, 0, 3000)
     counts = np.bincount(np.searchsorted(EDGES, values, side="right"), minlength=len(EDGES) + 1)
     for order in (0.5, 0.95, 0.99):
@@ -124,7 +124,7 @@ def test_a_quantile_is_that_of_the_values():
     assert quantile(counts, 0.95, 20) == np.inf and np.isfinite(quantile(counts, 0.9, 20))
 
 
-def test_what_did_not_end_is_infinite_and_what_comes_after_it_nothing(lost):
+def test_contact_without_end_counts_as_infinite_and_later_ones_are_left_out(lost):
     made, mechanism, rows = lost
     plan = make_plan(made, mechanism, rows)
     found = accumulated(plan, rows, [(0, NUMBER)])
@@ -150,7 +150,7 @@ def test_failures_are_counted_up_to_each_look(swept):
         np.testing.assert_array_equal(each, direct)
 
 
-def test_points_are_the_first_and_the_first_that_failed(usual, few_points):
+def test_plotted_points_are_the_first_and_the_first_failures(usual, few_points):
     made, mechanism, rows = usual
     found = accumulated(make_plan(made, mechanism, rows), rows, [(0, NUMBER)])
     failed = np.flatnonzero(rows["failed"])[:20]
@@ -161,7 +161,7 @@ def test_points_are_the_first_and_the_first_that_failed(usual, few_points):
     np.testing.assert_array_equal(found.points.inputs[1], 1e3 * rows["rig.force_sensor.delay"][wanted])
 
 
-def test_convergence_ends_at_the_verdict(swept):
+def test_convergence_plot_ends_at_the_verdict(swept):
     made, mechanism, rows = swept
     plan = make_plan(made, mechanism, rows)
     found = accumulated(plan, rows, [(0, NUMBER)])
@@ -185,7 +185,7 @@ def test_convergence_ends_at_the_verdict(swept):
 
 
 @pytest.mark.parametrize("acceptable", [None, 0.5])
-def test_convergence_shows_its_end_when_nothing_failed(usual, acceptable):
+def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     made, mechanism, rows = usual
     rows = {**rows, "failed": np.zeros(NUMBER, bool)}
     plan = make_plan(made, mechanism, rows)
@@ -198,7 +198,7 @@ def test_convergence_shows_its_end_when_nothing_failed(usual, acceptable):
     assert f"95 % at a number fixed beforehand, last 0 to {last:.3g}" in labels
 
 
-def test_pictures_are_the_same_whatever_the_callers_settings(usual, tmp_path):
+def test_sweep_plots_ignore_the_callers_settings(usual, tmp_path):
     made, mechanism, rows = usual
     plan = make_plan(made, mechanism, rows)
     found = accumulated(plan, rows, [(0, NUMBER)])
@@ -233,7 +233,7 @@ SELDOM = [("phases", 0.0), ("phases", 1e-9), ("phases", 1e9), ("lost", 0.2), ("l
         for limit in (0.2, 0.0, None, 1e-9, 1e9)
     ],
 )
-def test_every_axis_is_named_with_its_unit(request, name, limit):
+def test_every_axis_is_labelled_with_its_unit(request, name, limit):
     made, mechanism, rows = request.getfixturevalue(name)
     made = msgspec.structs.replace(made, limit=limit)
     plan = make_plan(made, mechanism, rows)
@@ -252,7 +252,7 @@ def test_every_axis_is_named_with_its_unit(request, name, limit):
 
 
 @pytest.mark.parametrize("limit", [0.2, None, 1e-9, 1e9])
-def test_both_ends_of_the_colour_scale_are_labelled(usual, limit):
+def test_colour_scale_is_labelled_at_both_ends(usual, limit):
     made, mechanism, rows = usual
     made = msgspec.structs.replace(made, limit=limit)
     plan = make_plan(made, mechanism, rows)
@@ -265,7 +265,7 @@ def test_both_ends_of_the_colour_scale_are_labelled(usual, limit):
     assert labels == pytest.approx(ticks, rel=0.05)
 
 
-def test_the_legend_counts_failures_by_kind(lost, few_points):
+def test_legend_counts_failures_by_kind(lost, few_points):
     made, mechanism, rows = lost
     plan = make_plan(made, mechanism, rows)
     found = accumulated(plan, rows, [(0, NUMBER)])
@@ -278,7 +278,7 @@ def test_the_legend_counts_failures_by_kind(lost, few_points):
     assert f"{pictures.UNENDED} ({endless} of the first {failed} of {of})" in labels
 
 
-def test_the_command_writes_them_and_resumes_over_them(tmp_path, capsys):
+def test_sweep_command_writes_plots_and_resumes_over_them(tmp_path, capsys):
     gains, store = tmp_path / "gains.json", tmp_path / "store"
     write_gain_file(gains, case())
     command = ["sweep", str(gains), "--scenarios", "70", "--chunk", "64", "-o", str(store), "--json"]

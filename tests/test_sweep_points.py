@@ -1,4 +1,4 @@
-"""Points of a sweep's studies: in pieces of any size, kept when finished, the same to the bit."""
+"""Points of a sweep's studies: in chunks of any size, saved when finished, the same to the bit."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def asked():
     return sweep, inputs, noise, run_points(sweep, inputs, noise)
 
 
-def test_pieces_that_were_finished_are_not_run_again(asked, tmp_path, monkeypatch):
+def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
     monkeypatch.setattr(points, "FEWEST", 8)
     *what, rows = asked
     ran, found = [], []
@@ -43,7 +43,7 @@ def test_pieces_that_were_finished_are_not_run_again(asked, tmp_path, monkeypatc
     assert again.kept.other == []
 
 
-def test_other_noise_is_another_piece(asked, tmp_path):
+def test_study_points_of_other_noise_are_run_anew(asked, tmp_path):
     sweep, inputs, noise, rows = asked
     running = HERE._replace(kept=Pieces(tmp_path / "kept", resume=True))
     run_points(sweep, inputs, noise, running)
@@ -51,7 +51,7 @@ def test_other_noise_is_another_piece(asked, tmp_path):
     assert np.any(other["worst_error"] != rows["worst_error"])
 
 
-def test_equal_points_are_run_once(asked):
+def test_equal_study_points_are_run_once(asked):
     sweep, inputs, noise, rows = asked
     ran = []
     twice = run_points(

@@ -1,4 +1,4 @@
-"""Sweeps that are interrupted, resumed, spread over workers: the store is the same, row for row."""
+"""Sweeps that are interrupted, resumed or spread over workers: the store is the same, row for row."""
 
 import os
 import shutil
@@ -60,7 +60,7 @@ def whole(tmp_path_factory):
     return store, all_rows(store), sweep, tally
 
 
-def test_the_tally_is_that_of_the_rows(whole):
+def test_tally_is_that_of_the_rows(whole):
     _, rows, _, tally = whole
     assert tally.scenarios == 300 and tally.failed == np.sum(rows["failed"])
     assert 0 < tally.failed < 300
@@ -69,7 +69,7 @@ def test_the_tally_is_that_of_the_rows(whole):
     np.testing.assert_array_equal([index for _, _, index in tally.worst], worst)
 
 
-def test_what_is_missing_or_damaged_is_made_again(whole, tmp_path):
+def test_missing_or_damaged_parts_are_made_again(whole, tmp_path):
     _, rows, _, tally = whole
     store, _, _ = Log().sweep(tmp_path / "store")
     store.part_path(0).unlink()
@@ -84,7 +84,7 @@ def test_what_is_missing_or_damaged_is_made_again(whole, tmp_path):
     assert len(list((tmp_path / "store" / "parts").iterdir())) == 10
 
 
-def test_an_interruption_keeps_what_was_written(whole, tmp_path):
+def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
     _, rows, _, tally = whole
     store = open_store(tmp_path / "store", MANIFEST, resume=False)
 
@@ -100,7 +100,7 @@ def test_an_interruption_keeps_what_was_written(whole, tmp_path):
     assert same_rows(all_rows(store), rows) == [] and again == tally
 
 
-def test_killed_and_resumed_is_the_same(whole, tmp_path):
+def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
     _, rows, _, _ = whole
     write_gain_file(tmp_path / "gains.json", case())
     folder = tmp_path / "store"
@@ -129,7 +129,7 @@ def test_any_row_replays_to_the_bit(whole):
         np.testing.assert_array_equal(found.again["error_1"], rows["error_1"][index])
 
 
-def test_a_row_that_was_changed_is_found_out(whole, tmp_path):
+def test_replay_detects_a_changed_row(whole, tmp_path):
     store = read_store(shutil.copytree(whole[0].folder, tmp_path / "store"))
     changed = dict(read_part(store, 0))
     changed["peak_force_1"] = changed["peak_force_1"].copy()
@@ -139,7 +139,7 @@ def test_a_row_that_was_changed_is_found_out(whole, tmp_path):
     assert replay(store, 6).different == []
 
 
-def test_the_motion_is_that_of_the_scenario(whole):
+def test_replayed_motion_is_that_of_the_scenario(whole):
     _, rows, sweep, _ = whole
     (piece,) = motion_of(sweep, 17)
     curve = piece.curves["rig"]
@@ -147,7 +147,7 @@ def test_the_motion_is_that_of_the_scenario(whole):
     np.testing.assert_allclose(rebound / curve.velocity, rows["restitution_1"][17], rtol=1e-9)
 
 
-def test_precisions_compare_the_same_scenarios(whole):
+def test_precisions_are_compared_on_the_same_scenarios(whole):
     _, rows, sweep, _ = whole
     found = compare_precisions(sweep, 64)
     assert found.scenarios == 32 and found.failed_float64 == np.sum(rows["failed"][:32])
@@ -170,7 +170,7 @@ def parts_of(store):
     return sorted(path.name for path in store.folder.glob("parts/part-*"))
 
 
-def test_a_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
+def test_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
     _, rows, _, _ = whole
     store, parts, tally = stopped
     failed, running = rows["failed"], Running()
@@ -190,7 +190,7 @@ def test_a_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
         replay(store, 299)
 
 
-def test_a_sweep_that_stopped_stays_where_it_is(stopped):
+def test_stopped_sweep_is_not_continued(stopped):
     store, parts, tally = stopped
     log = Log()
     _, _, again = log.sweep(store.folder, label=UNTIL)
@@ -200,7 +200,7 @@ def test_a_sweep_that_stopped_stays_where_it_is(stopped):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 
-def test_parts_in_any_order_stop_it_at_the_same_look(stopped, tmp_path):
+def test_sweep_with_parts_in_any_order_stops_at_the_same_look(stopped, tmp_path):
     _, parts, tally = stopped
 
     def shuffled(sweep, missing):
@@ -217,7 +217,7 @@ def test_parts_in_any_order_stop_it_at_the_same_look(stopped, tmp_path):
     assert (log.found, log.computed) == (tally.scenarios - 64, 64)
 
 
-def test_the_most_is_the_most(whole, tmp_path):
+def test_sweep_ends_at_its_largest_number_of_scenarios(whole, tmp_path):
     _, rows, _, _ = whole
     label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
     store, _, tally = Log().sweep(tmp_path / "store", label=label)

@@ -1,4 +1,4 @@
-"""What is kept beside the rows: read as it was written, to the bit, or not at all."""
+"""Studies stored beside the rows: read as they were written, to the bit, or not at all."""
 
 import json
 import math
@@ -91,25 +91,25 @@ def unwritten(*words):
 
 
 @given(drivers())
-def test_drivers_are_read_as_they_were_written(found):
+def test_sobol_study_is_read_as_it_was_written(found):
     request = IndicesRequest(128)
     assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
 
 
 @given(RARE)
-def test_rare_failures_are_read_as_they_were_written(found):
+def test_rare_event_study_is_read_as_it_was_written(found):
     request = RareRequest(1.5, replicates=REPLICATES)
     assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
 
 
 @given(st.sampled_from(REQUESTS), st.binary(max_size=300))
-def test_any_bytes_are_no_study(request, content):
+def test_study_of_arbitrary_bytes_is_ignored(request, content):
     assert decode(MANIFEST, request, content) is None
 
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=400)
-def test_no_bit_of_a_study_can_change_unseen(study, data):
+def test_study_with_any_flipped_bit_is_ignored(study, data):
     request, found = study
     content = bytearray(encode(MANIFEST, request, found))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
@@ -126,8 +126,8 @@ JSON = st.recursive(
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=300)
-def test_what_is_signed_is_read_as_it_says_or_not_at_all(study, data):
-    """Also where types or shapes are others: that is no result, and no crash."""
+def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
+    """Include other types or shapes, which are no result and must not crash."""
     request, found = study
     document = json.loads(encode(MANIFEST, request, found))
     place = data.draw(st.sampled_from([document, document["result"]]))
@@ -140,7 +140,7 @@ def test_what_is_signed_is_read_as_it_says_or_not_at_all(study, data):
         assert {**again, "sha256": document["sha256"]} == document
 
 
-def test_what_json_cannot_express_is_not_written(store):
+def test_study_that_json_cannot_express_is_not_written(store):
     # Where no nan can be, there is no sign for it.
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
@@ -149,7 +149,7 @@ def test_what_json_cannot_express_is_not_written(store):
     assert not (store.folder / "studies").exists()
 
 
-def test_what_is_kept_is_what_would_be_found_again(store, sweep):
+def test_stored_study_is_what_a_new_run_gives(store, sweep):
     first, again = (error_indices(sweep, 8) for _ in range(2))
     write_study(store, IndicesRequest(8), first)
     assert same(read_study(store, IndicesRequest(8)), again)
@@ -165,7 +165,7 @@ def test_what_is_kept_is_what_would_be_found_again(store, sweep):
     assert study_path(store, RareRequest(2.0, 20, 2)).read_bytes() == content
 
 
-def test_where_nothing_varies_and_nothing_fails(tmp_path):
+def test_study_without_variance_and_failures_is_stored(tmp_path):
     still = build_sweep(manifest(case(uncertainty={}), limit=1.5))
     store = open_store(tmp_path / "store", still.manifest, resume=False)
     nothing = rare_failure(still, 1e9, samples=20, replicates=2)
@@ -177,7 +177,7 @@ def test_where_nothing_varies_and_nothing_fails(tmp_path):
     assert same(read_study(store, IndicesRequest(2)), constant)
 
 
-def test_only_a_study_of_the_same_arguments_and_sweep_is_taken(store):
+def test_study_is_read_only_for_the_same_arguments_and_sweep(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
     assert (
@@ -200,7 +200,7 @@ def test_only_a_study_of_the_same_arguments_and_sweep_is_taken(store):
 
 
 @pytest.mark.parametrize("other", [manifest(limit=1.5, seed=1), manifest(limit=1.6)])
-def test_a_study_of_another_sweep_is_not_taken(store, other):
+def test_study_of_another_sweep_is_ignored(store, other):
     write_study(Store(store.folder, other), IndicesRequest(128), SOME_DRIVERS)
     write_study(Store(store.folder, other), RareRequest(1.5, replicates=2), SOME_RARE)
     assert (
@@ -209,7 +209,7 @@ def test_a_study_of_another_sweep_is_not_taken(store, other):
     )
 
 
-def test_a_study_says_what_it_is_of(store):
+def test_study_states_its_subject(store):
     write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
     found = json.loads(study_path(store, RareRequest(1.5, 1000, 2)).read_bytes())
     del found["result"]
@@ -221,7 +221,7 @@ def test_a_study_says_what_it_is_of(store):
 
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "folder", "large"])
-def test_a_damaged_study_is_none(store, harm):
+def test_damaged_study_is_ignored(store, harm):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     path = study_path(store, IndicesRequest(128))
     content = path.read_bytes()
@@ -239,7 +239,7 @@ def test_a_damaged_study_is_none(store, harm):
             write_study(store, IndicesRequest(128), SOME_DRIVERS)
 
 
-def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
+def test_study_on_a_full_disk_is_one_line_and_keeps_what_is_there(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     write_verdict(store, {"verdict": "good"})
     before = study_path(store, IndicesRequest(128)).read_bytes()
@@ -258,7 +258,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(store):
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_a_read_only_folder_is_one_line(store):
+def test_study_in_a_read_only_folder_is_one_line(store):
     (store.folder / "studies").mkdir(mode=0o500)
     with unwritten("drivers-128.json: ", "Permission denied"):
         write_study(store, IndicesRequest(128), SOME_DRIVERS)

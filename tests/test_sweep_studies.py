@@ -1,4 +1,4 @@
-"""Studies beside a sweep: what drives the error, and rare failures, beside what brute force finds."""
+"""Studies of a sweep: sensitivities of the error and rare failures, compared with brute force."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def whole():
     return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
 
 
-def test_an_input_that_does_nothing_drives_nothing(whole):
+def test_input_without_effect_has_no_sensitivity(whole):
     sweep, _ = whole
     ran = []
     found = error_indices(sweep, 128, Running(ran.append))
@@ -50,7 +50,7 @@ def test_an_input_that_does_nothing_drives_nothing(whole):
     assert first.first_order_low <= first.first_order <= first.first_order_high
 
 
-def test_the_variance_of_one_input_is_all_its_own():
+def test_variance_of_a_single_input_is_all_its_own():
     # One input beside the phase; the law of total variance, by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
     found = {one.input: one for one in error_indices(sweep, 256).inputs}
@@ -64,7 +64,7 @@ def test_the_variance_of_one_input_is_all_its_own():
     assert phase.total_low < 1 - share < phase.total_high
 
 
-def test_inputs_that_are_correlated_are_one():
+def test_correlated_inputs_count_as_one():
     table = {"keys": ["rig.force_sensor.delay", "approach.velocity"], "matrix": [[1.0], [0.9, 1.0]]}
     apart = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     together = sweep_of(case(uncertainty=UNCERTAIN | IDLE, correlation=table))
@@ -81,7 +81,7 @@ def test_inputs_that_are_correlated_are_one():
     assert alone.total_low < joint.total < alone.total_high
 
 
-def test_noise_is_an_input():
+def test_noise_is_an_input_of_the_study():
     document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
     found = error_indices(sweep_of(document), 64)
     shares = {one.input: one for one in found.inputs}
@@ -124,20 +124,20 @@ def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
     assert spread_beyond_formula(found._replace(coefficient_of_variation=0.9))
 
 
-def test_rare_failures_are_the_same_again(whole):
+def test_rare_failures_are_reproducible(whole):
     sweep, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.97))
     first, again = (rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
     np.testing.assert_array_equal(first.estimates, again.estimates)
 
 
-def test_what_fails_otherwise_fails_at_any_limit():
+def test_other_failures_fail_at_any_limit():
     # A force sensor that reads no more than a little of the force.
     sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
     assert rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 
 
-def test_points_run_alike_in_any_chunk(whole):
+def test_study_points_run_alike_in_any_chunk(whole):
     sweep, _ = whole
     points = np.random.default_rng(1).random((40, 4))
     one = run_points(sweep, points, np.arange(40))

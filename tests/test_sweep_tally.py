@@ -1,4 +1,4 @@
-"""The tally: the same whatever the order, and an interval that is known."""
+"""Tally of a sweep: the same in any order, and an interval with a known closed form."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def piece(rows, part):
     return {name: values[part] for name, values in rows.items()}
 
 
-def test_parts_in_any_order_make_the_same_tally():
+def test_tally_is_the_same_for_parts_in_any_order():
     rows = made_up(1000)
     cuts = np.split(np.arange(1000), [10, 500, 501])
     whole = add_rows(empty_tally(16), rows)
@@ -47,7 +47,7 @@ def test_parts_in_any_order_make_the_same_tally():
     assert sum(k for _, k in whole.replicates) == whole.failed
 
 
-def test_the_worst_come_first():
+def test_tally_lists_the_worst_first():
     rows = made_up(1000)
     tally = add_rows(empty_tally(1), rows)
     assert len(tally.worst) == WORST
@@ -59,14 +59,14 @@ def test_the_worst_come_first():
     np.testing.assert_array_equal([error for _, error, _ in tally.worst], largest)
 
 
-def test_interval_without_failures_is_known_in_closed_form():
+def test_tally_interval_without_failures_is_the_closed_form():
     rows = made_up(500, share=0.0)
     found = failure_probability(add_rows(empty_tally(1), rows))
     assert OUTCOMES[0] == GOOD and found.value == 0 and found.low == 0
     assert found.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
-def test_interval_of_replicates_is_students():
+def test_tally_interval_of_replicates_is_students():
     rows = made_up(16 * 64)
     found = failure_probability(add_rows(empty_tally(16), rows))
     means = rows["failed"].reshape(64, 16).mean(axis=0)
@@ -75,7 +75,7 @@ def test_interval_of_replicates_is_students():
     assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half))
 
 
-def test_a_remainder_is_in_no_replicate():
+def test_tally_remainder_is_in_no_replicate():
     rows = made_up(16 * 64 + 5)
     tally = add_rows(empty_tally(16, 16 * 64 + 5), rows)
     assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
@@ -87,7 +87,7 @@ def test_a_remainder_is_in_no_replicate():
     assert error_quantiles(tally) == error_quantiles(add_rows(empty_tally(16, 16 * 64), whole))
 
 
-def test_replicates_of_unequal_size_have_no_interval_yet():
+def test_tally_has_no_interval_for_replicates_of_unequal_size():
     tally = add_rows(empty_tally(16, 1600), made_up(100))
     found = failure_probability(tally)
     assert (found.low, found.high) == (0, 1) and 0 < found.value < 1 and "yet" in found.method
@@ -95,7 +95,7 @@ def test_replicates_of_unequal_size_have_no_interval_yet():
     assert failure_probability(add_rows(empty_tally(16, 10), made_up(10))).high == 1
 
 
-def test_looks_are_the_confidence_sequences():
+def test_tally_looks_are_the_confidence_sequences():
     rows = made_up(1000)
     tally, running = empty_tally(1, 10**6, looked_at=True), Running()
     for part in np.split(np.arange(1000), 10):
@@ -113,7 +113,7 @@ def test_looks_are_the_confidence_sequences():
 
 
 @pytest.mark.parametrize("replicates", [1, 16])
-def test_quantiles_are_those_of_the_errors(replicates):
+def test_tally_quantiles_are_those_of_the_errors(replicates):
     rows = made_up(1600, share=0.01)
     sizes = error_sizes(rows)
     assert np.array_equal(np.isinf(sizes), rows["outcome"] > OUTCOMES.index(SATURATED)) and np.any(

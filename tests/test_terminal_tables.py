@@ -1,4 +1,4 @@
-"""What is printed: tables, of which on any width no digit is lost and no name is broken, and JSON."""
+"""Terminal output: tables that lose no digit and break no name at any width, and JSON."""
 
 import json
 
@@ -12,7 +12,7 @@ FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 
 
 @pytest.mark.parametrize("width", [30, 60, 80, 110, 300])
-def test_no_digit_is_lost(monkeypatch, capsys, width):
+def test_table_loses_no_digit(monkeypatch, capsys, width):
     monkeypatch.setattr(terminal, "WIDTH", width)
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
     terminal.emit(
@@ -23,7 +23,7 @@ def test_no_digit_is_lost(monkeypatch, capsys, width):
     assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]
 
 
-def test_long_texts_are_folded_between_words(monkeypatch, capsys):
+def test_table_folds_long_texts_between_words(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "WIDTH", 60)
     text = "force delay, noise of the force sensor and dead zone, equivalent mass, roughly the surface"
     terminal.emit(terminal.table("costs", ["law", "known beforehand", "us"], [[LAW, text, 1.25]], (0, 1)))
@@ -32,7 +32,7 @@ def test_long_texts_are_folded_between_words(monkeypatch, capsys):
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
 
 
-def test_json_has_numbers_of_numpy_as_numbers_and_null_for_what_is_not_finite():
+def test_json_writes_numpy_numbers_as_numbers_and_nonfinite_as_null():
     said = {
         "yes": np.bool_(True),
         "three": np.int64(3),

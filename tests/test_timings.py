@@ -1,4 +1,4 @@
-"""`--timings`: time is counted once, whatever lies within what, and the command does what it does anyway."""
+"""`--timings`: nested times are counted once, and the command's results do not change."""
 
 import jax
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from tuning.cli import timings
 
 
-def test_what_overlaps_counts_once():
+def test_timings_count_overlapping_times_once():
     assert timings.covered([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
     spans = {
         "importing": [(0.0, 1.0)],
@@ -20,7 +20,7 @@ def test_what_overlaps_counts_once():
     )
 
 
-def test_what_jax_tells_is_heard(capsys):
+def test_timings_record_events_of_jax(capsys):
     with timings.measured(True):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 9.5)
         jax.monitoring.record_event_duration_secs("/jax/compilation_cache/cache_retrieval_time_sec", 4.24)
@@ -29,7 +29,7 @@ def test_what_jax_tells_is_heard(capsys):
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
-def test_a_command_prints_the_same(jaxhil, arguments):
+def test_timings_do_not_change_what_a_command_prints(jaxhil, arguments):
     plain, ran = jaxhil("mechanisms", *arguments), jaxhil("mechanisms", "--timings", *arguments)
     assert ran.code == plain.code == 0 and ran.out == plain.out
     assert plain.err == "" and ran.err.startswith("took: ") and "s in all" in ran.err

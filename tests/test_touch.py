@@ -48,8 +48,8 @@ MET = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
-def test_distance_has_a_unit_slope_along_its_normal(name):
-    """Its gradient is the normal, of length 1, and a step along it ends on the surface."""
+def test_distance_has_unit_slope_along_its_normal(name):
+    """Expect the gradient to be the normal, of length 1, and a step along it to end on the surface."""
     shape = SHAPES[name]
 
     def distance(points):
@@ -78,7 +78,7 @@ def test_distance_has_a_unit_slope_along_its_normal(name):
 
 @pytest.mark.slow
 def test_singular_points_have_no_nan():
-    """On the axis, at a centre, on a segment, on the faces of a box."""
+    """Cover the axis, a centre, a segment and the faces of a box."""
     singular = {
         "ball": (0.1, 0.2, 0.3), "cavity": (0.1, 0.2, 0.3), "drogue": (0, 0, -0.1), "rim": (0.5, 0, 0.1),
         "capsule": (-0.3, 0, 0), "box": (0.1, 0, 0),
@@ -130,8 +130,8 @@ def test_depth_changes_at_its_rate_and_slip_is_tangential(name):
 
 
 @pytest.mark.slow
-def test_a_pair_mirrored_is_the_same_touch():
-    """A sphere against a ball, whichever of them is called the shape: on that one the force acts."""
+def test_mirrored_pair_is_the_same_touch():
+    """Swap the shape of a sphere and a ball: the force acts on the shape."""
     pose, _ = pose_and_twist()
     one = CANDIDATES["ball on sphere"].touch(pose)
     ball = Ball(place(0.1, 0.05, -0.4), *numbers(0.1))
@@ -144,8 +144,8 @@ def test_a_pair_mirrored_is_the_same_touch():
 
 
 @pytest.mark.slow
-def test_nearest_points_of_segments():
-    """Against bounded least squares; parallel ones touch in the middle of each other."""
+def test_nearest_points_of_segments_agree_with_least_squares():
+    """Compare with bounded least squares; parallel segments touch in the middle of each other."""
     for _ in range(40):
         ends = SEEDED.normal(size=(4, 3))
         radii = numbers(0.1)[0], numbers(0.2)[0]

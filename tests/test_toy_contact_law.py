@@ -1,4 +1,4 @@
-"""A contact law takes one file and one entry: a toy law with a key of its own, in a copy of the package."""
+"""Toy contact law with a key of its own, added to a copy of the package by one file and one entry."""
 
 import os
 import re

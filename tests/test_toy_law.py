@@ -1,4 +1,4 @@
-"""A compensator is a folder with two files: one in JAX, one for the rig."""
+"""Toy compensator, added to a copy of the package as a folder of two files: JAX and rig."""
 
 import os
 import shutil
@@ -93,8 +93,8 @@ def copied(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_of_two_files_is_tested_and_exported(copied):
-    """By the tests named `...[toy...]`, in a process that sees the copy alone."""
+def test_toy_compensator_of_two_files_is_tested_and_exported(copied):
+    """Run the tests named `...[toy...]` in a process that sees the copy alone."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]
     environment = {**os.environ, "PYTHONPATH": str(copied)}
     folder = copied / "tests"

@@ -1,4 +1,4 @@
-"""Gains carried from mechanism to mechanism: exact on the same, within bounds on another, never a loss."""
+"""Transfer of gains between mechanisms: exact on the same, within bounds on another, never a loss."""
 
 import math
 from types import SimpleNamespace
@@ -46,7 +46,7 @@ def anywhere(mechanism, compensator, seed=0):
 # Distance
 
 
-def test_distance_is_nothing_to_itself_and_the_same_both_ways():
+def test_distance_is_zero_to_itself_and_symmetric():
     mechanisms = [load(name).mechanism for name in builtin_names()]
     for a in mechanisms:
         assert distance(a, a) == 0
@@ -76,11 +76,11 @@ def test_distance_is_nothing_to_itself_and_the_same_both_ways():
         ("name='other'", 0.0),
     ],
 )
-def test_each_trait_counts_by_what_it_does_to_the_restitution(override, expected):
+def test_distance_weighs_each_trait_by_its_effect_on_the_restitution(override, expected):
     assert distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
 
 
-def test_traits_do_not_hang_on_how_a_simulator_is_written():
+def test_traits_do_not_depend_on_the_form_of_the_simulator():
     second = traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
     omega = 2 * math.pi * 10
     written = behind(
@@ -93,13 +93,13 @@ def test_traits_do_not_hang_on_how_a_simulator_is_written():
 
 
 def test_damping_of_every_law_is_that_of_its_restitution():
-    """Hunt and Crossley's e = 1 - chi v."""
+    """Use Hunt and Crossley's e = 1 - chi v."""
     hertz = traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
     assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
     assert traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
 
 
-def test_the_nearest_is_the_least_distant_and_the_first_of_equals():
+def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
     stiff, soft = claw("contact.stiffness=[3e5]"), claw("contact.stiffness=[6e4]")
     known = [Tuned(stiff, {}, "stiff"), Tuned(soft, {}, "soft"), Tuned(soft, {}, "again")]
     assert nearest(claw("contact.stiffness=[2e5]"), known).source == "stiff"
@@ -111,21 +111,21 @@ def test_the_nearest_is_the_least_distant_and_the_first_of_equals():
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
 @pytest.mark.parametrize("name", builtin_names())
-def test_on_the_same_mechanism_gains_are_the_very_gains(compensator, name):
+def test_transferred_gains_on_the_same_mechanism_are_unchanged(compensator, name):
     mechanism = load(name).mechanism
     gains = anywhere(mechanism, compensator)
     assert carry_over(compensator, gains, mechanism, load(name).mechanism) == gains
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_the_literature_s_gains_become_the_literature_s(compensator):
+def test_transferred_literature_gains_are_the_literatures(compensator):
     source, target = claw(), load("varying", ["rig.control_period=0.002"]).mechanism
     carried = carry_over(compensator, literature_gains(source, compensator), source, target)
     for name, value in literature_gains(target, compensator).items():
         assert carried[name] == pytest.approx(value, rel=1e-12)
 
 
-def test_gains_move_with_the_literature_and_the_range():
+def test_transferred_gains_move_with_the_literature_and_the_range():
     source = claw()
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
@@ -137,7 +137,7 @@ def test_gains_move_with_the_literature_and_the_range():
     assert carried["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
 
 
-def test_carried_gains_are_within_the_bounds():
+def test_transferred_gains_are_within_the_bounds():
     names = builtin_names()
     for seed, name in enumerate(names):
         source, target = load(name).mechanism, load(names[seed - 1], ["rig.control_period=0.003"]).mechanism
@@ -165,7 +165,7 @@ def solved(task, validation):
     return starts
 
 
-def test_given_starts_take_the_places_of_the_last(task, validation):
+def test_prior_starts_replace_the_last_starts(task, validation):
     given = {"phase_lead": 0.011, "lead_filter": 0.0007}
     (usual,) = choose_starts(validation, 3, 0)
     (points,) = choose_starts(validation, 3, 0, first=[[given]])
@@ -178,15 +178,15 @@ def test_given_starts_take_the_places_of_the_last(task, validation):
 
 
 @pytest.mark.parametrize("starts", [1, 2])
-def test_the_literature_s_gains_stay_beside_those_given(task, validation, starts):
+def test_literature_gains_stay_beside_prior_starts(task, validation, starts):
     given = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
     (points,) = choose_starts(validation, starts, 0, first=[given])
     for gains, point in zip([task.literature, *given], points, strict=True):
         assert validation.gains(0, point) == pytest.approx(gains, rel=1e-12)
 
 
-def test_a_given_start_never_ends_worse_than_it_was(task, validation, solved):
-    """Tuned gains lie at a bound here."""
+def test_prior_start_never_ends_worse_than_it_was(task, validation, solved):
+    """Use tuned gains that lie at a bound."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
     assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)
@@ -219,12 +219,12 @@ def in_blocks(monkeypatch):
     return call
 
 
-def test_later_blocks_begin_at_what_earlier_ones_found(in_blocks):
+def test_later_blocks_start_at_the_results_of_earlier_ones(in_blocks):
     assert in_blocks(starts=3) == [[], [], ["3e5"]]
     assert in_blocks(starts=2) == [[], [], ["3e5"]]
 
 
-def test_gains_given_come_before_those_and_the_literature_s_stay(in_blocks):
+def test_prior_starts_come_before_transferred_ones_and_literature_stays(in_blocks):
     file = Tuned(claw("contact.stiffness=[1.1e5]"), {}, "file")
     assert in_blocks(3, [file]) == [["file"], ["file"], ["file", "3e5"]]
     assert in_blocks(2, [file]) == in_blocks(1, [file]) == [["file"]] * 3

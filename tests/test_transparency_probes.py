@@ -1,4 +1,4 @@
-"""Honest tuning: copies of every scenario whose restitution is that of space, and what they weigh."""
+"""Transparency in tuning: probed copies of every scenario, their ideal restitution and their weights."""
 
 import dataclasses
 
@@ -41,8 +41,8 @@ def kind(scenarios, number):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
-def test_a_pushed_contact_s_restitution_is_that_of_the_same_push_in_space():
-    """Against SciPy, event by event, with the very push that the scenario's hardware gets."""
+def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
+    """Compare with SciPy, event by event, under the very push that the scenario's hardware gets."""
     probed = probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, known in ((1, probed.early), (2, probed.late)):
         own = kind(probed.scenarios, number)
@@ -66,7 +66,7 @@ def test_a_pushed_contact_s_restitution_is_that_of_the_same_push_in_space():
             assert abs(known[lane] - probed.plain[lane]) > 0.01
 
 
-def test_on_an_ideal_rig_no_copy_errs():
+def test_probed_copies_have_no_error_on_an_ideal_rig():
     spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
     made = validated({**mechanism({}, IDEAL, 0.0, period=5e-5), "uncertainty": spread})
     probed = probed_scenarios(made, draw(made, 16, 0))
@@ -78,7 +78,7 @@ def test_on_an_ideal_rig_no_copy_errs():
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
-def test_the_first_lanes_have_some_of_each():
+def test_first_lanes_hold_some_copies_of_each_kind():
     assert list(are_probes(8)) == [False, True, True, True] * 2
     probed = probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]
@@ -90,7 +90,7 @@ def test_the_first_lanes_have_some_of_each():
     np.testing.assert_array_equal(pushed, np.arange(20) % LANES_PER_SCENARIO % 3 > 0)
 
 
-def test_only_what_anticipates_is_weighed_unless_asked():
+def test_only_anticipating_laws_are_probed_unless_requested():
     weighed = [name for name in COMPENSATORS if default_weights(name)]
     assert weighed == ["impulse_ledger"] == [n for n in COMPENSATORS if default_axis(n) == PEAK]
     assert Objective(**default_weights(weighed[0])).transparency_weight > 0
@@ -131,7 +131,7 @@ def test_solver_and_search_minimise_the_stated_objective(task):
         assert start.rms >= value * (1 - 1e-9)
 
 
-def test_scenarios_of_a_form_have_no_copies():
+def test_scenarios_of_a_common_form_cannot_be_probed():
     with pytest.raises(ValueError):
         build_task(DAMPED, "phase_lead", 4, 0, common=object(), probed=True)  # pyright: ignore
 
@@ -142,7 +142,7 @@ def result():
 
 
 @pytest.mark.slow
-def test_honesty_is_judged_of_literature_and_tuned_gains(result):
+def test_transparency_is_evaluated_for_literature_and_tuned_gains(result):
     assert list(result.transparency) == ["before", "literature", "tuned"]
     for key, own in result.transparency.items():
         peaks = result.outcomes[key].peak_ratio[result.outcomes[key].good]
@@ -152,7 +152,7 @@ def test_honesty_is_judged_of_literature_and_tuned_gains(result):
     assert result.nominal["tuned"] != result.figures["tuned"]
 
 
-def test_without_the_weight_there_are_no_copies():
+def test_scenarios_without_transparency_weight_are_not_probed():
     plain = dataclasses.replace(SMALL, objective=Objective())
     assert not plain.probed and dataclasses.replace(plain, judge_transparency=True).probed
     assert len(build_task(DAMPED, "phase_lead", 4, 0).scenarios.velocity) == 4
@@ -160,7 +160,7 @@ def test_without_the_weight_there_are_no_copies():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [PEAK, TRANSPARENCY])
-def test_the_error_is_traded_against_peak_or_honesty(result, axis):
+def test_error_is_traded_against_peak_or_transparency(result, axis):
     ((_, front),) = fronts([result], 2, axis=axis)
     assert front.axis == axis and front.points[0].weight == 0 < front.points[1].weight
     for point in (*front.points, front.tuned):

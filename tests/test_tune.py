@@ -1,4 +1,4 @@
-"""Tuning end to end on small settings: better than the literature on scenarios it never saw."""
+"""Tuning end to end with small settings: better than the literature on fresh scenarios."""
 
 import dataclasses
 
@@ -53,8 +53,8 @@ def test_every_start_has_a_status_and_a_falling_history(result):
 
 
 @pytest.mark.slow
-def test_gains_tuned_with_sensor_noise_are_better_where_there_is_noise(result):
-    """Three times the published noise, on scenarios that neither of the two has seen."""
+def test_gains_tuned_with_noise_are_better_with_noise(result):
+    """Use three times the published noise, on scenarios that neither of the two has seen."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
     task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
     validation = build_validation([task], 15, SMALL.seed)
@@ -88,17 +88,17 @@ def test_gains_lie_within_their_bounds(result):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_gains(result):
+def test_tuning_with_the_same_seed_gives_the_same_gains(result):
     assert tune(load().mechanism, "phase_lead", SMALL).gains == result.gains
 
 
-def test_a_compensator_without_gains_is_judged_only():
+def test_compensator_without_gains_is_only_evaluated():
     result = tune(load().mechanism, "none", SMALL)
     assert result.starts == [] and result.gains == {}
     assert result.figures["before"] == result.figures["tuned"]
 
 
-def test_a_setting_is_judged_as_it_is(monkeypatch):
+def test_setting_is_evaluated_without_tuning(monkeypatch):
     law = COMPENSATORS["phase_lead"]
     monkeypatch.setattr(type(law), "settings", {"mild": {"phase_lead": 0.0015}})
     result = tune(
@@ -110,7 +110,7 @@ def test_a_setting_is_judged_as_it_is(monkeypatch):
 
 
 @pytest.mark.slow
-def test_before_is_no_compensation_of_any_law(monkeypatch):
+def test_before_is_no_compensation_for_any_law(monkeypatch):
     monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", {"mild": {}})
     mechanism, quiet = load().mechanism, dataclasses.replace(SMALL, setting="mild")
     without = tune(mechanism, "none", SMALL).outcomes["tuned"]

@@ -14,14 +14,14 @@ pytestmark = pytest.mark.users_options
 FEW: dict[str, Any] = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 15}
 
 
-def test_a_scheduler_that_is_not_there_is_one_line():
+def test_tuning_without_a_scheduler_is_one_line():
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.tune("varying", scheduler="nowhere://x", **FEW)
 
 
 @pytest.mark.slow
-def test_the_same_gains_and_fronts_of_two_programs_and_two_blocks(tmp_path, monkeypatch):
+def test_tuning_on_a_cluster_gives_the_same_gains_and_fronts(tmp_path, monkeypatch):
     for place in ("tune_all", "pareto"):
         monkeypatch.setattr(f"tuning.gains.{place}.BLOCK", 2)
     changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]

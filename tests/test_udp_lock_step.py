@@ -1,4 +1,4 @@
-"""Rig and controller in lock-step: the contacts of the closed loop, and what becomes of lost packets."""
+"""Rig and controller in lock-step over UDP: the contacts of the closed loop, and lost packets."""
 
 import math
 from random import Random
@@ -34,7 +34,7 @@ def varying():
 
 
 @pytest.mark.parametrize("name", ["varying", "layered", "rattling"])
-def test_first_contacts_as_in_the_closed_loop(name):
+def test_first_contacts_are_those_of_the_closed_loop(name):
     mechanism = load(name).mechanism
     gains = literature_gains(mechanism, "response_error")
     contacts, _ = closed_loop(mechanism, "response_error", gains)
@@ -83,8 +83,8 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
 
 
-def test_contacts_that_the_law_did_not_know_are_counted():
-    """Too short ones, each reported once by an answer; the process says how many."""
+def test_contacts_unidentified_by_the_law_are_counted():
+    """Send contacts that are too short: an answer reports each once, and the process their number."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
     rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)
@@ -97,7 +97,7 @@ def test_contacts_that_the_law_did_not_know_are_counted():
     )
 
 
-def test_a_tick_made_up_is_the_tick_on_the_line_between(varying):
+def test_missing_tick_is_interpolated_linearly(varying):
     mechanism, _ = varying
     whole, gappy = prepared(mechanism), prepared(mechanism)
     for tick, force in enumerate((0.0, 10.0, 20.0, 30.0, 40.0)):
@@ -108,7 +108,7 @@ def test_a_tick_made_up_is_the_tick_on_the_line_between(varying):
     assert gappy.made_up == 2 and gappy.stale == 0
 
 
-def test_a_long_gap_is_the_controllers_to_judge(varying):
+def test_long_gap_is_left_to_the_controller(varying):
     mechanism, _ = varying
     task = prepared(mechanism, missed_in_a_row=20.0)
     first = task.answer(a_reading(0, force=7.0))
@@ -151,7 +151,7 @@ SMALL = st.integers(0, 40)
     ),
     st.sampled_from(["none", "response_error"]),
 )
-def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings, compensator):
+def test_any_packets_of_a_rig_are_answered_with_finite_commands(varying, readings, compensator):
     mechanism, gains = varying
     law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
     task = ControllerTask(law, to_builtins(mechanism))
@@ -163,7 +163,7 @@ def test_whatever_a_rig_sends_is_answered_with_finite_commands(varying, readings
 
 
 @pytest.mark.parametrize("resets", [False, True])
-def test_a_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets):
+def test_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains, missed_in_a_row=3.0)
     count = 0
@@ -186,7 +186,7 @@ def test_a_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, reset
     assert all(abs(one.restitution - 0.94) < 0.05 for one in rig.contacts if one.status == "ok")
 
 
-def test_a_trip_that_no_stall_explains_is_not_reset(varying):
+def test_trip_that_no_stall_explains_is_not_reset(varying):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains, force_limit=20.0, missed_in_a_row=1e9)
     count = 0
@@ -201,7 +201,7 @@ def test_a_trip_that_no_stall_explains_is_not_reset(varying):
     assert "force_limit" in rig.tripped and rig.forgiven == ()
 
 
-def test_a_sensor_that_fails_trips_and_the_rig_is_safe(varying):
+def test_failed_sensor_trips_and_the_rig_is_safe(varying):
     mechanism, gains = varying
     limits = {"held_readings": 3.0, "retreat_velocity": 0.01, "deceleration": 0.5, "velocity_limit": 0.1}
     law = controller(mechanism, "response_error", gains, **limits)

@@ -1,4 +1,4 @@
-"""Faults of the network, whose fault a missed tick is, and what a rig does that was held up."""
+"""Faults of the network, the cause of a missed tick, and a rig that was held up."""
 
 import math
 import socket
@@ -38,7 +38,7 @@ def varying():
     return mechanism, literature_gains(mechanism, "response_error")
 
 
-def test_injected_faults_of_the_network():
+def test_injected_network_faults_have_the_stated_rates():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as echo:
         echo.bind(("127.0.0.1", 0))
         echo.setblocking(False)
@@ -71,7 +71,7 @@ def test_injected_faults_of_the_network():
     assert np.mean(held) == pytest.approx(0.004, rel=0.05)
 
 
-def test_whose_fault_a_missed_tick_is():
+def test_missed_tick_is_attributed_to_its_cause():
     met = np.array([1, 0, 0, 0, 0, 1, 0, 0, 0], bool)
     overspent = np.array([1, 0, 0, 1, 0, 0, 0, 0, 0], bool)
     round_trip = np.array([1, 5, 0, 9, 9, 1, 3, 0, 6], float)
@@ -81,12 +81,12 @@ def test_whose_fault_a_missed_tick_is():
     assert list(attribute(met, overspent, round_trip, held, lost, 1.0)) == expected
 
 
-def test_quantiles_of_nothing():
+def test_quantiles_of_no_values_are_nan():
     assert all(math.isnan(value) for value in quantiles(np.zeros(0)))
     assert quantiles(np.arange(1001.0)) == (500.0, 999.0, 1000.0)
 
 
-def test_ticks_that_overspent_are_gone_through_again(varying):
+def test_ticks_that_took_too_long_are_replayed(varying):
     mechanism, _ = varying
     record = TickRecord(4)
     for tick, cpu in enumerate((10, 2_000_000_000, 30, 40)):
@@ -101,7 +101,7 @@ def test_ticks_that_overspent_are_gone_through_again(varying):
     assert replayed(lambda: pytest.fail("nothing to go through"), record, 1e10) == {}
 
 
-def test_references_are_those_of_the_lists():
+def test_ideal_restitutions_are_those_of_the_mechanisms_lists():
     def over(number, speed):
         return ContactResult(number, speed, 0.9, 1.0, 0.1, "ok", 3)
 
@@ -116,7 +116,7 @@ def test_references_are_those_of_the_lists():
     assert reference_restitutions(mechanism, []) == []
 
 
-def test_contacts_that_the_machine_left_without_commands_are_not_judged(varying):
+def test_contacts_without_commands_because_of_the_machine_are_not_evaluated(varying):
     causes = np.full(100, MET)
     causes[20:40], causes[60] = MACHINE, CONTROLLER
     figures, times = None, None
@@ -140,7 +140,7 @@ class Sleepy(EmptyTask):
             time.sleep(self.held)
 
 
-def test_a_rig_that_was_held_up_goes_on_from_there():
+def test_rig_that_was_held_up_continues_from_there():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))
         timing = Timing(100)

@@ -1,4 +1,4 @@
-"""Packets between rig and controller: what is sent comes back, and any other bytes are refused."""
+"""Packets between rig and controller: they are decoded as sent, and any other bytes are refused."""
 
 import math
 
@@ -34,7 +34,7 @@ WORD = st.integers(0, 2**32 - 1)
 @given(
     st.builds(Reading, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4)
 )
-def test_readings_come_back(reading):
+def test_readings_survive_encoding(reading):
     assert same(decode_reading(encode_reading(reading, 7), 7), reading)
 
 
@@ -44,7 +44,7 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
 @given(
     st.builds(Answer, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable)
 )
-def test_answers_come_back(answer):
+def test_answers_survive_encoding(answer):
     assert same(decode_answer(encode_answer(answer, 7), 7), answer)
 
 
@@ -100,7 +100,7 @@ def test_packets_of_another_session_are_refused():
                 decode(packet, other)
 
 
-def test_a_session_s_number_goes_to_who_asked_and_is_its_own_at_every_address():
+def test_session_number_goes_to_the_asker_and_is_unique_to_every_address():
     sessions, rig, number = Sessions(), ("127.0.0.1", 4000), 2**63 + 5
     answer = sessions.answer(ask_for_session(number), rig)
     assert answer is not None and len(answer) == len(ask_for_session(number))
@@ -113,7 +113,7 @@ def test_a_session_s_number_goes_to_who_asked_and_is_its_own_at_every_address():
 
 
 @given(st.one_of(st.binary(max_size=40), mutated(ask_for_session(3)), mutated(READING)))
-def test_nothing_but_a_question_opens_a_session(packet):
+def test_session_is_opened_by_a_question_alone(packet):
     answer = Sessions().answer(packet, ("127.0.0.1", 4000))
     assert (answer is not None) == (len(packet) == 24 and packet[:5] == ask_for_session(3)[:5])
 
@@ -123,7 +123,7 @@ def newer(sequence: Sequence, *numbers: int) -> list[bool]:
 
 
 @pytest.mark.parametrize("start", [0, 2**31 - 5, 2**32 - 5, 12345])
-def test_packets_are_newer_by_their_numbers_also_where_these_begin_again(start):
+def test_packet_numbers_order_packets_across_their_wrap_around(start):
     sequence = Sequence(start - 1)
     assert newer(sequence, start, start + 1, start + 4) == [True] * 3
     assert newer(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
@@ -131,7 +131,7 @@ def test_packets_are_newer_by_their_numbers_also_where_these_begin_again(start):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
-def test_one_packet_of_any_number_makes_no_more_than_a_window_of_others_old(newest, wild):
+def test_single_packet_of_any_number_makes_at_most_a_window_of_others_old(newest, wild):
     sequence = Sequence(newest)
     sequence.is_newer(wild)
     following = newer(sequence, *range(newest + 1, newest + WINDOW + 3))
@@ -141,7 +141,7 @@ def test_one_packet_of_any_number_makes_no_more_than_a_window_of_others_old(newe
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 
 
-def test_after_many_lost_packets_one_more_is():
+def test_first_packet_after_many_lost_ones_is_lost_too():
     for gap in (WINDOW + 1, 10**6, 2**31 - 10):
         sequence = Sequence(5)
         assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]

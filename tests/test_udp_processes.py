@@ -1,4 +1,4 @@
-"""`jaxhil rig` and the controller's process beside it: short runs over UDP, and what both refuse."""
+"""`jaxhil rig` and the controller's process: short runs over UDP, and refusals of both."""
 
 import json
 import os
@@ -33,8 +33,8 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
     return path
 
 
-def test_a_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
-    """What runs is what this version exports, or nothing."""
+def test_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
+    """Run what this version exports, or nothing."""
     made = build_bundle(document(), [])
     trap = b"open(%r, 'w')\n" % str(tmp_path / "ran")
     folder = tmp_path / "bundle"
@@ -51,7 +51,7 @@ def test_a_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_controllers_process_without_a_gain_file(capfd):
+def test_controller_process_without_a_gain_file_is_refused(capfd):
     assert udp_controller.main(["--gains", "nowhere.json"]) == 2
     error = capfd.readouterr().err
     assert "nowhere.json" in error and error.count("\n") == 1
@@ -94,7 +94,7 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
     assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
 
 
-def test_rig_trips_without_injection_and_is_bad(jaxhil, tmp_path):
+def test_rig_that_trips_without_injection_is_bad(jaxhil, tmp_path):
     limits = {"force_limit": 5.0, "retreat_velocity": 0.01, "deceleration": 1.0}
     path = gain_file(tmp_path, limits=limits)
     ran = jaxhil("rig", path.parent, "--duration", 2, "--limit", "inf")
@@ -102,7 +102,7 @@ def test_rig_trips_without_injection_and_is_bad(jaxhil, tmp_path):
     assert "tripped: force_limit" in ran.out and "though no faults were injected" in ran.out
 
 
-def test_rig_interrupted_says_what_it_measured(tmp_path):
+def test_interrupted_rig_reports_what_it_measured(tmp_path):
     path = gain_file(tmp_path)
     # A shell's background jobs ignore interrupts, and hand that on.
     heeding = (
@@ -141,7 +141,7 @@ def test_rig_interrupted_says_what_it_measured(tmp_path):
         (("BROKEN",), "sha256"),
     ],
 )
-def test_unusable_input_of_rig(jaxhil, tmp_path, options, words):
+def test_rig_refuses_unusable_input(jaxhil, tmp_path, options, words):
     good = gain_file(tmp_path)
     broken = tmp_path / "broken.json"
     broken.write_text(good.read_text().replace("0.005", "0.006"))
@@ -151,7 +151,7 @@ def test_unusable_input_of_rig(jaxhil, tmp_path, options, words):
     assert ran.err.strip().count("\n") == 0
 
 
-def test_a_priority_that_is_not_to_be_had(jaxhil, tmp_path, monkeypatch):
+def test_priority_that_cannot_be_set_is_reported(jaxhil, tmp_path, monkeypatch):
     def refuse(*arguments):
         raise PermissionError(1, "Operation not permitted")
 
@@ -160,12 +160,12 @@ def test_a_priority_that_is_not_to_be_had(jaxhil, tmp_path, monkeypatch):
     assert ran.code == 2 and "--realtime: found no such priority (Operation not permitted)" in ran.err
 
 
-def test_help_of_rig_has_an_example(jaxhil):
+def test_rig_help_has_an_example(jaxhil):
     ran = jaxhil("rig", "--help")
     assert ran.code == 0 and "Example: jaxhil rig" in ran.out
 
 
-def test_the_loop_runs_without_jax():
+def test_rig_loop_runs_without_jax():
     program = (
         "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.report\n"
         "assert 'jax' not in sys.modules"
@@ -174,7 +174,7 @@ def test_the_loop_runs_without_jax():
 
 
 @pytest.mark.benchmark
-def test_ten_minutes_at_1_khz(jaxhil, tmp_path):
+def test_rig_runs_ten_minutes_at_1_khz(jaxhil, tmp_path):
     mechanism, sha256, _ = load("varying")
     gains = literature_gains(mechanism, "response_error")
     path = tmp_path / "gains.json"

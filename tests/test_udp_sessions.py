@@ -1,4 +1,4 @@
-"""The controller's process and its session: to whom it belongs, what breaks in, and what ends it."""
+"""Session of the controller's process: its owner, intruding packets, and its end."""
 
 import json
 import socket
@@ -110,7 +110,7 @@ def flood(*senders):
     yield once
 
 
-def test_the_controllers_process_answers_its_rig_and_nobody_else(process):
+def test_controller_process_answers_its_rig_and_nobody_else(process):
     served = process()
     rig, stranger, guesser = served.rig(), served.rig(), served.rig()
     rig.send(b"no packet at all")
@@ -135,8 +135,8 @@ def test_the_controllers_process_answers_its_rig_and_nobody_else(process):
     assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
 
-def test_a_packet_from_the_rig_s_address_without_the_session_s_number_is_ignored(process):
-    """What somebody sends who can write the rig's address, but does not receive there."""
+def test_packet_from_the_rigs_address_without_session_number_is_ignored(process):
+    """Send what somebody can send who forges the rig's address but does not receive there."""
     served = process()
     rig = served.rig()
     rig.prepare()
@@ -150,7 +150,7 @@ def test_a_packet_from_the_rig_s_address_without_the_session_s_number_is_ignored
     assert code == 0 and found["ignored"] == 2 and found["stale"] == 0
 
 
-def test_a_wild_number_does_not_make_the_controller_deaf(process):
+def test_packet_with_wild_number_does_not_block_the_controller(process):
     served = process()
     rig = served.rig()
     rig.prepare()
@@ -165,7 +165,7 @@ def test_a_wild_number_does_not_make_the_controller_deaf(process):
     assert code == 0 and found["stale"] == 6
 
 
-def test_a_packet_that_is_played_again_is_dropped(process):
+def test_replayed_packet_is_dropped(process):
     served = process("--silence", str(SILENCE))
     rig = served.rig()
     rig.prepare()
@@ -183,7 +183,7 @@ def test_a_packet_that_is_played_again_is_dropped(process):
     assert code == 1 and found["ended"] == "silent" and found["stale"] > 10
 
 
-def test_strangers_do_not_keep_a_session_alive(process):
+def test_packets_of_strangers_do_not_keep_a_session_alive(process):
     served = process("--silence", str(SILENCE))
     rig, stranger = served.rig(), served.rig()
     rig.prepare()
@@ -197,7 +197,7 @@ def test_strangers_do_not_keep_a_session_alive(process):
 
 
 @pytest.mark.parametrize("opened", [False, True])
-def test_without_a_session_the_process_ends_whoever_asks_for_one(process, opened):
+def test_controller_process_without_session_ends_whoever_asks_for_one(process, opened):
     served = process("--wait", "0.3")
     rig = served.rig()
     begun = time.monotonic()
@@ -208,7 +208,7 @@ def test_without_a_session_the_process_ends_whoever_asks_for_one(process, opened
     assert code == 1 and found["ended"] == "silent"
 
 
-def test_a_silent_rig_ends_an_empty_loop(process):
+def test_silent_rig_ends_an_empty_loop(process):
     served = process("--empty", "--silence", "0.1")
     rig = served.rig()
     rig.open()
@@ -217,7 +217,7 @@ def test_a_silent_rig_ends_an_empty_loop(process):
     assert code == 1 and found["ended"] == "silent"
 
 
-def test_a_rig_that_begins_anew_does_not_go_on_with_the_old_session(process):
+def test_restarted_rig_does_not_continue_the_old_session(process):
     served = process("--silence", str(SILENCE))
     rig = served.rig()
     rig.prepare()
@@ -230,7 +230,7 @@ def test_a_rig_that_begins_anew_does_not_go_on_with_the_old_session(process):
     assert code == 1 and found["ended"] == "silent" and found["ignored"] == 2
 
 
-def test_a_lost_question_or_answer_is_asked_for_again(process):
+def test_lost_question_or_answer_is_asked_for_again(process):
     served = process()
     rig = served.rig()
     rig.send(ask_for_session(1)[:-1])
@@ -245,7 +245,7 @@ def test_a_lost_question_or_answer_is_asked_for_again(process):
     assert code == 0 and found["ignored"] == 1
 
 
-def test_a_rig_of_another_version_is_ignored(process):
+def test_rig_of_another_version_is_ignored(process):
     served = process()
     rig = served.rig()
     packet = bytearray(ask_for_session(1))

@@ -55,7 +55,7 @@ DISTRIBUTIONS = [
 
 @pytest.mark.parametrize("draws", [draw, quasi_random])
 @pytest.mark.parametrize(("path", "entry", "expected"), DISTRIBUTIONS)
-def test_distribution(draws, path, entry, expected):
+def test_draws_have_the_stated_distribution(draws, path, entry, expected):
     values = draws(mechanism_with(path, entry), 4096, 3)[path]
     for column in np.reshape(values, (4096, -1)).T:
         result = stats.kstest(column, expected.cdf)
@@ -64,7 +64,7 @@ def test_distribution(draws, path, entry, expected):
         assert draws is draw or result.statistic < 1e-3
 
 
-def test_phases_are_uniform_and_each_contact_has_its_own():
+def test_phases_are_uniform_and_every_contact_has_its_own():
     phases = draw(from_builtins(BASE, "f"), 4096, 0)
     assert list(phases) == [PHASE]
     assert phases[PHASE].shape == (4096, 3)
@@ -123,7 +123,7 @@ def test_nested_lists_keep_their_shape():
     st.integers(0, 30),
     st.sampled_from(["varying", "layered"]),
 )
-def test_a_draw_depends_on_its_own_number_alone(seed, first, number, name):
+def test_draw_depends_on_its_own_number_alone(seed, first, number, name):
     mechanism = load(name).mechanism
     several = draw(mechanism, number, seed, first)
     for path, values in several.items():
@@ -141,7 +141,7 @@ def test_draws_cross_blocks_and_differ():
         assert not np.any(values == draw(mechanism, 3000, 8, first=1500)[path])
 
 
-def test_a_key_is_drawn_alike_whatever_else_is_uncertain():
+def test_key_is_drawn_alike_whatever_else_is_uncertain():
     mechanism = load().mechanism
     more = ["uncertainty.'rig.simulator.delay'={distribution='uniform', factor=[0.5, 1]}"]
     other = draw(load("varying", [*more, "approach.contacts=5"]).mechanism, 10, 0)
@@ -149,8 +149,8 @@ def test_a_key_is_drawn_alike_whatever_else_is_uncertain():
         np.testing.assert_array_equal(values, other[path][:, :3] if path == PHASE else other[path])
 
 
-def test_recorded_draws():
-    """Recorded sweeps stay reproducible: these numbers may not change between versions."""
+def test_recorded_draws_are_reproduced():
+    """Keep recorded sweeps reproducible: these numbers may not change between versions."""
     values = draw(load().mechanism, 1, seed=1, first=1024)
     np.testing.assert_allclose(
         [values["approach.velocity"][0], values[DELAY][0], values[PHASE][0, 2]],
@@ -173,7 +173,7 @@ def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
         assert sorted(np.floor(64 * column)) == list(range(64))
 
 
-def test_no_draws_and_negative_arguments():
+def test_draw_accepts_no_scenarios_and_refuses_negative_arguments():
     mechanism = load().mechanism
     for values in (draw(mechanism, 0, 0), quasi_random(mechanism, 0, 0)):
         assert {path: entry.shape for path, entry in values.items()} == {
@@ -263,12 +263,12 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
         ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
     ],
 )
-def test_unusable_uncertainty(path, entry, reason):
+def test_unusable_uncertainty_is_refused(path, entry, reason):
     message = refusal(path, entry)
     assert "uncertainty." in message and reason in message
 
 
-def test_rules_hold_over_the_whole_range():
+def test_rules_hold_over_the_whole_uncertain_range():
     third = {"model": "third_order", "coefficients": [0.1, 0.1, 0.005]}
     path, wide = "rig.simulator.coefficients", {"distribution": "uniform", "factor": [0.4, 1.5]}
     narrow = wide | {"factor": [0.6, 1.5]}
@@ -341,7 +341,7 @@ def test_every_draw_lies_between_the_extremes(name):
         assert np.all(np.ptp(ends[path], axis=0) <= 4 * np.ptp(values, axis=0))
 
 
-def test_points_of_the_box_are_what_quasi_random_draws_are_made_of():
+def test_quasi_random_draws_are_points_of_the_box():
     parsed = from_builtins(BASE, "f")
     points = np.full((2, sum(dimensions(parsed).values())), 0.25)
     np.testing.assert_array_equal(at_points(parsed, points)[PHASE], np.full((2, 3), 0.25))

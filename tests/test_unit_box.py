@@ -13,7 +13,7 @@ BOUNDS = Bounds(np.array([0.0, 1e-3, 0.4]), np.array([2.0, 10.0, 0.4]), np.array
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
-def test_bounds_map_one_to_one(linear, logarithmic):
+def test_gains_and_coordinates_map_one_to_one(linear, logarithmic):
     gains = np.array([2 * linear, 1e-3 * 1e4**logarithmic, 0.4])
     coordinates = to_coordinates(gains, BOUNDS)
     np.testing.assert_allclose(coordinates, [linear, logarithmic, 0], atol=1e-12)

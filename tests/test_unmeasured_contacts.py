@@ -1,4 +1,4 @@
-"""Without a measured force there is no contact, whatever turns the numerical model back.
+"""Contacts without a measured force: none is reached, whatever turns the numerical model back.
 
 A virtual spring on the numerical model's own motion stands for a law that does not wait for the hardware.
 """
@@ -46,13 +46,16 @@ def test_hardware_that_never_touches_is_not_reached(noise):
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_model_turned_back_by_a_bias_alone_is_not_reached(noise):
-    """A bias of 70 N turns the model back 0.09 mm before the surface, one of 40 N behind it: after 0.2 mm."""
+    """Use a bias of 70 N or 40 N, and expect no contact.
+
+    The first turns the model back 0.09 mm before the surface, the second 0.2 mm behind it.
+    """
     for bias in (70.0, 40.0):
         found = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))
         assert found.status == "not reached" and math.isnan(found.contacts[0].restitution)
 
 
-def test_a_dead_zone_that_hides_the_whole_contact_hides_it():
+def test_dead_zone_that_hides_the_whole_contact_leaves_it_unreached():
     largest = STIFFNESS * 0.5 * DEEPEST
     hidden = run(rig(0.5 * DEEPEST, dead_zone=1.01 * largest))
     assert hidden.contacts[0].status == "not reached"
@@ -60,21 +63,21 @@ def test_a_dead_zone_that_hides_the_whole_contact_hides_it():
     assert almost.contacts[0].status == "ok"
 
 
-def test_a_single_reading_is_a_contact():
+def test_single_reading_is_a_contact():
     found = run(rig(0.99996 * DEEPEST))
     assert found.contacts[0].status == "ok" and 0 < found.contacts[0].duration < 2e-3
     assert np.count_nonzero(found.force_measured[found.contact == 0]) == 1
 
 
 def test_hardware_that_touches_late_is_waited_for():
-    """The virtual spring turns the model back after 85 ms; the hardware touches after 91 ms."""
+    """Turn the model back by the virtual spring after 85 ms; the hardware touches after 91 ms."""
     found = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
     assert found.contacts[0].status == "ok" and found.contacts[0].peak_force > 0
 
 
 @pytest.mark.slow
 def test_impulse_ledger_makes_no_contact_of_its_own():
-    """In front of a surface that a run does not reach."""
+    """Place the surface where the run does not reach it."""
     made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
     found = jaxhil.simulate(made, "impulse_ledger")
     assert found.status in ("not reached", "timeout") and math.isnan(found.contacts[0].restitution)

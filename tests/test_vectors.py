@@ -1,4 +1,4 @@
-"""Test vectors: what the simulation read, as the runtime answers it; and hostile ticks of every kind."""
+"""Test vectors: readings of the simulation with the runtime's answers, and hostile ticks of every kind."""
 
 import csv
 import io
@@ -42,11 +42,11 @@ def runs_of(vectors):
     return runs
 
 
-def test_columns_are_those_that_the_self_test_reads():
+def test_vector_columns_are_those_that_the_self_test_reads():
     assert ",".join(Row._fields) == selftest.COLUMNS
 
 
-def test_recorded_runs_are_the_simulation_s_and_agree(loaded, vectors):
+def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
     assert vectors.reasons == [] and vectors.ended == [None] * 3
     _, lanes = record_lanes(loaded, nominal_and_draws(one_rig(loaded.mechanism), 3, 3))
     runs = runs_of(vectors)
@@ -63,8 +63,8 @@ def test_recorded_runs_are_the_simulation_s_and_agree(loaded, vectors):
         assert len(begins) == loaded.mechanism.approach.contacts == 3
 
 
-def test_the_model_moves_as_it_does_in_the_simulation(vectors):
-    """Position and velocity after a tick are what the next tick's are, but for rounding."""
+def test_vector_model_moves_as_in_the_simulation(vectors):
+    """Compare position and velocity after a tick with those of the next tick, but for rounding."""
     for rows in list(runs_of(vectors).values())[:3]:
         for row, following in itertools.pairwise(rows):
             if following.event == 0:
@@ -73,7 +73,7 @@ def test_the_model_moves_as_it_does_in_the_simulation(vectors):
         assert [row.time for row in rows] == [tick * 0.001 for tick in range(len(rows))]
 
 
-def test_draws_differ_and_the_seed_decides(loaded, vectors):
+def test_vector_draws_differ_and_depend_on_the_seed(loaded, vectors):
     runs = runs_of(vectors)
     first = [rows[60].force_measured for rows in list(runs.values())[:3]]
     assert len({*first}) == 3
@@ -83,7 +83,7 @@ def test_draws_differ_and_the_seed_decides(loaded, vectors):
     assert as_csv(other.rows) != as_csv(vectors.rows)
 
 
-def test_hostile_runs_hold_every_kind_of_damage(vectors):
+def test_hostile_vectors_hold_every_kind_of_damage(vectors):
     rows = [row for row in vectors.rows if row.run > 2]
     inputs = [value for row in rows for value in row[2:10] if value is not None]
     assert any(math.isnan(value) for value in inputs) and {math.inf, -math.inf} <= {*inputs}
@@ -99,7 +99,7 @@ def test_hostile_runs_hold_every_kind_of_damage(vectors):
     assert all(math.isnan(row.force_simulated) for row in rows)
 
 
-def test_every_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, vectors):
+def test_every_vector_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, vectors):
     gain_file = check_gain_document(loaded.document)
     controller = None
     for row in vectors.rows:
@@ -112,7 +112,7 @@ def test_every_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, vectors)
         assert (force, position, controller.faults) == (row.force_command, row.position_command, row.faults)
 
 
-def test_the_text_gives_back_the_same_bits(vectors):
+def test_vector_text_gives_back_the_same_bits(vectors):
     rows = list(csv.reader(io.StringIO(as_csv(vectors.rows))))[1:]
     for row, fields in zip(vectors.rows, rows, strict=True):
         for value, field in zip(row, fields, strict=True):
@@ -124,7 +124,7 @@ def test_the_text_gives_back_the_same_bits(vectors):
                 assert field == "nan"
 
 
-def test_where_a_guard_acts_nothing_is_compared(loaded):
+def test_vectors_are_not_compared_where_a_guard_acts(loaded):
     tight = check_document(with_limits(loaded.document, {"force_limit": 20.0}))
     found = make_vectors(tight, seed=3, draws=2)
     assert found.reasons == []
@@ -135,8 +135,8 @@ def test_where_a_guard_acts_nothing_is_compared(loaded):
     assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])
 
 
-def test_a_trip_between_two_contacts_ends_the_comparison_too(loaded):
-    """The audit waits for the force to die out; here it comes with the next contact."""
+def test_trip_between_two_contacts_ends_the_comparison(loaded):
+    """Let the audit, which waits for the force to die out, come with the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
     found = make_vectors(check_document(with_limits(loaded.document, limits)), seed=3, draws=1)
     assert found.reasons == []
@@ -147,7 +147,7 @@ def test_a_trip_between_two_contacts_ends_the_comparison_too(loaded):
         assert [math.isnan(row.force_simulated) for row in rows[begins - 1 : begins + 1]] == [False, True]
 
 
-def test_a_runtime_that_differs_is_reported(loaded, monkeypatch):
+def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
     class Wrong(ON_THE_RIG[loaded.compensator]):
         def step(self, *readings):
             return super().step(*readings) * (1 + 1e-9)
@@ -158,8 +158,8 @@ def test_a_runtime_that_differs_is_reported(loaded, monkeypatch):
     assert "allowed 1e-11" in found.reasons[1] and found.reasons[1].startswith("draw 1, ")
 
 
-def test_a_noisy_biased_rig_agrees_too():
-    """Its loop takes the first tick's force as none, whatever the sensor reads: that tick is not compared."""
+def test_vectors_of_a_noisy_biased_rig_agree():
+    """Leave out the first tick: the loop takes its force as none, whatever the sensor reads."""
     rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
     found = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
     assert found.reasons == [] and found.ended == [None, None]
@@ -168,7 +168,7 @@ def test_a_noisy_biased_rig_agrees_too():
     assert not math.isnan(found.rows[1].force_simulated)
 
 
-def test_no_draw_changes_what_the_gain_file_says(loaded):
+def test_vector_draws_change_nothing_that_the_gain_file_states(loaded):
     uncertain = one_rig(loaded.mechanism).uncertainty
     assert "rig.control_period" not in uncertain and "contact.clearance" not in uncertain
     assert uncertain.keys() <= loaded.mechanism.uncertainty.keys()

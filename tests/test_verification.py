@@ -1,4 +1,4 @@
-"""Verification: it passes what agrees, and tells in plain words what a wrong runtime does wrong."""
+"""Verification: it passes runtimes that agree, and names in plain words what a wrong one does."""
 
 import jax
 import msgspec
@@ -51,7 +51,7 @@ def varying():
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=pytest.mark.slow if case == "rattling" else ()) for case in CASES]
 )
-def test_what_agrees_is_verified(case):
+def test_verification_passes_what_agrees(case):
     loaded = loaded_gains(*CASES[case])
     messages = []
     report = verify(loaded, scenarios=4, seed=1, progress=messages.append)
@@ -69,7 +69,7 @@ def test_what_agrees_is_verified(case):
     assert msgspec.convert(msgspec.json.decode(msgspec.json.encode(report)), type(report)) == report
 
 
-def test_the_record_is_the_rollout(varying):
+def test_verification_record_is_the_rollout(varying):
     batch = nominal_and_draws(varying.mechanism, 4, seed=1)
     metrics, lanes = record_lanes(varying, batch)
     assert np.all(metrics.status[:3] == OK)
@@ -79,7 +79,7 @@ def test_the_record_is_the_rollout(varying):
     assert runs == [3, 3, 3, 3]
 
 
-def test_the_same_seed_gives_the_same_report(varying):
+def test_verification_with_the_same_seed_gives_the_same_report(varying):
     assert verify(varying, 4, seed=1) == verify(varying, 4, seed=1)
 
 
@@ -120,7 +120,7 @@ class Failing(ON_THE_RIG["response_error"]):
         (Failing, "the nominal run: the runtime's controller tripped: command_not_finite"),
     ],
 )
-def test_a_wrong_runtime_is_reported(varying, monkeypatch, runtime, start):
+def test_verification_reports_a_wrong_runtime(varying, monkeypatch, runtime, start):
     monkeypatch.setitem(ON_THE_RIG, "response_error", runtime)
     report = verify(varying, 4, seed=1)
     assert not report.verdict
@@ -140,7 +140,7 @@ def test_a_wrong_runtime_is_reported(varying, monkeypatch, runtime, start):
         assert len(in_the_loop) == 1 and in_the_loop[0].endswith("allowed 1e-09")
 
 
-def test_single_precision_is_refused(varying):
+def test_verification_refuses_single_precision(varying):
     with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
         verify(varying)
 
@@ -167,7 +167,7 @@ def gain_file(varying):
     return file._replace(gains=gains)
 
 
-def test_ticks_near_a_threshold_are_counted(gain_file):
+def test_verification_counts_ticks_near_a_threshold(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18  # instead of 0: in contact, but by less than rounding
     force = np.where(measured > 0, 1e5 * measured, 0.0)
@@ -183,7 +183,7 @@ def test_ticks_near_a_threshold_are_counted(gain_file):
     assert np.nonzero(near_threshold(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
 
 
-def test_a_decision_that_fell_differently_ends_the_comparison(gain_file):
+def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20:23] = -3e-18, 3e-18, 6e-18  # a standstill at the surface: rounding has the say
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
@@ -196,8 +196,8 @@ def test_a_decision_that_fell_differently_ends_the_comparison(gain_file):
     assert parted.difference <= 1e-13
 
 
-def test_a_tick_beside_the_surface_does_not_decide(gain_file):
-    """A contact that begins a hair before a tick or after it begins at the same time."""
+def test_verification_ignores_a_tick_beside_the_surface(gain_file):
+    """Let a contact begin just before a tick or after it: it begins at the same time."""
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
@@ -209,7 +209,7 @@ def test_a_tick_beside_the_surface_does_not_decide(gain_file):
     assert seen.difference <= 1e-11 and seen.near_difference <= 1e-11
 
 
-def test_a_difference_away_from_thresholds_is_not_excused(gain_file):
+def test_verification_does_not_excuse_a_difference_away_from_thresholds(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     lane = lane_of(measured, np.where(np.arange(40) > 17, 50.0, 0.0), gain_file)
@@ -220,7 +220,7 @@ def test_a_difference_away_from_thresholds_is_not_excused(gain_file):
     assert seen.difference == pytest.approx(1e-9, rel=1e-3) and seen.worst_tick >= 19
 
 
-def test_a_command_that_is_always_zero_allows_equality_alone():
+def test_verification_of_a_command_that_is_always_zero_requires_equality():
     ticks = np.zeros(5)
     signals = Signals(ticks, ticks, ticks, ticks, np.arange(5, dtype=np.int32))
     gain_file = GainFile("none", {}, 0.001, np.inf)

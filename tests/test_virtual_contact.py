@@ -20,7 +20,7 @@ from jaxhil.mechanism.file import load
     frequency=st.floats(0.1, 1e3),
     angle=st.floats(0.0, 0.01) | st.floats(0.0, 1.0) | st.floats(0.0, 50.0),
 )
-def test_the_limit_has_an_imaginary_root(mass, frequency, angle):
+def test_virtual_contact_has_an_imaginary_root_at_the_limit(mass, frequency, angle):
     stiffness, delay = mass * frequency**2, angle / frequency
     damping, critical = damping_at_the_limit(stiffness, frequency, delay)
     root = 1j * critical
@@ -31,8 +31,8 @@ def test_the_limit_has_an_imaginary_root(mass, frequency, angle):
     assert np.all(np.cos(below * delay) > (below / frequency) ** 2)
 
 
-def test_nominal_damping_is_the_limit_of_all_delay():
-    """That of the force measurement, and of the motion simulator as it follows a uniform motion."""
+def test_nominal_damping_is_the_limit_for_the_total_delay():
+    """Include the force measurement, and the motion simulator as it follows a uniform motion."""
     overrides = ["rig.force_sensor.delay=0.003", "rig.force_sensor.time_constant=0.002"]
     simulator = 'rig.simulator={model="first_order", time_constant=0.01, delay=0.004}'
     mechanism = load("rod-100n-mm", [*overrides, simulator, "uncertainty={}"]).mechanism
@@ -43,8 +43,8 @@ def test_nominal_damping_is_the_limit_of_all_delay():
     assert gains["virtual_stiffness"] == 0.0
 
 
-def test_the_simulated_loop_is_marginal_at_the_limit():
-    """Growth per half-cycle of an endless contact, pi Re s/Im s of the characteristic root: 0 at the limit.
+def test_simulated_loop_is_marginal_at_the_limit():
+    """Compare the growth per half-cycle, pi Re s/Im s of the characteristic root, with 0 at the limit.
 
     Semi-implicit Euler has the velocity half a period late: what is of first order in T is extrapolated.
     """

@@ -1,4 +1,4 @@
-"""The watchdog on fresh scenarios, by the controller in C: it misses nothing and stops nothing in vain.
+"""Watchdog on fresh scenarios, by the controller in C: no missed runs and no false stops.
 
 Limits are calibrated on some draws, and judged on draws of another seed (`tests/fresh_runs.py`).
 """
@@ -41,7 +41,7 @@ def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
     return gains(parsed, nominal_gains(parsed, "response_error"))
 
 
-def test_the_controller_in_c_misses_nothing_and_stops_nothing_in_vain(tmp_path):
+def test_watchdog_in_c_misses_nothing_and_stops_no_good_run(tmp_path):
     loaded = coarse({}, contacts=2)
     one, _ = export(loaded, 0.05, tmp_path, scenarios=256, lanes=128)
     (count,) = counted(loaded, [one], 384, lanes=128, in_python=12)
@@ -50,9 +50,12 @@ def test_the_controller_in_c_misses_nothing_and_stops_nothing_in_vain(tmp_path):
 
 
 @pytest.mark.slow
-def test_between_two_surfaces_with_noise_it_does_what_calibration_states(tmp_path):
-    """In flight, noise goes on to change the model's velocity: where by more than the limit leaves room for,
-    the margin is widened until good runs pass; here still nothing is missed."""
+def test_watchdog_between_two_surfaces_with_noise_does_as_calibrated(tmp_path):
+    """Let noise go on to change the model's velocity in flight.
+
+    Where the change exceeds what the limit leaves room for, the margin is widened until good runs pass; here
+    still nothing is missed.
+    """
     loaded = coarse({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
     both = [export(loaded, limit, tmp_path, scenarios=1024, lanes=128) for limit in (0.05, 0.1)]
     narrow, wide = counted(loaded, [one for one, _ in both], 1024, lanes=128, in_python=12)
@@ -69,8 +72,8 @@ def test_between_two_surfaces_with_noise_it_does_what_calibration_states(tmp_pat
     assert not narrow.missed and not wide.missed
 
 
-def test_a_run_that_is_not_stopped_in_time_is_counted(tmp_path):
-    """Without a margin on the restitution everything is missed, with none allowed nothing is good."""
+def test_run_that_is_not_stopped_in_time_is_counted(tmp_path):
+    """Set the largest margin on the restitution, which misses every bad run, and 0, which stops every run."""
     loaded = coarse({}, contacts=2)
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)
     margin = list(one.parameters).index(one.gain_file.limits["restitution_margin"])
@@ -91,7 +94,7 @@ def test_a_run_that_is_not_stopped_in_time_is_counted(tmp_path):
         ("literature", [(0.02, 8192), (0.03, WITHOUT_STORE), (0.03, 8192)]),
     ],
 )
-def test_of_a_hundred_thousand_fresh_runs_of_the_default_mechanism_none_is_missed(chosen, exports, tmp_path):
+def test_watchdog_misses_none_of_a_hundred_thousand_fresh_runs(chosen, exports, tmp_path):
     parsed = load(DEFAULT).mechanism
     loaded = gains(parsed, literature_gains(parsed, "response_error") | CHOSEN[chosen])
     exported = [export(loaded, limit, tmp_path, scenarios)[0] for limit, scenarios in exports]

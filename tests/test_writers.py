@@ -1,4 +1,4 @@
-"""What each writer writes is read back by an independent reader to the same bits."""
+"""Writers of gain files: an independent reader reads back the same bits."""
 
 import copy
 import csv
@@ -49,7 +49,7 @@ writer_test = settings(max_examples=25)
 
 @writer_test
 @given(documents)
-def test_ros2_parameters(made):
+def test_ros2_parameters_are_read_back(made):
     text = ros2_yaml(made)["ros2.yaml"].decode("ascii")
     tree = YAML(typ="safe", pure=True).load(text)
     assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
@@ -65,8 +65,8 @@ def test_ros2_parameters(made):
 
 @writer_test
 @given(documents)
-def test_every_number_is_a_double_to_ros2_and_every_text_a_text(made):
-    """By the letter, as ROS 2's parser goes: a decimal point or .inf makes a double, quotes make a string."""
+def test_ros2_numbers_are_doubles_and_texts_are_texts(made):
+    """Follow ROS 2's parser by the letter: a decimal point or .inf makes a double, quotes make a string."""
     sections = []
     for line in ros2_yaml(made)["ros2.yaml"].decode().splitlines()[3:]:
         indent, name, value = re.fullmatch(r"( +)([A-Za-z_][A-Za-z0-9_]*):(?: (\S.*))?", line).groups()
@@ -92,7 +92,7 @@ def test_texts_that_look_like_numbers_stay_texts():
 
 @writer_test
 @given(documents)
-def test_matlab_struct(made):
+def test_matlab_struct_is_read_back(made):
     files = matlab(made)
     assert files == matlab(made)
     found = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
@@ -137,7 +137,7 @@ def mat_value(content):
     return struct.unpack(f"<{len(parts[3][1]) // 8}d", parts[3][1])
 
 
-def test_matlab_struct_by_the_format_s_description():
+def test_matlab_struct_follows_the_description_of_the_format():
     made = document([*AWKWARD, 1.0, 2.0, 3.0, 4.0], [None, 2.5])
     content = matlab(made)["gains.mat"]
     assert content[124:128] == b"\x00\x01IM"
@@ -153,7 +153,7 @@ def test_matlab_struct_by_the_format_s_description():
 
 @writer_test
 @given(documents)
-def test_csv_table(made):
+def test_csv_table_is_read_back(made):
     rows = list(csv.DictReader(io.StringIO(csv_table(made)["gains.csv"].decode("ascii"))))
     found = {row["name"]: row for row in rows}
     assert len(found) == len(rows)
@@ -179,14 +179,14 @@ def test_every_compensator_is_written(compensator):
     assert {name: mat["gains"][name]["value"] for name in values} == values
 
 
-def test_no_limit_is_what_the_runtime_takes_it_for():
+def test_missing_limit_is_written_as_the_runtimes_default():
     made = document([1.0] * 12, [None] * len(LIMITS))
     assert {name: one.value for name, one in limit_entries(made).items()} == {
         name: one.default for name, one in LIMITS.items()
     }
 
 
-def test_a_name_too_long_for_matlab_is_refused():
+def test_name_too_long_for_matlab_is_refused():
     made = json.loads(json.dumps(gain_document("phase_lead")))
     made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
     with pytest.raises(InputError, match="found 64 characters, allowed 63"):
