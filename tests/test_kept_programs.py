@@ -41,7 +41,7 @@ class Sums(NamedTuple):
 
 
 class Mine(KelvinVoigt):
-    """A law from elsewhere."""
+    """A user-registered law."""
 
 
 traced = []
@@ -72,7 +72,7 @@ def as_for_users(monkeypatch):
 
 
 def run(folder, static=STATIC, values=VALUES, options=TICKS, function=sums):
-    """What a new process would find."""
+    """Run the program as a new process would."""
     kept_programs._programs.clear()
     kept_programs.program_folder = lambda: folder
     more = ({"factor": jnp.array(3.0)},) if function is sums else ()

@@ -40,7 +40,7 @@ def test_latch_captures_deep_aligned_bodies_and_holds_them():
     caught = [3e-3, 0, -2e-3]
     wrench, held = step(one, held, at(caught, [0.01, 0, 0]), still)
     assert held.caught.all() and np.max(np.abs(components(wrench.force))) < 1e-12
-    # From far away, too; about T's origin.
+    # Also from far away, and about T's origin.
     wrench, held = step(one, held, at([3e-3, 0, 0.098], [0.01, 0, 0]), still)
     np.testing.assert_allclose(components(wrench.force)[:, 0], [0, 0, -2e4], atol=1e-9)
     np.testing.assert_allclose(components(wrench.moment)[:, 0], [0, 3e-3 * 2e4, 0], atol=1e-9)
@@ -67,7 +67,7 @@ def test_latches_together_hold_as_much_as_each_alone():
 
     held, together = after(all_three)
     assert held.caught.shape == (3, 1) and held.caught.all()
-    # One alone: the others are never deep enough.
+    # Alone: the other latches are never deep enough.
     alone = [after(all_three._replace(depth=jnp.where(one[:, None], 1e-3, jnp.inf))) for one in np.eye(3) > 0]
     assert all(held.caught.sum() == 1 for held, _ in alone)
     for found, *parts in zip(

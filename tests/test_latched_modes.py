@@ -25,7 +25,7 @@ from jaxhil.sixdof.vectors import components, vector
 pytestmark = pytest.mark.slow
 BATCH, PERIOD, TICKS, DELAY = (1,), 5e-4, 4000, 6e-3
 UNEQUAL = [DELAY, 5e-3, 7e-3, 8e-3, 4e-3, 6.5e-3]
-MODES, APART = 12, 20  # complex modes; ticks between the samples that are fitted
+MODES, APART = 12, 20  # complex modes; ticks between the fitted samples
 SMALL = 1e-7  # m/s, rad/s
 STIFFNESS = np.diag([1e5, 1.3e5, 2e5, 5e3, 7e3, 4e3])
 STIFFNESS[0, 4] = STIFFNESS[4, 0] = 6e3
@@ -38,7 +38,7 @@ def latch():
 
 
 def started():
-    """The bodies, docked, and moving in all six coordinates."""
+    """Return the bodies, docked and moving in all six coordinates."""
     bodies = Pair(
         plain_body(1800.0, FULL[0], (0.05, -0.02, 1.2), BATCH),
         plain_body(420.0, FULL[1], (0.01, 0.04, -1.0), BATCH),
@@ -48,7 +48,7 @@ def started():
 
 
 def scenario(delays):
-    """On a motion simulator that is late and nothing else."""
+    """Return a scenario with a motion simulator that is late and nothing else."""
     late = lanes(delays, BATCH)
     free = late + jnp.inf
     simulator = MotionSimulator(jnp.zeros((0, 6, 1)), jnp.ones((1, 6, 1)), late, free, free)
@@ -93,7 +93,7 @@ def test_response_error_with_true_stiffness_removes_the_rig():
     still = init_latch(one, pose)
 
     def pulled(share):
-        """The chaser's coordinates tick by tick; of the response error a share."""
+        """Return the chaser's coordinates tick by tick, and the given share of the response error."""
 
         def tick(carry, now):
             states, hardware = carry
@@ -112,7 +112,7 @@ def test_response_error_with_true_stiffness_removes_the_rig():
         return jax.lax.scan(tick, (start, hardware), jnp.arange(TICKS // 2, dtype=jnp.int32))[1]
 
     def alone(states, _):
-        """The numerical model on its own spring."""
+        """Simulate the numerical model on its own spring."""
         wanted, _ = command_of(bodies, states)
         pull = -jnp.einsum("ij,jb->ib", jnp.asarray(STIFFNESS), wanted)
         wrench = Wrench(vector(pull[:3]), vector(pull[3:]))
@@ -125,7 +125,7 @@ def test_response_error_with_true_stiffness_removes_the_rig():
 
 
 def _fastest(mass, late, frequencies):
-    """Root with the largest growth, by Newton's method from each mode under the mean delay."""
+    """Return the root with the largest growth, by Newton's method from each mode under the mean delay."""
 
     def determinant(s):
         return np.linalg.det(s**2 * np.eye(6) + np.linalg.solve(mass, STIFFNESS @ np.diag(np.exp(-s * late))))
@@ -140,7 +140,7 @@ def _fastest(mass, late, frequencies):
 
 
 def _growth(signal, guess):
-    """The complex frequency nearest to a guess of what the samples are a sum of (Prony)."""
+    """Return the complex frequency of the samples that is nearest to a guess (Prony's method)."""
     windows = [
         np.lib.stride_tricks.sliding_window_view(one / np.max(np.abs(one)), MODES + 1) for one in signal
     ]

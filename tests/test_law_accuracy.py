@@ -23,7 +23,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, probe_figures, probed_scenarios
 
 pytestmark = pytest.mark.slow
-LAW, SEED = "impulse_ledger", 0xACC  # of scenarios that nothing was tuned or judged on elsewhere
+LAW, SEED = "impulse_ledger", 0xACC  # of scenarios that nothing else was tuned or evaluated on
 CONTACTS = 4
 
 
@@ -32,7 +32,7 @@ RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.75
 
 
 def within(path: str, low: float, high: float) -> str:
-    """An override: a number that lies anywhere between two."""
+    """Return an override: a number that lies anywhere between two."""
     return f'uncertainty."{path}"={{distribution="uniform",low={low},high={high}}}'
 
 
@@ -43,13 +43,13 @@ FRICTION = "contact.friction=3.0", within("contact.friction", 0.0, 6.0)
 
 def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
     loop = build_loop(mechanism, LAW, scenarios)
-    # Lane by lane, so that one program serves every set of gains.
+    # Run lane by lane, so that one program serves every set of gains.
     lanes = scenarios.velocity.shape
     return evaluate(loop, {name: np.broadcast_to(value, lanes) for name, value in gains.items()}, scenarios)
 
 
 def left(errors: Any) -> tuple[float, float, float]:
-    """Root mean square, 99th percentile and largest of |e - e*| [%]."""
+    """Return root mean square, 99th percentile and largest of |e - e*| [%]."""
     size = 100 * np.abs(np.asarray(errors))
     return float(np.sqrt(np.mean(size**2))), float(np.percentile(size, 99)), float(np.max(size))
 
@@ -59,7 +59,7 @@ def printed(*what: object) -> None:
 
 
 def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
-    """With an axis for a scenario's plain run, its two pushes and its damped twin."""
+    """Return copies with an axis for a scenario's plain run, its two pushes and its damping perturbation."""
     number = len(probed.plain)
     return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], number, LANES_PER_SCENARIO), outcome)
 

@@ -46,12 +46,12 @@ from tuning.rig.plant import Plant
 from tuning.rig.udp_protocol import NumericalModel
 
 LAW = "impulse_ledger"
-AFTER = 60  # ticks that are run on once both have left the surface
+AFTER = 60  # ticks that are simulated after both have left the surface
 LONGEST = 2000
 
 
 class Kind(NamedTuple):
-    """A contact: its suite, what is set, the gains that differ, and what the law is to say of it."""
+    """A contact: its suite, its overrides, the gains that differ, and the expected status of the law."""
 
     suite: str
     changes: tuple[str, ...]
@@ -78,7 +78,7 @@ LIMITS = {
 
 
 class Ran(NamedTuple):
-    """A contact tick by tick: rows of `c99_cases.ROW`, the controller's faults and what the law said."""
+    """Record of a contact by tick: rows of `c99_cases.ROW`, the controller's faults and the law's status."""
 
     rows: np.ndarray
     faults: np.ndarray
@@ -86,7 +86,7 @@ class Ran(NamedTuple):
 
 
 def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
-    """One contact in lock-step with the rig's plant, until both have been outside for a while."""
+    """Simulate one contact in lock-step with the rig's plant, until both have been outside for a while."""
     plant, model = Plant(mechanism, seed), NumericalModel(to_builtins(mechanism))
     period, quiet, entered = law.control_period, 0, False
     surface = min(mechanism.rig.contact_plane, 0.0)
@@ -120,13 +120,13 @@ def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainF
 
 @cache
 def ran(name: str, limits: str) -> tuple[Controller, Ran]:
-    """One of the kinds under these limits, and its controller after it."""
+    """Run one of the kinds under these limits; return it and its controller."""
     mechanism, made = gain_file(KINDS[name], LIMITS[limits])
     law = Controller(made)
     return law, run(mechanism, law)
 
 
-# Every kind without the audit; otherwise every day some.
+# All kinds run without the audit; with it, only some run every day.
 @pytest.mark.parametrize(
     "name, limits",
     [
@@ -324,7 +324,7 @@ def test_contact_status_follows_from_status_counts(counts, status):
 
 
 def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = ()) -> Iterator[Mechanism]:
-    """So many draws of a suite, with the changes."""
+    """Yield that many draws of a suite, with the changes."""
     drawn = draw(load(f"suite-{suite}", list(changes)).mechanism, number, seed)
     for place in range(number):
         one = {path: values[place].tolist() for path, values in drawn.items()}
@@ -364,7 +364,7 @@ def test_share_of_doubtful_ticks_separates_short_contacts(suite):
 
 
 class Wrong(NamedTuple):
-    """What differs from the nominal mechanism, and what of it the controller knows."""
+    """Differences from the nominal mechanism, and those of them that the controller knows."""
 
     changes: tuple[str, ...] = ()
     known: tuple[str, ...] = ()

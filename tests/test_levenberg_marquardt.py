@@ -49,7 +49,7 @@ def test_gain_with_equal_bounds_stays_fixed():
 
 
 def tilted(static, gains, arguments):
-    """Linear residuals whose free minimum lies far outside of the box, along a narrow valley."""
+    """Return linear residuals whose free minimum lies far outside of the box, along a narrow valley."""
     matrix = jnp.array([[1.0, 0.9], [0.9, 1.0], [0.1, -0.1]])
     return (gains - arguments) @ matrix.T
 
@@ -107,5 +107,5 @@ def test_least_squares_derivative_is_that_of_the_residuals(number):
     np.testing.assert_allclose(value, np.sin(free) * factors)
     np.testing.assert_allclose(loss, np.sum(np.asarray(value) ** 2, axis=1) / 2)
     np.testing.assert_allclose(slope, np.cos(free) * factors * tangent[None])
-    # Alone, it is the same function.
+    # The function of one problem alone is the same.
     np.testing.assert_allclose(function(free[0], factors[0])[0], np.asarray(value)[0])

@@ -20,7 +20,7 @@ PERIOD, VELOCITY_LIMIT, ACCELERATION_LIMIT = 1e-3, 0.02, 0.5
 
 @jax.jit
 def follow(targets, velocity_limit, acceleration_limit):
-    """Limited commands c(n), n >= 1, of a numerical model at `targets`, which starts in uniform motion."""
+    """Return the limited commands c(n), n >= 1, of a model at `targets` that starts in uniform motion."""
 
     def tick(carry, pair):
         command, step = carry
@@ -36,7 +36,7 @@ def follow(targets, velocity_limit, acceleration_limit):
 
 
 def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
-    """`follow` with the start in front."""
+    """Return `follow` with the start in front."""
     limits = np.array([velocity_limit, acceleration_limit], np.asarray(targets).dtype)
     return np.concatenate([targets[:1], np.asarray(follow(jnp.asarray(targets), *limits))])
 
@@ -48,7 +48,7 @@ def moves(speeds):
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.lists(st.floats(-0.08, 0.08), min_size=8, max_size=8))
 def test_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
-    # The first speed is one that the drives can have.
+    # The drives can reach the first speed.
     speeds[0] = np.clip(speeds[0], -VELOCITY_LIMIT, VELOCITY_LIMIT)
     commands = limited(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
     steps = np.diff(commands)
@@ -57,7 +57,7 @@ def test_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
 
 
 def gap(distance, speed=0.0):
-    """How far the command is behind a target that jumps ahead by `distance` and goes on at its speed."""
+    """Return the command's lag behind a target that jumps ahead by `distance` and goes on at its speed."""
     targets = moves(np.full(800, speed))
     targets[2:] += distance
     return (targets - limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)
@@ -68,7 +68,7 @@ def gap(distance, speed=0.0):
 def test_command_reaches_displaced_target(distance, speed):
     behind = gap(distance, speed)
     assert np.all(behind[:2] == 0) and abs(behind[-1]) < 1e-12
-    # Closing all the way, and never beyond.
+    # The gap closes all the way and is never overshot.
     assert np.diff(behind[2:]).max() < 1e-15
     assert behind.min() > -1e-15
 
@@ -115,7 +115,7 @@ def test_limits_that_do_not_bind_change_no_bit(offset, dtype, margin):
     targets = smooth.astype(dtype)
     for limits in (loose, (loose[0], np.inf), (np.inf, loose[1])):
         np.testing.assert_array_equal(limited(targets, *limits), targets)
-    # Either limit that much lower does bind.
+    # A limit that is this much lower does bind.
     assert np.abs(limited(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
     assert np.abs(limited(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
 
@@ -155,9 +155,9 @@ def test_limits_hold_over_a_whole_contact(limits):
     steps = np.diff(commands[going])
     assert np.abs(steps).max() <= limits[0] * PERIOD * (1 + 1e-9)
     assert np.abs(np.diff(steps)).max() <= limits[1] * PERIOD**2 * (1 + 1e-9)
-    # They do bind here, in the contact: the model is faster than the drives.
+    # The limits bind in this contact: the model is faster than the drives.
     assert metrics.status[0, 0] == OK
-    # From the first touch to the tick at which the contact is over, with which it is no longer active.
+    # Count from the first touch to the tick at which the contact ends and is no longer active.
     begin, end = np.argmax(np.asarray(ticks.plant_signals.force)[:, 0] != 0), np.argmin(going)
     largest = behind[begin : end + 1].max()
     assert largest > 1e-6 and metrics.position_shortfall[0, 0] == pytest.approx(largest, rel=1e-9)

@@ -13,7 +13,7 @@ SPEEDS = (0.003, 0.006, 0.012) * 2
 
 
 def logged(run, ahead):
-    """The run in rows whose readings are `ahead` of what a row of one tick has."""
+    """Return the run in rows whose readings are `ahead` of those of one tick."""
     end = len(run.tick) - 1
     command = slice(1, None) if ahead > 0 else slice(0, end)
     reading = slice(1, None) if ahead < 0 else slice(0, end)

@@ -18,7 +18,7 @@ def message(path, kind="contact", **said):
 
 
 def model(integrator, row, sign=1):
-    """Commands of a model under a given force, and the rows in which a logger puts them."""
+    """Return commands of a model under a given force, and the rows in which a logger writes them."""
     times = PERIOD * np.arange(900)
     force = 40 * np.sin(np.pi * times / 0.25) ** 2 * ((times > 0.1) & (times < 0.6))
     x, v, found = -5e-3, 0.02, []
@@ -135,16 +135,16 @@ def test_commands_and_forces_of_another_rate_are_detected(tmp_path, every):
     path = write_csv(tmp_path / "b.csv", LOG | {"F": held(LOG["F"])})
     (note,) = read(path, force_command=None).notes
     assert f"force_measured: a new reading every {every} rows" in note
-    # A steady motion in steps of the last digit changes as regularly.
+    # A steady motion in steps of the last digit also changes at regular intervals.
     slow = {"t": PERIOD * np.arange(800), "xd": 1e-5 * (np.arange(800) // every), "xm": sway()["xm"]}
     slow["xm"] = np.concatenate([np.zeros(LAG), slow["xd"][:-LAG]])
     assert read(write_csv(tmp_path / "c.csv", slow), "free").runs[0].kind == "free"
 
 
 def far_side():
-    """A touch, and the flight back to another one on the far side of a clearance of 2 mm."""
+    """Simulate a touch, and the flight back to another one on the far side of a clearance of 2 mm."""
     log = touches(2)
-    back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # there the touch's log is driven back
+    back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # the log is driven back there
     other = {name: -column for name, column in log.items() if name != "t"}
     other = other | {name: other[name] - 2e-3 for name in ("xd", "xm")}
     both = {name: np.concatenate([log[name][:back], other[name]]) for name in other}

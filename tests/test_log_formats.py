@@ -105,7 +105,7 @@ FORMATS = [
 ]
 
 
-@pytest.mark.filterwarnings("ignore")  # other libraries' own
+@pytest.mark.filterwarnings("ignore")  # those of other libraries
 @pytest.mark.parametrize(("name", "write"), FORMATS)
 def test_log_formats_give_the_same_campaign(tmp_path, name, write):
     if write is mat_5:
@@ -137,7 +137,7 @@ def test_torn_log_or_missing_library_is_refused_in_one_line(tmp_path, suffix):
 
 
 def bag_of_topics(path, log, late):
-    """The force a topic of its own, whose first message comes some ticks later."""
+    """Write a bag whose force is a topic of its own, with its first message some ticks later."""
     pytest.importorskip("rosbags")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore

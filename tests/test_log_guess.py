@@ -37,7 +37,7 @@ def test_draft_mapping_reads_its_logs(tmp_path, names, factors):
     assert 'files = "contact*.csv"' in text and 'files = ["morning.csv"]' in text
 
 
-def test_draft_mapping_recognises_own_columns_and_skips_unknown_names(tmp_path):
+def test_draft_mapping_recognises_own_columns_and_refuses_unknown_ones(tmp_path):
     own = (
         "time",
         "force_measured",

@@ -13,7 +13,7 @@ PERIOD, ROWS = 1e-3, 2000
 
 
 def smooth(times):
-    """A signal that is known at any time."""
+    """Return a signal that is known at any time."""
     return np.sin(2 * np.pi * 2.3 * times) + 0.3 * np.cos(2 * np.pi * 7.1 * times + 1.0)
 
 
@@ -22,7 +22,7 @@ def scattered(times, jitter, seed=0):
 
 
 def joined(sampled, stamps=None, ticks=None, jitter=0.0):
-    """The rows' ticks, readings joined to them, and notes; `sampled`: when readings were taken [s]."""
+    """Return the rows' ticks, joined readings and notes; `sampled` are the times of the readings [s]."""
     ticks = np.arange(ROWS) if ticks is None else ticks
     rows = scattered(PERIOD * ticks, jitter, 1)
     columns = {"position_desired": ticks.astype(float), "position_measured": smooth(sampled)}
@@ -34,7 +34,7 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
     assert len(times) == len(kept) == len(found["position_measured"])
     assert np.all(np.isin(times, rows))
     if "force_late" in found:
-        # Forces are not interpolated: each is one of the readings, and it is told how late.
+        # Forces are not interpolated: each is one of the readings, and its delay is reported.
         assert np.all(np.isin(found["force_measured"], columns["force_measured"]))
         moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
         at = PERIOD * kept + found["force_late"]
@@ -124,7 +124,7 @@ def test_channels_that_hold_their_value_are_not_interpolated():
 
 
 def separate(late, rows=580):
-    """A log whose force has stamps and a number of rows of its own."""
+    """Write a log whose force has its own stamps and its own number of rows."""
     log = touches(1)
     force = {"tF": 1e3 * (log["t"][:rows] + late), "F": log["F"][:rows]}
     return log, {"tx": 1e3 * log["t"], **{name: log[name] for name in ("xd", "xm", "vd", "Fc")}}, force
@@ -150,7 +150,7 @@ def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
     shift, first = round(1e3 * late), np.flatnonzero(log["xd"] == run.position_desired[0])[0]
     np.testing.assert_array_equal(run.force_measured, log["F"][first - shift : first - shift + len(run.tick)])
     assert f"begins {abs(shift)} ms" in campaign.notes[0]
-    # By row numbers they do not go together.
+    # They cannot be joined by row numbers.
     with pytest.raises(InputError, match="found columns of unlike length"):
         read(tmp_path / "a.h5", **TIMES | {"force_measured": "f/F"})
     with pytest.raises(InputError, match=r"channels.force_measured.time is named"):

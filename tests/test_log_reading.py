@@ -45,7 +45,7 @@ def test_log_is_read_as_it_was_written(tmp_path):
     assert found.equivalent_mass == MASS and found.timing.control_period == PERIOD
     assert found.sources == {"a.csv": hashlib.sha256(path.read_bytes()).hexdigest()}
     assert found.notes == ()
-    # Of the lists of a prior the last entry repeats.
+    # The last entry of a prior's list repeats.
     (one, two) = read_campaign([path], mapping(), load("rig-300kg").mechanism).runs
     assert set(one.contact_index) == set(two.contact_index) == {0}
 

@@ -27,13 +27,13 @@ def rounded(log, **quanta):
 
 
 def lose(log, share, seed=0):
-    """Rows lost here and there."""
+    """Drop some rows."""
     kept = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
     return {name: column[kept] for name, column in log.items()}
 
 
 def scatter(log, std, seed=1, samples=False):
-    """Stamps that scatter, and samples where they do."""
+    """Scatter the stamps, and sample at the scattered times."""
     late = np.clip(std * np.random.default_rng(seed).standard_normal(len(log["t"])), -4e-4, 4e-4)
     times = log["t"] + late
     if samples:
@@ -123,7 +123,7 @@ def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
     assert all(run.force_command is None for run in found.runs)
     found = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
     assert "force_command: ignored, since it is 0 N in every contact" in "\n".join(found.notes)
-    # The measured force is then held against the momentum of the positions.
+    # The measured force is then compared with the momentum of the positions.
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
 
@@ -213,7 +213,7 @@ def test_campaign_of_several_files_names_the_wrong_one(tmp_path):
 
 
 def test_note_on_several_logs_is_given_once(tmp_path):
-    log = LOG | {"vd": 0.0 * LOG["vd"]}  # as loggers write a channel that is not connected
+    log = LOG | {"vd": 0.0 * LOG["vd"]}  # loggers write a channel like this if it is not connected
     paths = [write_csv(tmp_path / f"{name}.csv", log) for name in "abc"]
     (note,) = read_campaign(paths, mapping()).notes
     assert note.startswith(f"{paths[0]} and 2 more: velocity_desired: ignored")

@@ -24,7 +24,7 @@ ONE_AXIS = [(name, law) for law in COMPENSATORS for name in ("varying", "suite-r
 
 
 def calls(function, *arguments):
-    """Names of all that a program, lowered for CUDA, calls outside of it."""
+    """Return the names of all external functions that a program calls when lowered for CUDA."""
     lowered = export.export(jax.jit(function), platforms=["cuda"])(*arguments)
     assert lowered.platforms == ("cuda",)
     assert not lowered.ordered_effects and not lowered.unordered_effects
@@ -44,13 +44,13 @@ def case(name, compensator):
 
 
 def batch(name, compensator):
-    """What a batch on all devices calls."""
+    """Return the external calls of a batch on all devices."""
     model, loop, gains, scenarios = case(name, compensator)
     return calls(lambda *parts: run_tiles((model, loop), *parts), *model.shard(scenarios, gains))
 
 
 def jacobian(name, compensator):
-    """What the derivatives of a tuning's errors by all gains call."""
+    """Return the external calls of the derivatives of tuning errors by all gains."""
     model, loop, gains, scenarios = case(name, compensator)
 
     def errors(values, scenarios):

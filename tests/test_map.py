@@ -18,7 +18,7 @@ from tuning.reporting import map_grid
 from tuning.reporting.closed_forms import characteristic_root, critical_delay, series
 from tuning.reporting.contact_growth import LINEAR_COMPENSATORS, growth
 
-SOFT = {  # one contact that lasts for about 4.8 s, all but uniform on the scale of what else moves
+SOFT = {  # one contact of about 4.8 s; the other motions are almost uniform on this scale
     "approach.contacts": 1, "contact.stiffness": [150.0], "contact.damping": [0.4], "uncertainty": {},
 }  # fmt: skip
 IDEAL = {
@@ -41,7 +41,7 @@ RIGS = {
 
 
 def simulated_growth(run, period):
-    """ln|z|/T of the slowest mode z^n of x_d while it is in contact, after all faster ones have died out."""
+    """Return ln|z|/T of the slowest mode z^n of x_d in contact, after all faster modes have died out."""
     position = run.position_desired
     begin, step = round(1.5 / period), round(0.7 / period)
     end = np.flatnonzero(position > 0)[-1] - round(0.2 / period)
@@ -74,7 +74,7 @@ def test_map_derivatives_by_gains_are_finite_differences():
         for side in (-2, -1, 1, 2):
             moved = growth(mechanism, "phase_lead", gains | {name: value + side * step}, scenarios)
             at[side] = moved.spectral_radius
-        # Of the fourth order in the step: a smaller one would leave no digits of an eigenvalue.
+        # The error is of fourth order in the step; a smaller step would leave no digits of an eigenvalue.
         difference = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * step)
         assert slopes[name] == pytest.approx(difference, rel=1e-5)
 
@@ -91,14 +91,14 @@ def test_growth_agrees_with_closed_forms():
     mass, stiffness, damping = 350.0, 1.2e5, np.array([100.0, 3000.0])
     delay = critical_delay(mass, stiffness, damping)
     for b, tau in zip(damping, delay, strict=True):
-        # At the limit something on the imaginary axis solves M s^2 + (b s + k) e^(-s tau) = 0.
+        # At the limit M s^2 + (b s + k) e^(-s tau) = 0 has a root on the imaginary axis.
         frequencies = np.geomspace(1, 1e3, 200_001)
         left = -mass * frequencies**2 + (1j * b * frequencies + stiffness) * np.exp(-1j * frequencies * tau)
         assert np.min(np.abs(left)) < 1e-4 * stiffness
 
 
 def solved_root(phase):
-    """Newton's root of s^2 + e^(-s phase) = 0 near j."""
+    """Return Newton's root of s^2 + e^(-s phase) = 0 near j."""
     root = 1j
     for _ in range(50):
         grown = cmath.exp(-root * phase)
@@ -126,7 +126,7 @@ def test_map_of_an_uncompensated_contact_is_that_of_theory(ideal):
 
 
 def growing(found, restitution):
-    """The spectral radius of a contact that grows over half an oscillation as the restitution says."""
+    """Return the spectral radius of a contact that grows over half an oscillation as its restitution says."""
     stiffness, delay = np.meshgrid(found.x, found.y)
     frequency = np.sqrt(stiffness / 350.0)
     roots = np.vectorize(solved_root)(frequency * delay)
@@ -204,7 +204,7 @@ def test_map_of_100_by_100_points_takes_at_most_20_s(compensator):
         tuning.map("varying", *axes, compensator)
         took, spent = time.monotonic() - begun, time.process_time() - before
     print(f"\n{compensator}: 100 x 100 points, warm: {took:.1f} s, {spent:.1f} s of all cores' time")
-    # Of two cores, however busy others keep them.
+    # CPU time of two cores, whatever else runs on them.
     assert spent < 2 * 20
 
 

@@ -196,7 +196,7 @@ def test_every_key_has_a_meaning_and_every_number_a_unit():
                 yield from keys(field.type, f"{path}{field.name}.")
 
     def texts(kind):
-        """Meanings and units anywhere in a type."""
+        """Yield meanings and units anywhere in a type."""
         if isinstance(kind, UnionType):
             return [text for member in kind.types for text in texts(member)]
         if not isinstance(kind, Metadata):

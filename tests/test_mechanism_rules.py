@@ -131,7 +131,7 @@ def test_mechanism_with_other_law_or_model_survives_round_trip(changes):
     [
         ({**IDEAL, "contact.damping": 0.0}, 0.0),
         (FIRST_ORDER, 0.01),
-        # Drawn down to 10 Hz.
+        # The draws go down to 10 Hz.
         ({}, 2 * 0.8 / (2 * math.pi * 10.0)),
         (THIRD_ORDER, 0.1),
         (
@@ -197,7 +197,7 @@ def test_start_is_clear_of_the_contact_surface(side):
     ],
 )
 def test_transfer_function_is_accepted_or_refused_by_key(numerator, denominator, key):
-    # One-sided: a gap would have to be wider than the lag of some of these.
+    # A gap would have to be wider than the lag of some of these, so the contact is one-sided.
     changes = {**TRANSFER_FUNCTION, "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}
     raw = changed(changes)
@@ -218,7 +218,7 @@ def test_hurwitz_criterion_agrees_with_roots(pairs, reals):
     roots = [*pairs, *np.conj(pairs), *reals]
     rightmost = max((root.real for root in map(complex, roots)), default=-1.0)
     polynomial = np.real(np.poly(roots)) if roots else np.ones(1)
-    # Rounding of the coefficients moves roots next to the axis over it.
+    # Rounding of the coefficients moves roots that are next to the axis across it.
     if abs(rightmost) > 1e-2:
         assert is_hurwitz(polynomial.tolist()) == (rightmost < 0.0)
         assert is_hurwitz((-polynomial).tolist()) == (rightmost < 0.0)

@@ -64,7 +64,7 @@ def test_new_mechanism_file_has_every_key_at_its_default(written):
             shown[path + found[2]] = (found[1], value.get("value"))
     assert set(shown) == {name for name in defaults if '"' not in name}
     assert all(value == defaults[name] for name, (sign, value) in shown.items() if sign)
-    # As the file is read with none of the signs, where the law uses the keys.
+    # Compare with the file without comment signs, where the law uses the keys.
     of_laws = {key.name for table in tables() for key in table.keys if key.users}
     live = re.sub(
         r"^#(\w+)( = )", lambda line: line[0] if line[1] in of_laws else line[1] + line[2], text, flags=re.M
@@ -82,7 +82,7 @@ def test_new_mechanism_file_explains_itself():
 def test_every_key_has_a_description():
     keys = {f"{table.path}.{key.name}": key for table in tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
-    others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # whole ones, and of keys
+    others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # integer keys
     assert numbers - others == set(numeric_keys())
     assert all(keys[path].unit == numeric_keys()[path].unit for path in numbers - others)
     assert keys["approach.contacts"].allowed == f"an integer from 1 to {MAX_CONTACTS}"

@@ -27,13 +27,13 @@ BEFORE, AFTER = 5, 40  # ticks without force
 
 @partial(jax.jit, compiler_options=QUICK)
 def excess(commands, touching):
-    """Excess variation [N] of commands (ticks,), while the mechanism touches or not."""
+    """Return the excess variation [N] of commands (ticks,), while the mechanism touches or not."""
     rules = build_rules(SCENARIO)
     zeros = jnp.zeros(1)
 
     def tick(watch, now):
         command, touches = now
-        # It turns round at once, so that what ends the contact is the quiet after it.
+        # The model turns round at once, so that the quiet after it ends the contact.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None, None)
         return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None
@@ -45,7 +45,7 @@ def excess(commands, touching):
 
 
 def recorded(commands, after=()):
-    """Excess variation of a contact with these commands; `after` it is over, others."""
+    """Return the excess variation of a contact with these commands; others come `after` it has ended."""
     quiet = np.zeros(AFTER)
     late = AFTER - len(after)
     quiet[late:] = after
@@ -63,13 +63,13 @@ HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
     [
         (HUMP, 0),
         (-HUMP, 0),
-        # An undershoot belongs to the swing, wherever it is.
+        # An undershoot is part of the swing, wherever it is.
         (np.concatenate([HUMP, -0.2 * HUMP]), 0),
         (np.concatenate([-0.2 * HUMP, HUMP]), 0),
-        # A second hump, a third: a swing each.
+        # A second hump and a third add a swing each.
         (np.concatenate([HUMP, HUMP]), 60),
         (np.concatenate([HUMP, 0.25 * HUMP, HUMP]), 75),
-        # A spike of ten peaks on the way up is a swing to the peak: the hump is one too many.
+        # A spike of ten peaks on the way up is itself a swing to the peak: the hump is one too many.
         (np.concatenate([[600], HUMP]), 60),
         (np.concatenate([[600, -200], HUMP]), 60),
         # Ripple of 2 N on a plateau of 60: 20 times up, of which one belongs to the swing.
@@ -113,7 +113,7 @@ def test_excess_variation_derivatives_are_those_of_the_sum():
 
     up, down = (float(excess(commands + step * way, touching)) for step in (1e-6, -1e-6))
     assert float(slope(commands)) == pytest.approx((up - down) / 2e-6, rel=1e-7)
-    # Where nothing moves, neither way is preferred.
+    # If nothing moves, neither direction is preferred.
     assert np.isfinite(slope(np.where(touching, 60.0, 0.0)))
 
 

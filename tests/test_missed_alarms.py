@@ -15,7 +15,7 @@ from tuning.watchdog.fault_runs import BAND, FAULTS, MOST, scenarios_needed
 from tuning.watchdog.verdict import ALLOWED, judged
 
 LIMIT, NUMBER = 0.02, 64
-# An undelayed, undamped contact: whatever goes wrong is what was injected.
+# Undelayed, undamped contact: any error comes from the injected fault.
 EXACT = (
     'rig.simulator={model = "ideal"}',
     "rig.force_sensor.delay=0",
@@ -53,12 +53,12 @@ def test_injected_delay_is_that_of_theory(rates):
         one = fault(rates, name)
         assert one["runs"] == one["scenarios"] == NUMBER and one["counted"] and one["unit"] == "s"
         assert LIMIT < one["error"] <= BAND * LIMIT
-        # Of the median run; stiffness is spread evenly about the nominal one.
+        # Use the median run; stiffness is spread evenly about the nominal value.
         assert one["size"] == pytest.approx(2 / (math.pi * omega) * math.log1p(one["error"]), rel=0.05)
 
 
 def test_fault_without_effect_is_not_counted(rates):
-    # Without a compensator nobody reads the position; there are no gains to take away.
+    # Without a compensator the position is not read, and there are no gains to remove.
     one = fault(rates, "position_delay")
     assert one["runs"] == 0 and not one["counted"] and one["size"] is None
     assert {one["name"] for one in rates["fault_runs"]} == {
@@ -72,7 +72,7 @@ def test_fault_without_effect_is_not_counted(rates):
 def test_watchdog_that_sees_every_error_misses_none(rates):
     for name in ("force_delay", "simulator_delay"):
         assert fault(rates, name)["alarms"] == 0 and fault(rates, name)["high"] < 0.06
-    assert rates["missed_alarms"]["runs"] == 0  # no draw is bad: nothing could be counted on draws
+    assert rates["missed_alarms"]["runs"] == 0  # no draw is bad, so that nothing could be counted on draws
 
 
 def test_watchdog_without_a_margin_misses_every_fault():
@@ -86,7 +86,7 @@ def test_watchdog_without_a_margin_misses_every_fault():
 
 def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
     found = calibrated("phase_lead")
-    # Nothing is late here: the literature's lead is 0 already, and there is nothing to take away.
+    # Nothing is late here: the literature's lead is already 0, and there is nothing to remove.
     assert [one["name"] for one in found["fault_runs"]] == [one.name for one in FAULTS if one.name != "gains"]
     assert fault(found, "force_delay")["runs"] == NUMBER
 
@@ -119,7 +119,7 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
     if verdict == "unknown":
         tells = "about 190 such runs tell, there are 182" if counted else "a sweep of at least "
         assert tells in found["unknown"][0]
-    # Drawn runs of which too many are missed are bad, whatever the injected ones say.
+    # If too many drawn runs are missed, the result is bad, whatever the injected runs give.
     missed = judged({**rates, "missed_alarms": rate(50, 100)}, ALLOWED, 2048)
     assert missed["verdict"] == "bad"
 

@@ -24,7 +24,7 @@ STATED = {
 
 
 def file_of(kind, stated=None):
-    """A mechanism file that knows the rig of that kind."""
+    """Write a mechanism file that knows the rig of that kind."""
     bodies = {"equivalent_mass": kind.mass}
     document = {"schema": "jaxhil/mechanism/1", "name": "known", "bodies": bodies, "rig": kind.rig}
     document |= {"approach": {"velocity": 0.006}, "contact": kind.contact}
@@ -32,7 +32,7 @@ def file_of(kind, stated=None):
 
 
 def quiet(kind):
-    """Without noise and quanta."""
+    """Return the rig without noise and quantisation."""
     sensors = ("force_sensor", "position_sensor")
     kept = {
         one: {k: v for k, v in kind.rig[one].items() if k not in ("noise_std", "quantum")} for one in sensors
@@ -52,7 +52,7 @@ def contacts(kind, seed=0, speeds=SPEEDS, name="monitored"):
 
 
 def changed(kind, **sections):
-    """The kind with other numbers in some tables of its rig."""
+    """Return the kind with other numbers in some tables of its rig."""
     return replace(kind, rig=kind.rig | {one: kind.rig[one] | table for one, table in sections.items()})
 
 
@@ -85,7 +85,7 @@ def test_monitor_of_a_matching_rig_scatters_as_predicted():
 
 
 CHANGES = {
-    # what is changed; the figure that tells, by how much, and within what
+    # changed value; the metric that shows it, by how much, and its tolerance
     "stiffness": (replace(CLEAN, contact=campaign_kinds.voigt((1.236e5,))), "stiffness", 0.03, 0.003),
     "delay": (changed(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
     "motion": (changed(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),
@@ -146,7 +146,7 @@ def test_monitor_correlates_numbers_as_the_file_says():
 
 
 def written(folder, campaign):
-    """The contacts as `simulate --log` writes them, a file each."""
+    """Write the contacts as `simulate --log` does, a file each."""
     folder.mkdir()
     columns = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     for number, run in enumerate(campaign.runs):

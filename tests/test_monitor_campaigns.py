@@ -23,7 +23,7 @@ CLEAN = campaigns.KINDS["clean"]
 
 @pytest.fixture(scope="module")
 def files():
-    """Of the same rig, each identified from a day of its own."""
+    """Return files of the same rig, each identified from a different day."""
     found = []
     for seed in range(FILES):
         day = campaigns.campaign("clean", 60_000 + seed)
@@ -37,7 +37,7 @@ def contacts(name, seed, speeds):
 
 
 def delayed(seed, speeds, growth):
-    """Contacts in the course of which the force delay grows [s]."""
+    """Return contacts during which the force delay grows [s]."""
     runs = []
     for i, speed in enumerate(speeds):
         delay = CLEAN.rig["force_sensor"]["delay"] + growth * i / (len(speeds) - 1)
@@ -79,5 +79,5 @@ def test_monitor_finds_drifts_early(files, number):
         print(f"{number} contacts: {name} when it was found: {np.round(reached, 2)}")
     assert np.median(found["stiffness [%]"]) < 3.0
     if number > 15:
-        # The first five of the fifteen are too slow to tell a delay.
+        # The first five of the fifteen are too slow to show a delay.
         assert np.max(found["stiffness [%]"]) < 3.0 and np.max(found["force delay [ms]"]) < 0.3

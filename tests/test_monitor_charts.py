@@ -6,13 +6,13 @@ import pytest
 from tuning.identification.monitor.charts import CONTACTS, LIMIT, WINDOW, changes
 from tuning.identification.monitor.figures import NAMES
 
-CUSUM_LIMIT, AVERAGE_LIMIT = 9.0, 4.07  # with 0.5 allowed and weight 0.2: together as rare as `LIMIT`
+CUSUM_LIMIT, AVERAGE_LIMIT = 9.0, 4.07  # with 0.5 allowed and weight 0.2; together as rare as `LIMIT`
 
 
 def test_change_point_agrees_with_calculation_by_hand():
     z = np.array([[0.0, 1.0], [0.0, np.nan], [2.0, 1.0], [2.0, np.nan]])
     likelier, since = changes(z)
-    # (2 + 2)^2 / 2 and (1 + 1)^2 / 2, which not knowing changes nothing of.
+    # (2 + 2)^2 / 2 and (1 + 1)^2 / 2: the unknown change point does not alter these.
     np.testing.assert_allclose(likelier, [8.0, 2.0])
     assert since.tolist() == [2, 0]
     long = np.zeros((WINDOW + 50, 1))
@@ -22,7 +22,7 @@ def test_change_point_agrees_with_calculation_by_hand():
 
 
 def alarms(mean, lanes, contacts, rng):
-    """Contacts to the first alarm of one figure in each lane, by the likelihood ratio and by both charts."""
+    """Return each lane's contact of the first alarm of one metric, by likelihood ratio and by both charts."""
     sums, up, down, average = np.zeros((WINDOW, lanes)), *np.zeros((3, lanes))
     first = np.full((2, lanes), contacts)
     for i in range(contacts):
@@ -55,7 +55,7 @@ def test_first_alarm_is_that_of_the_charts():
 
 
 class Silent:
-    """A generator of noise that there is none of."""
+    """Noise generator that returns zeros."""
 
     def standard_normal(self, lanes):
         return np.zeros(lanes)

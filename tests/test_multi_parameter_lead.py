@@ -35,7 +35,7 @@ def test_placed_pole_is_a_root_of_the_characteristic_equation(frequency, delay, 
     value = root**2 + frequency**2 * (gain + rate * root) * shift
     size = frequency**2 * (abs(gain) + abs(rate * root)) * abs(shift) + abs(root) ** 2
     assert abs(value) < 1e-9 * size
-    # Nor is it a root for any other gains: the equation is linear in the two.
+    # It is no root for any other gains either: the equation is linear in both gains.
     assert abs(value + frequency**2 * 1e-3 * shift) > 1e-4 * frequency**2 * abs(shift)
 
 
@@ -53,7 +53,7 @@ def test_pole_placement_refuses_what_has_no_pole(bad):
 
 
 def placed(phases):
-    """Gains for every desired restitution at each omega tau, one lane each; and those omega tau."""
+    """Return gains for every desired restitution at each omega tau, one lane each, and those omega tau."""
     phase, desired = grid(phases, DESIRED)
     gain, rate = np.transpose(
         [pole_placement(OMEGA, p / OMEGA, e) for p, e in zip(phase, desired, strict=True)]
@@ -78,10 +78,10 @@ def test_contact_has_the_desired_restitution():
     scenario = spread(parsed, len(lane), phase=start, control_period=period, force_sensor__delay=delay)
     restitution = first_contact(parsed, scenario, "multi_parameter_lead", gains)["restitution"]
     coarse, fine = restitution.reshape(2, len(phases), len(DESIRED), len(PHASES)).mean(axis=-1)
-    # Onset and end of the contact are no oscillation: that leaves an error of third order in omega tau.
+    # Onset and end of the contact are no oscillation: they leave an error of third order in omega tau.
     error = np.abs(2 * fine - coarse - DESIRED)
     assert np.all(error < 0.1 * phases[:, None] ** 3)
-    # Far below what is to be made up for: without compensation e is about exp(pi omega tau/2).
+    # The error is far below the uncompensated one, where e is about exp(pi omega tau/2).
     assert np.all(error < 0.01 * (np.exp(pi * phases / 2) - 1)[:, None])
 
 

@@ -16,7 +16,7 @@ from tuning.gains.validation import build_validation
 from tuning.gains.work import Work
 
 SCANNED = TuneSettings().scanned
-FEW = 32  # points of a scan whose result is not what is tested
+FEW = 32  # points of a scan whose result is not tested
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
         values = validation.losses(RMS, [index], points[None])[0]
         looked_at = spread_points(points[0], SCANNED, 3)
         every = validation.losses(RMS, [index], looked_at[None])[0]
-        # The best lies apart from the literature's gains, as all of them do from each other.
+        # The best gains lie apart from the literature's, and so do those of all tasks from each other.
         assert np.min(every) <= values[1] <= np.quantile(every, 0.05)
         assert (values[1:] < np.median(every)).all()
         assert (np.diff(values[1:]) >= 0).all()
@@ -125,7 +125,7 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
     assert all(0 <= share <= 1 for share in shares) and shares[-1] == 1
     points = np.stack([start.coordinates for start in found[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
-    # Steps of 1 + 2 evaluations, the scan at full cost on no more than 32 scenarios, the polish of 2 gains.
+    # Steps cost 1 + 2 evaluations; the scan runs at full cost on at most 32 scenarios; 2 gains are polished.
     assert found[0].evaluations == FEW + 3 * 3 + 32
     assert found[1].evaluations == BATCHES * (FEW + 3 * 3) + 32
 
@@ -172,7 +172,7 @@ def test_failed_task_leaves_the_others_their_best_gains(tasks, validation):
 
 
 class Kinked:
-    """A task whose objective has a kink that leads along an edge, in the place of a validation's."""
+    """Task whose objective has a kink along an edge; it replaces that of a validation."""
 
     def losses(self, objective, which, points):
         x, y = points[..., 0], points[..., 1]

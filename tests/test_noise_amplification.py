@@ -28,7 +28,7 @@ def _amplified(compensator, gains, period):
 
 
 def amplified(compensator, gains, period=1e-3):
-    """Amplification of noise, and its derivative by every gain."""
+    """Return the noise amplification and its derivative by every gain."""
     gains = {name: np.asarray(value, float) for name, value in gains.items()}
     return _amplified(compensator, gains, np.asarray(period))
 
@@ -58,7 +58,7 @@ LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 
 
 def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, **values):
-    """Gains of response_error; F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
+    """Return gains of response_error, and F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
     contact, sensor = {"damping": [damping]}, {"noise_std": DEVIATION}
     raw = mechanism(contact, period=1e-3, velocity=velocity, force_sensor=sensor)
     parsed = validated(raw | ({"bodies": bodies} if bodies else {}))
@@ -70,8 +70,10 @@ def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, 
 
 
 def steady_contact(**values):
-    """Gains; what F_c deviates from its straight line [N], (ticks, lanes): a heavy body that hardly moves,
-    seconds of contact under a force that rises slowly."""
+    """Return gains, and the deviation of F_c from its straight line [N], (ticks, lanes).
+
+    A heavy body hardly moves during seconds of contact under a slowly rising force.
+    """
     gains, command, force = noisy_contact(1e-3, bodies={"equivalent_mass": 1e9}, **values)
     assert force[500:].min() > 3 * DEVIATION
     command, time = command[500:], np.arange(TICKS - 500)
@@ -87,7 +89,7 @@ def test_noise_amplification_is_that_of_the_loop_in_steady_contact():
     # 40000 samples, neighbours of which are anticorrelated.
     np.testing.assert_allclose(np.std(lead) / DEVIATION, expected, rtol=0.005)
     np.testing.assert_allclose(np.std(whole) / DEVIATION, expected, rtol=0.01)
-    # The noise is the same: identification adds a tenth, independently, which is half a percent in all.
+    # The noise is the same; identification independently adds a tenth, which is half a percent in all.
     assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
 
 
@@ -105,7 +107,7 @@ def test_noise_amplification_rises_early_in_contact_by_identification():
         expected = amplified("response_error", gains)[0] * DEVIATION
         return gains, np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
 
-    # By tenths of the contact.
+    # tenths of the contact
     np.testing.assert_allclose(noise(**LEAD_ALONE)[1], 1, atol=0.1)
     gains, own = noise()
     covariance = gains["stiffness_covariance"]

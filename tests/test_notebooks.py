@@ -18,7 +18,7 @@ LARGEST = 500_000  # bytes
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\btune\(")
 IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
-# Beside the front door: the rig's controller, and intervals of many sweeps at once.
+# Besides the public interface: the rig's controller, and intervals of many sweeps at once.
 ALSO_PUBLIC = {"jaxhil.rig", "tuning.statistics.intervals"}
 MACHINE_PATH = re.compile(r"(?:/(?:home|root|tmp|work|Users|usr|opt)/|[A-Z]:\\\\)[\w.-]")
 
@@ -32,7 +32,7 @@ def test_notebooks_exist():
     assert NOTEBOOKS
 
 
-# Event loop and messaging of the notebook client are not ours to warn about.
+# Ignore warnings of the notebook client's event loop and messaging.
 @pytest.mark.filterwarnings("default")
 @pytest.mark.slow
 def test_notebook_runs_every_cell(path, tmp_path, monkeypatch):
@@ -43,7 +43,7 @@ def test_notebook_runs_every_cell(path, tmp_path, monkeypatch):
     client = NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
     )
-    client.execute()  # raises at the first cell that does
+    client.execute()  # raises at the first cell that fails
     complaints = [
         output.text
         for cell in notebook.cells
@@ -59,14 +59,14 @@ def test_notebook_runs_every_cell(path, tmp_path, monkeypatch):
         words, numbers = _printed(before)
         new_words, new_numbers = _printed(after)
         assert new_words == words, "execute it again"
-        # What a solver ends with depends on the last bits, and all that follows from it; what is simulated
-        # does not.
+        # The result of a solver depends on the last bits, and so does all that follows; simulated numbers
+        # do not.
         solved = solved or SOLVER.search(before.source) is not None
         assert solved or new_numbers == pytest.approx(numbers, rel=2e-3), "execute it again"
 
 
 def _printed(cell) -> tuple[list[str], list[float]]:
-    """What a cell printed: the words and, apart from them, the numbers."""
+    """Split the printed output of a cell into its words and its numbers."""
     text = "".join(output.text for output in cell.outputs if output.output_type == "stream")
     return NUMBER.sub("#", text).split(), [float(number) for number in NUMBER.findall(text)]
 

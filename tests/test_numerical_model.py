@@ -56,7 +56,7 @@ def quaternion(rotations):
 
 
 def lanes(values, number=LANES):
-    """The same in every lane."""
+    """Repeat the values in every lane."""
     values = np.asarray(values, float)
     return jnp.asarray(np.broadcast_to(values[..., None], (*values.shape, number)))
 
@@ -133,7 +133,7 @@ def run():
 
 
 def at_the_same_time(series):
-    """Of the tops, (components, lanes), after 250 of the longest periods."""
+    """Return the tops' states (components, lanes) after 250 of the longest periods."""
     return np.stack([series[250 * 2**lane, :, lane] for lane in range(3)], axis=-1)
 
 
@@ -147,7 +147,7 @@ def test_free_top_follows_jacobis_solution_to_second_order(run):
     errors = np.linalg.norm(found - np.array([[first * dn], [-second * sn], [third * cn]]), axis=0)
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.02)
     assert errors[-1] < 1e-6
-    # Carried as it is: to the bit.
+    # It is passed on unchanged, to the bit.
     np.testing.assert_array_equal(run["spin"][:, :, TOPS], run["spin"][:1, :, TOPS] + np.zeros((STEPS, 1, 1)))
     energy = run["energy"][:, 2]
     assert np.max(np.abs(energy / energy[0] - 1)) < 1e-6
@@ -247,6 +247,6 @@ def test_wrench_accelerates_the_relative_mass():
             np.testing.assert_allclose(along @ gained, 1 / effective, rtol=1e-7)
         mobility = np.linalg.inv(mass)
         np.testing.assert_allclose(along @ mobility @ along, 1 / effective, rtol=1e-9)
-        # With its tangential motion held, a contact meets more.
+        # If its tangential motion is held, a contact meets more mass.
         held = np.linalg.inv(at_point @ mobility @ at_point.T)
         assert normal[:, lane] @ held @ normal[:, lane] > 1.001 * effective

@@ -38,7 +38,7 @@ NAMES = ("phase_lead", "lead_filter")
 GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
 SCENARIOS = 6
 SLOTS = 144
-SHORT = 2  # the scenario whose time is too short for its contacts
+SHORT = 2  # the scenario with too little time for its contacts
 STATED = Objective("rms", 2.0, 0.3, 0.004, 0.05, limit=1.0)
 
 
@@ -47,7 +47,7 @@ def of_name(name):
 
 
 def build_batch(overrides=()):
-    """(loop, scenarios, rigs): the scenario `SHORT` fails under all gains."""
+    """Return (loop, scenarios, rigs); the scenario `SHORT` fails under all gains."""
     parsed = load("varying", overrides).mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
@@ -65,7 +65,7 @@ def batch():
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def with_jacobian(static, gains, problems):
-    """Residuals (problems, residuals); by every gain of every problem, (gain's problem, gain, ...)."""
+    """Return residuals (problems, residuals) and derivatives by all gains (gain's problem, gain, ...)."""
 
     def along(direction):
         return jax.jvp(lambda gains: residuals(static, gains, problems), (gains,), (direction,))
@@ -84,7 +84,7 @@ def run(batch, gains=GAINS, objective=STATED):
 
 
 def stacked(objectives):
-    """Weights of problems."""
+    """Stack the weights of problems."""
     return Weights(
         *(jnp.asarray(column) for column in zip(*(one.weights for one in objectives), strict=True))
     )
@@ -185,7 +185,7 @@ def test_errors_within_the_tolerance_hardly_count(tolerance):
     expected = np.sqrt(counted**2 + (0.01 * 0.2 * 0.4) ** 2 + (0.01 * 0.1 * 2.0) ** 2)
     assert objective_value(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
     assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
-    # Its derivative along the errors themselves, at which the size grows in proportion.
+    # Along the errors themselves the derivative is the size, which grows in proportion.
     _, slopes = alone(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
     values, _ = alone(objective, errors, excesses, 3.0)
     grown = counted if counted <= TOLERATED * size or tolerance == 0 else size
@@ -215,7 +215,7 @@ def test_common_terms_are_those_that_any_objective_has():
 
 
 def against_differences(batch, jacobian):
-    """Derivatives (problem, gain, residual), which are compared with central differences."""
+    """Compare derivatives (problem, gain, residual) with central differences."""
     own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
     for gain in range(len(NAMES)):
         step = 1e-6 * GAINS[:, gain]
@@ -272,7 +272,7 @@ def test_failed_contacts_count_and_have_no_derivative(batch, known):
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def weighed(static, weights, terms, tangents):
-    """Residuals of one problem's (errors, excesses, chatter, wanted, amplification), and their derivative."""
+    """Return one problem's residuals and derivative; (errors, excesses, chatter, wanted, amplification)."""
     *contacts, wanted, noise = terms
 
     def value(error, excess, chatter, noise):
@@ -287,7 +287,7 @@ def padded(contacts):
 
 
 def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (), (), 0.0)):
-    """Residuals of one problem with these contacts, in more slots than were asked for; their derivative."""
+    """Return one problem's residuals with these contacts, in more slots than needed, with derivative."""
     wanted = np.arange(SLOTS) < len(errors)
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
@@ -305,7 +305,7 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
     errors[::2] *= -1
     expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
     assert objective_value(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
-    # What the solver sees is an upper bound: the root of the mean of powers.
+    # The solver sees an upper bound: the root of the mean of powers.
     bound = (np.sum(np.abs(errors) ** POWERS["cvar"]) / tail) ** (1 / POWERS["cvar"])
     np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), bound**2, rtol=1e-13)
     assert expected <= bound
@@ -327,7 +327,7 @@ def test_known_errors_have_known_metrics():
         replace(stated, chatter_weight=0.02), errors, excesses, 4.0, np.array([3.0, 1.0])
     )
     assert swings == pytest.approx(np.sqrt(whole**2 + 0.02**2 * 5), rel=1e-14)
-    # A command quieter than the measured force earns nothing.
+    # A command quieter than the measured force gains nothing.
     assert objective_value(stated, errors, None, 0.5) == 0.04
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
 
@@ -337,7 +337,7 @@ def test_high_norm_approximates_the_worst_error():
     norm = np.sum(np.abs(errors) ** POWERS["worst"]) ** (1 / POWERS["worst"])
     assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
     np.testing.assert_allclose(sum_of_squares(Objective("worst"), errors), norm**2, rtol=1e-13)
-    # Neither wild errors nor tiny ones leave the range of numbers.
+    # Neither very large errors nor tiny ones overflow or underflow.
     for size in (1e100, 1e-100):
         value = SCALE * alone(Objective("worst"), size * errors)[0]
         np.testing.assert_allclose(np.sqrt(np.sum((value / size) ** 2)), norm, rtol=1e-13)

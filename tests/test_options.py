@@ -28,7 +28,7 @@ COMMANDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ToyOptions(TuneOptions):
-    """Options with one more, which is stated here and nowhere else."""
+    """Options with one additional option, which is stated here and nowhere else."""
 
     toys: Annotated[int, number("Toys to play with."), Allowed(1, 3)] = 2
 
@@ -62,7 +62,7 @@ def test_toy_option_is_stated_once():
 def test_functions_and_commands_have_the_same_options_and_defaults(function):
     command = {field.name: field for field in dataclasses.fields(COMMANDS[function])}
     parameters = inspect.signature(function).parameters
-    # The command line reads these otherwise: as files, or as words.
+    # The command line reads these differently: as files, or as words.
     read = {"formats", "limits", "gains"} | ({"compensator"} if function is tuning.map else set())
     shared = [name for name in parameters if name in command and name not in read]
     assert len(shared) >= 3

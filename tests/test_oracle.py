@@ -50,7 +50,7 @@ def linear(omega):
 
 
 def delayed_restitution(phase):
-    """e of x'' = -x(t - phase), phase = omega tau (T -> 0, pure force delay), by its series."""
+    """Return e of x'' = -x(t - phase) by its series; phase = omega tau (T -> 0, pure force delay)."""
 
     def series(t, derivative):
         terms = range(int(t / phase) + 1)
@@ -92,7 +92,7 @@ def test_oracle_agrees_with_damped_separation_without_delay(tension):
     }
     values = np.array([simulate(mechanism(T, contact=law))[0]["restitution"] for T in (1e-3, 5e-4, 2.5e-4)])
     assert abs(values[-1] - expected) < 5e-4
-    # First order in T: the onset of a damped contact jumps between two ticks.
+    # The error is of first order in T: the onset of a damped contact jumps between two ticks.
     assert abs(2 * values[-1] - values[-2] - expected) < 1e-4
 
 
@@ -178,7 +178,7 @@ def test_oracle_starts_in_the_steady_state_of_the_held_history(simulator, hold):
     assert matrices is not None
     A, B, C = matrices
     assert float(-C @ np.linalg.solve(A, B)) == pytest.approx(1.0, abs=1e-12)
-    # Its value by brute force: a long staircase (or ramp) from rest through the same system.
+    # Compute its value by brute force: a long staircase (or ramp) from rest through the same system.
     T, delay, z = 1e-3, simulator["delay"], np.zeros(len(B))
     ticks = np.arange(-2000, 1)
     steps = np.append((ticks * T + delay)[ticks * T + delay < 0.0], 0.0)
@@ -291,7 +291,7 @@ def test_rattling_contact_uses_successive_laws_on_both_sides():
             force_delay=0.001,
             approach={"velocity": result["approach_velocity"]},
         )
-        # Another contact phase, otherwise the same contact.
+        # Another contact phase of otherwise the same contact.
         assert result["restitution"] == pytest.approx(simulate(alone)[0]["restitution"], abs=4e-3)
     speeds = [r["restitution"] * r["approach_velocity"] for r in results]
     assert [r["approach_velocity"] for r in results[1:]] == pytest.approx(speeds[:-1], rel=1e-12)

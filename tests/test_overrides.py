@@ -81,7 +81,7 @@ def test_override_of_a_model_accepts_its_keys_and_no_others():
     simulator = mechanism.rig.simulator
     assert (simulator.model, simulator.time_constant, simulator.delay) == ("first_order", 0.01, 0.001)
     assert simulator.natural_frequency is None
-    # What is no longer there is not uncertain either.
+    # A removed key is not uncertain either.
     assert set(load("varying").mechanism.uncertainty) - set(mechanism.uncertainty) == {SECOND_ORDER[0]}
     ideal = load("varying", ["rig.simulator.model=ideal"], SECOND_ORDER).mechanism
     changes = {"rig.simulator.model": "ideal", **dict.fromkeys(SECOND_ORDER)}

@@ -24,7 +24,7 @@ def thesis(tmp_path):
 
 @pytest.fixture
 def untouched(thesis):
-    """Everything below the folder is as it was in the end."""
+    """Check that everything below the folder is unchanged at the end."""
 
     def everything():
         files = sorted(thesis.rglob("*"))
@@ -93,7 +93,7 @@ def named(path, name):
     return path
 
 
-RESULTS = {  # of mechanism "a b": the command that would replace them, the document, its content
+RESULTS = {  # Mechanism "a b": the command that would replace files, the document, its content
     "tune": (("tune",), "a_b/gains.json", {"compensator": "none", "mechanism": {"name": "a b"}}),
     "map": (("map", "--x", "rig.force_sensor.delay", "--y", "contact.stiffness"), "map.json",
             {"theory": {}, "mechanism": "a b"}),

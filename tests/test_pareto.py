@@ -50,7 +50,7 @@ def results():
 
 @pytest.fixture(scope="module")
 def made(results):
-    """Fronts, and how many programs they took to solve."""
+    """Return fronts, and the number of programs needed to solve them."""
     program_cache._program.cache_clear()
     every = dict(fronts(results, POINTS))
     count = program_cache._program.cache_info().misses
@@ -63,7 +63,7 @@ def errors_of(loop, scenarios, gains):
     return outcome.error[outcome.wanted]
 
 
-# What a point is judged by
+# Evaluation of a point
 
 
 def test_pareto_weights_are_in_units_of_the_objective():
@@ -74,7 +74,7 @@ def test_pareto_weights_are_in_units_of_the_objective():
     assert 3.0 * weights[-1] == pytest.approx(heavy * 0.012)
     np.testing.assert_allclose(np.diff(np.log(weights[1:])), math.log(heavy / light) / 6, rtol=1e-12)
     assert ladder(2, 0.012, 3.0) == pytest.approx([0, heavy * 0.004])
-    # Next to no noise to begin with: still weights, and finite ones.
+    # With next to no noise to begin with, there are still weights, and finite ones.
     assert np.isfinite(ladder(8, 0.012, 0.0)).all()
 
 
@@ -151,7 +151,7 @@ def test_no_pareto_point_is_better_under_another_points_weight(results, made):
                 objective_value(objective, error, None, other.cost)
                 for error, other in zip(errors, every, strict=True)
             ]
-            # As exact as what a start tells of itself: its last step is not in its history.
+            # As exact as a start's own record: its last step is not in its history.
             assert objective_value(objective, own, None, point.cost) <= min(values) * (1 + 2e-4)
         weights = [point.weight for point in front.points]
         assert weights[0] == 0 and weights == sorted(weights) and len(weights) == POINTS
@@ -184,7 +184,7 @@ def test_result_of_a_start_is_distinguished_from_its_noise():
     (one,) = pareto_search._reached_noise(task, 0.003, [broken, start])
     assert one.excess == pytest.approx(excess) and one.error == pytest.approx(0.02, rel=1e-12)
     assert one.value(0.003) == pytest.approx(start.rms, rel=1e-12)
-    # Where nothing is usable there are the literature's gains.
+    # If no result is usable, the literature's gains remain.
     assert pareto_search._reached_noise(task, 0.003, [broken])[0].gains == task.literature
 
 

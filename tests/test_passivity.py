@@ -30,7 +30,7 @@ EPSILON = 2.0**-52
 
 
 def check(forces, velocities, period):
-    """The energy that the contact has taken, in exact arithmetic, is never below 0 but by rounding."""
+    """Check in exact arithmetic that the energy taken by the contact is below 0 by rounding alone."""
     law = ON_THE_RIG["passivity"]({}, period, math.inf)
     energy, moved, least, corrected = Fraction(0), Fraction(0), Fraction(0), 0
     for force, velocity in zip(forces, velocities, strict=True):
@@ -41,7 +41,7 @@ def check(forces, velocities, period):
         energy += taken
         moved += abs(taken)
         corrected += command != force
-        # The least of numbers has no relative precision.
+        # The smallest numbers have no relative precision.
         least += Fraction(5e-324) * (1 + abs(Fraction(force)) + abs(Fraction(velocity)))
         assert energy >= -moved * len(forces) * Fraction(2 * EPSILON) - 2 * least
     return corrected
@@ -70,7 +70,7 @@ def test_passivity_energy_of_hostile_readings_stays_positive(rows):
 def test_passivity_forgets_energy_that_overflows():
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(1e308, 0.0, 1e308, 0.0) == 1e308
-    # Nothing was taken in, so nothing is given back.
+    # No energy was taken, so none is returned.
     assert law.step(5.0, 0.0, -1.0, 0.0) == 0.0
 
 

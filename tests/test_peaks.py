@@ -6,13 +6,13 @@ import numpy as np
 
 from jaxhil.sixdof.peaks import higher, no_peak
 
-# Unequal steps [s]; every lane begins elsewhere in them.
+# Times with unequal steps [s]; every lane begins at another place in them.
 TIMES = np.cumsum(np.tile([0.02, 0.03, 0.05], 22))[:, None] + np.linspace(0, 0.02, 5)
 
 
 @jax.jit
 def largest(curve, times, anew):
-    """Of curves sampled at times, (samples, lanes)."""
+    """Return the largest values of curves sampled at times, (samples, lanes)."""
 
     def take(carry, given):
         peak, before = carry

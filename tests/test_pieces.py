@@ -27,7 +27,7 @@ def test_checkpoint_returns_every_bit():
     assert [struct.pack("d", one) for one in found] == [struct.pack("d", one) for one in NUMBERS]
     point = decode(encode(POINT), Point)
     assert type(point) is Point and point.curvature.tobytes() == POINT.curvature.tobytes()
-    # The order of what a table shows is the order in which it was found.
+    # A table shows its rows in the order in which they were found.
     assert list(point.gains) == ["z", "a"] and point.weight is None
     for array in (np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), np.empty((0, 2))):
         again = decode(encode(array), np.ndarray)
@@ -52,7 +52,7 @@ def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch)
     for changed in ({**inputs, "seed": 2}, {**inputs, "limit": 1.0}, {**inputs, "gains": POINT[:3]}):
         assert reader.read("one", changed, Point) is None
     assert reader.other == ["one"] * 3
-    # Another type than it was written with.
+    # Read with another type than it was written with.
     assert reader.read("one", inputs, int) is None
     for name in ("sources_sha256", "versions", "xla_flags"):
         with monkeypatch.context() as patched:
@@ -92,7 +92,7 @@ def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
     assert made == [0, 1]
     journal = run(stop=None)
     assert made == [0, 1, 2, 3]
-    # Not to resume: all is made again.
+    # Without resuming, all is computed again.
     run(stop=2, resume=False)
     assert made == [0, 1, 2, 3, 0, 1]
     (folder,) = tmp_path.iterdir()

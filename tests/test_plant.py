@@ -18,7 +18,7 @@ from jaxhil.simulation.scenario import build_scenarios
 from tuning.rig.plant import Plant
 from tuning.rig.propagation import split_delay
 
-# One of each kind of motion simulator, hold, law and fault of a sensor, and several contacts.
+# One of each motion simulator, hold, law and sensor fault, and several contacts.
 AGAINST_THE_ORACLE = (
     *("delays of whole periods", "delays that make a whole period together", "overdamped", "tension"),
     *("zoh hold and integrator", "transfer function with latency", "third order with latency"),
@@ -30,7 +30,7 @@ AGAINST_THE_ORACLE = (
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),
     *("contact plane deeper", "rattling, contact plane nearer", "elastoplastic, contact plane nearer"),
 )
-# Parabolas stand for the force that a lagging sensor follows.
+# The oracle uses parabolas for the force behind a lagging sensor.
 LAGGED = 1e-7
 
 
@@ -42,7 +42,7 @@ def test_plant_agrees_with_the_oracle_in_every_contact(name):
     found, shortfalls = closed_loop(mechanism, case.compensator, gains)
     expected = oracle_contacts(name)
     assert len(found) == len(expected) == mechanism.approach.contacts
-    # So does a cubic for the motion on which the deepest point is found.
+    # It uses a cubic for the motion near the deepest point.
     case_lags = mechanism.rig.force_sensor.time_constant > 0
     accuracy = LAGGED if case_lags or "elastoplastic" in name else 1e-11
     for number, (mine, other) in enumerate(zip(found, expected, strict=True)):
@@ -53,7 +53,7 @@ def test_plant_agrees_with_the_oracle_in_every_contact(name):
         assert shortfalls[number] == pytest.approx(other["position_shortfall"], rel=1e-8, abs=1e-17)
 
 
-# Each form of loop is compiled for some seconds.
+# Each form of loop takes some seconds to compile.
 BUILT_IN = [
     name if name == "varying" else pytest.param(name, marks=pytest.mark.slow) for name in builtin_names()
 ]
@@ -191,7 +191,7 @@ def test_plant_tick_takes_little_time(name):
     for _ in range(20):
         plant.begin(-0.02 * velocity, velocity, -0.02 * velocity, 0)
         for tick in range(300):
-            # In and out of contact.
+            # Alternate contact and flight.
             phase = math.pi * (tick - 20) / 250
             begun = time.thread_time_ns()
             plant.read()

@@ -20,7 +20,7 @@ MASS, STIFFNESS, SPEED = 300.0, 106592.0, 0.005  # of rig-300kg
 
 
 def rig(overrides=(), **others):
-    """rig-300kg with dotted paths replaced; `a__b` stands for a.b."""
+    """Return rig-300kg with dotted paths replaced; `a__b` stands for a.b."""
     named = {path.replace("__", "."): value for path, value in others.items()}
     return jaxhil.load("rig-300kg", {**dict(overrides), **named})
 
@@ -69,7 +69,7 @@ def test_summary_lists_different_contacts_once_in_order():
 
 
 def power_law(stiffness, exponent):
-    """Peak force and duration of M d'' = -k d^n, in closed form."""
+    """Return peak force and duration of M d'' = -k d^n, in closed form."""
     order = exponent + 1
     deepest = (order * MASS * SPEED**2 / (2 * stiffness)) ** (1 / order)
     # 2 int_0^d_m dd / sqrt(v^2 - ...), with d = d_m s^(1/(n+1)).
@@ -83,7 +83,7 @@ def test_summary_of_every_law_is_that_of_its_ideal_contact():
     laws = {
         "linear": ({}, *spring),
         "kelvin_voigt": ({}, *spring),
-        # As deep as it goes one slope is as good as three equal ones.
+        # At its largest depth one slope is as good as three equal ones.
         "piecewise_linear": ({"stiffness": [[STIFFNESS] * 3], "depths": [1e-5, 2e-4]}, *spring),
         "hunt_crossley": ({"stiffness": [6e6]}, *power_law(6e6, 1.5)),
         "depth_damped": (
@@ -108,7 +108,7 @@ def test_damped_spring_has_the_frequency_of_the_spring():
     for tension in (False, True):
         [contact] = meaning(rig(damped, contact__tension=tension)).contacts
         assert contact.frequency == pytest.approx(math.sqrt(STIFFNESS / MASS) / (2 * math.pi))
-        # Overdamped, and pulled back as well: they never part.
+        # It is overdamped and is pulled back as well: the bodies never part.
         assert math.isinf(contact.duration) == tension
 
 
@@ -159,7 +159,7 @@ def test_ideal_simulator_has_no_bandwidth():
 @pytest.mark.parametrize(
     ("key", "plausible", "implausible", "said"),
     [
-        # Contact at 5 Hz and the like of 300 kg.
+        # Contact at 5 Hz of 300 kg, and similar values.
         ("rig.control_period", 0.03333, 0.03334, "contact.stiffness: found a contact frequency of 3 Hz"),
         (
             "contact.stiffness",
@@ -253,7 +253,7 @@ def test_flight_without_end_is_refused():
     assert "contact.clearance: found 100 m, allowed at most 1e+07 ticks a contact" in said
     assert "contact 2 takes about 2e+04 s, 2e+07 ticks" in said
     assert "contact.clearance: found 1e+30 m" in refusal(rig(gap, contact__clearance=1e30))
-    # Nobody flies after the last contact.
+    # There is no flight after the last contact.
     check_run(rig(contact__clearance=1e30))
 
 

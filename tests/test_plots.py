@@ -29,7 +29,7 @@ LANES = 40
 
 
 def result(error_size=(0.5, 0.05, 0.005)):
-    """A result as tuning makes it, with errors drawn from a seed."""
+    """Return a result as tuning gives it, with errors drawn from a seed."""
     mechanism = load("varying").mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 1), 1)
     generator = np.random.default_rng(0)
@@ -120,7 +120,7 @@ def test_best_start_stands_out_in_the_plot():
 
 
 def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1))):
-    """Points at (error, amplification), the fourth beaten by the third."""
+    """Return points at (error, amplification), the fourth dominated by the third."""
     made = result()
 
     def point(error, noise, on_front):
@@ -140,7 +140,7 @@ def test_front_plot_has_units_numbers_and_the_literature():
     assert labels(axes) == [
         *("front", "beaten by another", "literature's rule", "tuned", "limit 0.015"),
     ]
-    # Points that came out alike share a place.
+    # Points with the same result share a place.
     assert {text.get_text(): text.xy for text in axes.texts} == {
         **{"1, 2": (3.0, 0.01), "3": (2.0, 0.02), "4": (2.5, 0.03), "5": (1.1, 0.04)},
     }
@@ -163,7 +163,7 @@ def test_contact_plot_shows_contacts_side_by_side_with_units():
     figure = contact_plot(pieces(), "title")
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
-    # The speed at which a curve entered is stated where it differs visibly.
+    # The speed of a curve's approach is stated where it differs visibly.
     assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
     assert len(figure.legends) == 1
     assert "the first 4 of 6 contacts" in contact_plot(pieces(6), "title").get_suptitle()

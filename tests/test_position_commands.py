@@ -55,7 +55,7 @@ def in_both(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
 
 
 def rows_of(*rows: dict[str, float]) -> np.ndarray:
-    """Ticks at rest, one period after the other, but for what is said of them."""
+    """Return ticks at rest, one period after the other, with the given exceptions."""
     made = np.zeros((len(rows), len(ROW)))
     for n, row in enumerate(rows):
         for name, value in {"time": n * PERIOD, "timed": 1.0, **row}.items():
@@ -64,7 +64,7 @@ def rows_of(*rows: dict[str, float]) -> np.ndarray:
 
 
 class Reference:
-    """Place at which a run may begin, and the distance allowed from it, by the rows alone."""
+    """Reference from the rows alone: the place at which a run may begin, and the allowed distance from it."""
 
     def __init__(self, gain_file: GainFile) -> None:
         self.limits, self.clearance = gain_file.limits, gain_file.clearance
@@ -88,7 +88,7 @@ class Reference:
             far += limits["start_distance"]
         assert math.isfinite(command)
         if where is None:
-            # Nobody knows where the drives are: out of contact.
+            # The drives' position is unknown, so the command is out of contact.
             assert abs(deflection(command, self.clearance)) <= most or limits["command_lowest"] > 0.0
         else:
             assert abs(command - where) <= far * (1 + 1e-9) + 1e-14 * abs(where)
@@ -103,7 +103,7 @@ class Reference:
             event, tripped = row[0], bool(result[TRIPPED])
             if event == COMMAND_FIRST:
                 self.check(result[ANSWER], row[7], tripped)
-            # An audit that trips, on the next contact's announcement, leaves the run as it was.
+            # An audit that trips when the next contact is announced leaves the run as it was.
             audited = int(result[RESULT.index("cause")]) & (RESTITUTION | ENERGY_BALANCE)
             if event == NEXT_CONTACT and not before and not audited:
                 self.last, self.fresh = None, False
@@ -144,7 +144,7 @@ def runs(draw):
         *(NUMBERS, PLACES, NUMBERS, PLACES, st.floats(0.0, 1.0), st.just(0.0), PLACES, NUMBERS, NUMBERS),
     )
     rows = draw(st.lists(row, min_size=1, max_size=25))
-    if draw(st.booleans()):  # a rig that stands near the model, so that runs last
+    if draw(st.booleans()):  # a rig that stands near the model, so that runs last long
         rows = [(*row[:4], row[2] - 1e-5, *row[5:7], row[2] + 1e-5, *row[8:]) for row in rows]
     return GainFile(law, gains, PERIOD, clearance, limits), np.array(rows)
 
@@ -167,7 +167,7 @@ def test_position_command_stays_near_the_drives_for_a_million_ticks(law):
         Reference(gain_file).follow(rows, made.run(rows, True))
 
 
-# The cases in which the drives once leapt
+# Cases in which the drives once jumped
 
 
 def plain(law: str = "none", **limits: float) -> GainFile:
@@ -186,7 +186,7 @@ def test_first_position_command_against_the_drives_does_not_jump(drives, model, 
     assert abs(commands[0] - drives) <= STEP * (1 + 1e-9)
     assert np.all(np.abs(np.diff(commands)) <= STEP * (1 + 1e-9))
     if not LIMITED["command_lowest"] <= model <= LIMITED["command_highest"]:
-        # A trip: out of contact, and never the deepest that is allowed.
+        # After a trip the command is out of contact, and never at the deepest place that is allowed.
         assert np.all(sent[:, TRIPPED]) and np.all(np.diff(commands) <= 0.0)
         assert (
             int(sent[0, RESULT.index("cause")]) & STROKE or not LIMITED["measured_lowest"] <= drives <= 0.01
@@ -261,7 +261,7 @@ def test_drives_that_follow_late_begin_without_a_bump(law):
     strict = in_both(plain(law), rows_of(start))[0]
     assert strict[POSITION] == pytest.approx(-5e-4 + STEP, rel=1e-12)
     assert strict[RESULT.index("seen")] == VELOCITY_LIMIT
-    # In contact nothing but the velocity limit counts.
+    # In contact only the velocity limit counts.
     pressed = rows_of({"desired": 1e-4, "measured": -1e-4, "x": 1e-4})
     assert in_both(gain_file, pressed)[0, POSITION] == pytest.approx(-1e-4 + STEP, rel=1e-12)
 

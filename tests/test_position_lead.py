@@ -44,8 +44,10 @@ DELAY = 0.005
 
 @functools.cache
 def restitutions():
-    """Means over the contact phase, (3, periods): with the exact inverse, without any lead, with the inverse
-    and a force delay."""
+    """Return mean restitutions over the contact phase, (3, periods).
+
+    The rows are the exact inverse, no lead, and the inverse with a force delay.
+    """
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, EXACT, 0.0, period=PERIODS[-1]))
     gains = nominal_gains(parsed, "position_lead")
     frequency = 2 * pi * 12.0
@@ -117,7 +119,7 @@ def test_position_lead_nominal_gains_are_within_bounds():
         assert gain.lower(held) <= gain.nominal(held) <= gain.upper(held)
 
 
-# On the rig
+# Runtime on the rig
 
 
 def loaded_gains(simulator=SECOND_ORDER, **keys):
@@ -141,7 +143,7 @@ def test_sent_command_is_recorded_before_the_simulators_limits():
     expected = x + loaded.gains["position_lead"] * v + loaded.gains["acceleration_lead"] * acceleration
     assert lane.sent is not None and np.sum(~same_run) == 1
     np.testing.assert_allclose(np.asarray(lane.sent)[:-1][same_run], expected[same_run], rtol=0, atol=1e-15)
-    # It is not the model's position: ahead of it on the way in.
+    # It is not the model's position: it is ahead of it on the way in.
     assert np.max(np.abs(np.asarray(lane.sent)[:-1] - x)[same_run]) > 0.02 * VELOCITY
 
 
@@ -171,7 +173,7 @@ def test_stroke_and_velocity_limits_apply_to_the_sent_command():
     [chunk] = recorded_chunks(loaded, Scenarios("random", 0, 8))
     sent, position = (np.where(chunk.signals.live, leaf, np.nan) for leaf in chunk.signals[5:0:-4])
     assert np.nanmax(sent) > np.nanmax(position)
-    # The limits are margins on every fourth run; the others judge them.
+    # Limits keep a margin on every fourth run; the other runs test them.
     sent, begins = sent[:, ::4], chunk.signals.begins[1:, ::4]
     speed = np.abs(np.diff(sent, axis=0))[~begins]
     spare = 0.5 * (np.nanmax(sent) - np.nanmin(sent))

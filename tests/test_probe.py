@@ -37,19 +37,19 @@ def test_sensor_without_lag_reads_the_probe_push():
 
 
 def run(parsed, *push, **table):
-    """Metrics of a run with a push of so many newtons at 0.06 s of the contact."""
+    """Return metrics of a run with a push of so many newtons at 0.06 s of the contact."""
     probed = with_push(build_scenarios(parsed), *push, **table)
     return run_rollout(build_loop(parsed, "none", probed), nominal_gains(parsed, "none"), probed)
 
 
 def recorded(parsed, scenarios):
-    """Metrics of a run whose approach is flown, probed or not."""
+    """Return metrics of a run whose approach is simulated, probed or not."""
     loop = build_loop(parsed, "none", scenarios)
     return run_record(loop, nominal_gains(parsed, "none"), scenarios, 400)[0]
 
 
 def with_push(scenarios, size=0.0, share=0.25, depth=None, span=0.1):
-    """Scenarios probed with a push of so many newtons at this share of 0.16 s."""
+    """Return scenarios probed with a push of so many newtons at this share of 0.16 s."""
     shape = scenarios.phase.shape
     full = np.full(shape, 1.0)
     push = Push(size * full, share * 0.16 * full, 0.02 * full)
@@ -74,7 +74,7 @@ def test_early_probe_push_takes_energy_and_late_push_gives_energy():
 
 
 def test_trajectory_error_is_the_root_mean_square_off_the_table():
-    # Ideal, no delay, linear: x_d is the sine itself, and the table lies 1 mm deeper.
+    # Ideal linear contact without delay: x_d is the sine itself, and the table lies 1 mm deeper.
     parsed = validated(mechanism({}, IDEAL, 0.0))
     shape = build_scenarios(parsed).phase.shape
     omega = np.sqrt(parsed.contact.stiffness[0] / parsed.bodies.mass)
@@ -83,6 +83,6 @@ def test_trajectory_error_is_the_root_mean_square_off_the_table():
     table = np.broadcast_to(sine[None, :, None], (shape[0], 513, shape[1]))
     on = run(parsed, depth=table, span=span).trajectory_error[0, 0]
     off = run(parsed, depth=table + 1e-3, span=span).trajectory_error[0, 0]
-    # The sampled loop itself is off by the semi-implicit rule's half stride.
+    # The sampled loop itself is off by half a period of the semi-implicit rule.
     assert on < 1e-2 * np.max(sine)
     assert off == pytest.approx(1e-3, rel=0.02)

@@ -51,7 +51,7 @@ def forgetful():
 
 
 def run(folder, static=STATIC, arguments=VALUES):
-    """What a new process would find."""
+    """Run the program as a new process would."""
     program_cache._program.cache_clear()
     result = program_cache.run(sums, static, arguments, folder)
     return float(result.total), np.asarray(result.parts)

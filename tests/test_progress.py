@@ -10,7 +10,7 @@ from tuning import terminal
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds that pass as the test says."""
+    """Clock whose seconds pass as the test says."""
     now = [1000.0]
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     return now

@@ -24,7 +24,7 @@ def test_quantile_ranks_leave_out_at_most_the_stated_probability(number, order):
     law = stats.binom(number, order)
     below, above = law.cdf(low - 1), law.sf(high - 1)
     assert below <= 0.025 and above <= 0.025
-    # And no rank more could be left out.
+    # No further rank could be left out.
     assert law.cdf(low) >= 0.025 and law.sf(high - 2) >= 0.025
     wider = ranks(number, order, sequential=True)
     assert wider[0] <= low and wider[1] >= high
@@ -150,7 +150,7 @@ def test_quantile_without_values_is_unknown(interval):
 def test_few_values_do_not_bound_a_far_quantile():
     values = np.arange(1.0, 11.0)
     assert np.isinf(quantile(values, 0.99).high) and quantile(values, 0.01).low == 0.0
-    # 100 n q in whole numbers: the rank is not rounded up.
+    # 100 n q is a whole number: the rank is not rounded up.
     assert quantile(np.arange(1.0, 101.0), 0.07).value == 7.0
 
 

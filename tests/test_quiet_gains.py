@@ -47,7 +47,7 @@ def noisy(name, stiffness, delay, noise):
     return load("varying", [*changes, *sensor]).mechanism
 
 
-# Of the last one no gains are within the limit.
+# For the last one no gains are within the limit.
 RIGS = [("soft", 5e4, 0.004, 0.3), ("late", 2e5, 0.03, 3.0)]
 MECHANISMS = [noisy(*rig) for rig in RIGS]
 
@@ -59,7 +59,7 @@ def tuned(settings, **options):
 
 @pytest.fixture(scope="module")
 def quiet():
-    """The quietest, and how many programs of the solver they took."""
+    """Return the quietest gains, and the number of solver programs they took."""
     program_cache._program.cache_clear()
     found = tuned(SETTINGS)
     return found, program_cache._program.cache_info().misses
@@ -70,7 +70,7 @@ def noise_of(result, gains):
 
 
 def most_accurate(result):
-    """The best of the starts of least error."""
+    """Return the best of the starts of least error."""
     return min(result.starts, key=lambda start: start.rms)
 
 
@@ -92,7 +92,7 @@ def test_gains_of_least_error_stay_if_none_are_within_the_limit(quiet, validatio
 
 @pytest.fixture(scope="module")
 def validation():
-    """The training scenarios of all."""
+    """Validation on the training scenarios of all mechanisms."""
     tasks = [build_task(one, LAW, SETTINGS.scenarios, SETTINGS.seed) for one in MECHANISMS]
     return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
 
@@ -220,7 +220,7 @@ def test_warnings_name_peaks_and_noise_beyond_their_bounds():
     assert "1.6 times the ideal contact's peak force" in peaks and "at most 1.5" in peaks
     (noise,) = warned(**loud)
     assert "amplifies the sensor's noise" in noise and "at most 2" in noise
-    # Without noise there is none to amplify.
+    # Without noise there is nothing to amplify.
     assert warned(**loud, silent=None) == ()
 
 

@@ -23,13 +23,13 @@ def compiled(law):
 
 
 def evaluate(law, *parameters):
-    """Lists and floats to arrays, with one compilation per law and shape."""
+    """Convert lists and floats to arrays; compile once per law and shape."""
     arrays = [jnp.asarray(p) if np.asarray(p).dtype == bool else jnp.asarray(p, float) for p in parameters]
     return jax.device_get(compiled(law)(*arrays))
 
 
 class Terminal:
-    """An event that ends the integration where its value falls through 0."""
+    """Event that ends the integration where its value falls through 0."""
 
     terminal, direction = True, -1
 
@@ -41,8 +41,7 @@ class Terminal:
 
 
 def integrate(force, mass, velocity, time_scale, separation="force"):
-    """Restitution, peak force and duration by numerical integration in units of v and the given
-    time."""
+    """Integrate restitution, peak force and duration numerically, in units of v and the given time."""
     length = velocity * time_scale
 
     def acceleration(depth, speed):
@@ -70,7 +69,7 @@ def integrate(force, mass, velocity, time_scale, separation="force"):
         def pull(instant, way=way):
             return acceleration(*way.sol(instant))
 
-        # Zooming in, not interpolating: the force may peak at a kink.
+        # Refine the search instead of interpolating: the force may peak at a kink.
         low, high = time, way.t[-1]
         for points in (101, *[11] * 12):
             grid = np.linspace(low, high, points)
@@ -92,7 +91,7 @@ def damping_of(ratio):
 
 
 def staircase(slopes, depths, damping):
-    """The piecewise-linear force, written with ramps rather than with segments."""
+    """Return the piecewise-linear force, written with ramps rather than with segments."""
     edges = [0.0, *depths]
     rises = np.diff([0.0, *slopes])
 
@@ -265,7 +264,7 @@ def test_piecewise_linear_contact_may_just_reach_a_depth(depth):
 
 
 def packed(law, *shapes):
-    """The law as a function of one vector of its parameters, in the order of its arguments."""
+    """Return the law as a function of one vector of its parameters, in the order of its arguments."""
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
 
     def function(vector):
@@ -329,7 +328,7 @@ def test_ideal_contact_without_damping_has_derivative_by_damping(function, param
     value, columns = function(parameters)
     np.testing.assert_allclose(value[0], 1.0, rtol=1e-14)
     assert np.all(np.isfinite(columns))
-    # One-sided, of fourth order.
+    # One-sided differences of fourth order.
     steps = parameters + 2e-3 * np.arange(5)[:, None] * np.eye(parameters.size)[index]
     values = np.stack([function(p)[0] for p in steps])
     difference = np.array([-25, 48, -36, 16, -3]) @ values / (12 * 2e-3)

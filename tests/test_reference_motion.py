@@ -38,7 +38,7 @@ CASES = {
 
 
 def contact(dtype=float, **values):
-    """Parameters of every lane, by name; what is not named is nominal."""
+    """Return parameters of every lane, by name; those not named are nominal."""
 
     def lanes(value):
         return np.broadcast_to(np.asarray(value, dtype), (*np.shape(value)[:-1], LANES))
@@ -52,13 +52,13 @@ def contact(dtype=float, **values):
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def within(law, parameters, mass, velocity, tolerance):
-    """One program for a law, whatever the tolerance."""
+    """Use one program for a law, whatever the tolerance."""
     return integrate_contact(law, parameters, mass, velocity, tolerance=tolerance)
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def closed_form(law, parameters, mass, velocity):
-    """What the law itself says of its contact."""
+    """Return the contact by the law's own closed form."""
     return law.reference(parameters, mass, velocity)
 
 
@@ -105,7 +105,7 @@ def test_sticking_bodies_never_separate():
 
 
 def pulse(start, length, height):
-    """Half a sine."""
+    """Return half a sine."""
 
     def push(time):
         inside = (time > start) & (time < start + length)
@@ -175,7 +175,7 @@ def test_trajectory_of_linear_contact_is_the_closed_form():
     np.testing.assert_allclose(found.velocity / VELOCITY, speed, rtol=0, atol=2e-7)
 
 
-# Of each quantity over itself, by stiffness, damping (of a tenth of the critical one), mass and velocity.
+# Without damping the derivative by it is one-sided.
 @pytest.mark.parametrize(
     "case, tolerance",
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],

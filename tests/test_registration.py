@@ -22,7 +22,7 @@ from tuning.transparency.damping_perturbations import perturb_damping
 def registered():
     for law in (ScaledLead(), SquaredSpring()):
         jaxhil.register(law)
-        jaxhil.register(law)  # as a notebook's cell that runs twice
+        jaxhil.register(law)  # like a notebook cell that runs twice
 
 
 def test_user_registered_compensator_is_simulated(registered):
@@ -35,7 +35,7 @@ def test_user_registered_compensator_is_simulated(registered):
     filtered = jaxhil.simulate(mechanism, "phase_lead").contacts[0].error
     assert run.contacts[0].error == pytest.approx(filtered, abs=2e-3)
     assert run.contacts[0].error < none.contacts[0].error - 0.1
-    by = ["gains.toy_lead"] * len(KEYS)  # as many as elsewhere
+    by = ["gains.toy_lead"] * len(KEYS)  # as many as the other tests use
     slope = jaxhil.jacobian(mechanism, "scaled_lead", by=by)["gains.toy_lead"]
     step = 1e-6
     high, low = (
@@ -52,7 +52,7 @@ def test_user_registered_contact_law_agrees_with_its_integrated_ideal_contact(re
     prompt = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "uncertainty": {}}
     mechanism = jaxhil.load("rig-300kg", own | prompt)
     [contact] = jaxhil.simulate(mechanism, "phase_lead").contacts
-    # M v^2/2 = k d^3/3 at the deepest point, and nothing is lost.
+    # M v^2/2 = k d^3/3 at the deepest point: no energy is lost.
     mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
     deepest = (1.5 * mass * speed**2 / 1e8) ** (1 / 3)
     assert contact.reference_restitution == pytest.approx(1.0, abs=1e-8)

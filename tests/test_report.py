@@ -24,7 +24,7 @@ def signed(document):
 
 
 def identified(name=HOSTILE, **others):
-    """What `jaxhil identify` writes, with texts from elsewhere."""
+    """Write what `jaxhil identify` writes, with third-party texts."""
     estimate = {"key": name, "value": 1.0, "std": 0.1, "low": 0.8, "high": 1.2, "unit": name, "known": False}
     check = {"name": name, "finding": name, "where": name, "there": False, "effect": 0.001}
     document = {
@@ -36,7 +36,7 @@ def identified(name=HOSTILE, **others):
 
 
 def mapped(name=HOSTILE):
-    """What `jaxhil map` writes."""
+    """Write what `jaxhil map` writes."""
     error = [[0.1, -0.02, None], [0.3, 0.0, 0.01]]
     margin = {"low": None, "high": 4.0}
     return signed({
@@ -52,7 +52,7 @@ def mapped(name=HOSTILE):
 
 
 def monitored(name=HOSTILE, **others):
-    """What `jaxhil monitor --json` prints."""
+    """Write what `jaxhil monitor --json` prints."""
     figures = {one: {"value": 0.01, "predicted_std": 0.02, "z": 0.5} for one in ("stiffness", "noise", name)}
     figures["bias"] = {"value": None, "predicted_std": None, "z": None}
     contacts = [{"contact": n, "log": name, "state": "good", "figures": figures} for n in range(1, 81)]
@@ -65,7 +65,7 @@ def monitored(name=HOSTILE, **others):
 
 
 def compared(name=HOSTILE):
-    """What `jaxhil compare` writes."""
+    """Write what `jaxhil compare` writes."""
     figures = {name: {"rms": {"value": 0.1, "low": 0.05, "high": None}, "noise": {"value": None}}}
     return signed({
         "limit": 0.01, "seed": 0, "scenarios": 2, "judged": 4, "tuned": True,
@@ -94,7 +94,7 @@ def test_names_in_the_report_stay_text(put):
     made = tuning.report(places)
     page = made.html.decode()
     assert made.verdict == "good" and "9**9" in page and "387420489" not in page
-    # Of all that could run there is the page's own script alone; tags from a name are text.
+    # The only script that could run is the page's own; tags from a name are text.
     assert page.count("<script>") == 1 and not re.search(r"<[^>]*\sonerror\s*=", re.sub(r'"[^"]*"', "", page))
     assert page.count(html.escape(SCRIPT)) > 10
     assert "script-src 'sha256-" in page and "default-src 'none'" in page
@@ -145,7 +145,7 @@ def test_report_arguments_are_checked(jaxhil, put, tmp_path):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """A whole way, with a name from elsewhere: tuned, swept, compared, mapped, exported."""
+    """Results of a complete workflow under a third-party name: tuned, swept, compared, mapped, exported."""
     place = tmp_path_factory.mktemp("results")
     mechanism = jaxhil.load("varying", {"name": HOSTILE, "rig.force_sensor.noise_std": 0.5})
     tuned = tuning.tune(mechanism, "phase_lead", scenarios=16, starts=1)

@@ -26,7 +26,7 @@ from tuning.gains.tune_all import tune_all
 from tuning.statistics.intervals import Estimate
 
 HERE = Path(__file__).parent
-FILES = 5  # more than have pictures of their own
+FILES = 5  # more than those that have pictures of their own
 TINY = ["--compensator", "phase_lead", "--scenarios", "4", "--starts", "2", "--steps", "2"]
 TINY += ["--validation", "16", "--limit", "inf", "--json"]
 SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
@@ -34,7 +34,7 @@ SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Mechanisms of one program."""
+    """Mechanisms that share one program."""
     folder, text = tmp_path_factory.mktemp("files"), builtin_path("rig-300kg").read_text()
     for number in range(FILES):
         (folder / f"m{number}.toml").write_text(text.replace('"rig-300kg"', f'"m{number}"'))
@@ -43,7 +43,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(files, tmp_path_factory):
-    """A run without an interruption: what it made, and how many pieces it wrote."""
+    """A run without interruption: its results, and the number of checkpoints written."""
     from tuning import terminal
     from tuning.__main__ import main
 
@@ -56,7 +56,7 @@ def whole(files, tmp_path_factory):
 
 
 def outputs(said, folder):
-    """What a run said and wrote, but for times of day and timings, and for where it wrote."""
+    """Return what a run printed and wrote, without dates, timings and output folders."""
     document = json.loads(said.replace(str(folder), "DIR"))
     for entry in document["mechanisms"]:
         entry.pop("timings")
@@ -70,7 +70,7 @@ def outputs(said, folder):
 
 
 class Writes:
-    """Interrupts at the write of a piece number `stop`, before it or after."""
+    """Interrupts at the write of checkpoint number `stop`, before it or after."""
 
     def __init__(self, monkeypatch, stop=None, after=False):
         self.number, self.stop, self.after = 0, stop, after
@@ -101,14 +101,14 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
 @pytest.mark.slow
 def test_resumed_run_ends_as_without_interruption(jaxhil, files, whole, tmp_path):
     expected, every = whole
-    # Rounds of the search, the search, and a result each.
+    # Rounds of the search, the search, and one result each.
     assert every >= 2 + FILES
     for stop in (2, every):
         found, made = interrupted_and_resumed(jaxhil, files, tmp_path / str(stop), stop, after=stop > 2)
         assert found == expected
-        # What was kept is not made again.
+        # Saved results are not computed again.
         assert made == (every - 1 if stop == 2 else 0)
-    # Steps are gone, results stay.
+    # Steps are removed, results stay.
     assert len(list((tmp_path / "2" / FOLDER).iterdir())) == FILES
 
 
@@ -178,7 +178,7 @@ def test_front_is_checkpointed_too(jaxhil, tmp_path):
 
 
 class Scene(NamedTuple):
-    """As much of one as names what it is for."""
+    """Scene with only the attributes that name its purpose."""
 
     mechanism: Mechanism
 

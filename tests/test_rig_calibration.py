@@ -43,14 +43,14 @@ def gains(contact=None, uncertainty=UNCERTAIN, compensator="response_error", con
     return check_document(build_document(compensator, law, parsed, "0" * 64, {}, {}, 0, {}))
 
 
-LANES = 128  # everywhere: one program
+LANES = 128  # the same everywhere, so that there is one program
 ONE_SIDED = gains()
 NOISY_GAP = gains({"clearance": 0.001}, force_sensor=NOISY, contacts=3)
 
 
 @functools.cache
 def recorded(sided):
-    """Runs of either mechanism."""
+    """Recorded runs of either mechanism."""
     (chunk,) = recorded_chunks({1: ONE_SIDED, 2: NOISY_GAP}[sided], Scenarios("random", 1, LANES))
     return chunk
 
@@ -62,7 +62,7 @@ def calibrated():
 
 
 def watch(limits, signals, rules, lane):
-    """(restitution, expected, imbalance, fault) of every contact of a lane by the runtime's watchdog."""
+    """Return (restitution, expected, imbalance, fault) of a lane's contacts by the runtime's watchdog."""
     watchdog = Watchdog(complete(limits), rules.period, rules.clearance)
     found, given = [], 0.0
 
@@ -139,7 +139,7 @@ def test_audit_of_a_law_with_status_begins_when_the_law_acts():
 def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
     limits = calibrated[0].limits
     assert list(limits) == list(LIMITS)
-    # From how far a rig approaches one surface is its own affair.
+    # The distance from which a rig approaches a surface is not limited.
     assert [name for name, value in limits.items() if value is None] == ["measured_lowest", "command_lowest"]
     controller = limited_controller(ONE_SIDED, limits_section(limits))
     assert not controller.tripped
@@ -185,7 +185,7 @@ def test_rig_specific_limits_are_preserved_and_count():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
     found = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: found.limits[name] for name in small} == small
-    # A limit that no run keeps stops the good ones too.
+    # A limit that no run satisfies stops the good ones too.
     rate = found.rates["false_alarms"]
     assert rate["alarms"] == rate["runs"] > 0
 
@@ -299,7 +299,7 @@ def test_calibration_misses_none_of_a_hundred_thousand_scenarios():
     assert false["runs"] + missed["runs"] > 60_000 and missed["runs"] > 10_000
     assert missed["alarms"] == 0 and missed["high"] < 5e-4
     assert false["high"] < 1e-4
-    # The same verdicts by the controller itself, on other draws.
+    # Compare verdicts by the controller itself, on other draws.
     rules, distance = watchdog_rules(loaded)
     controller = limited_controller(loaded, limits_section(limits))
     (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, 1024))
@@ -312,7 +312,7 @@ def test_calibration_misses_none_of_a_hundred_thousand_scenarios():
 
 
 def signals(**columns):
-    """One lane."""
+    """Return the signals of one lane."""
     columns = {name: np.array(values, float)[:, None] for name, values in columns.items()}
     shape = next(iter(columns.values())).shape
     live, begins = np.ones(shape, bool), np.zeros(shape, bool)

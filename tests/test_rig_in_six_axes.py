@@ -43,15 +43,15 @@ STIFFNESS, DAMPING = 124355.0, 395.8
 
 
 def effective_mass():
-    """Of a contact off the line by ARM."""
+    """Return the effective mass of a contact off the line by ARM."""
     turned = np.cross(ARM, [0, 0, 1])
     return 1 / (np.sum(1 / MASSES) + np.sum(turned**2 / MOMENTS))
 
 
 def cases():
-    """Masses, moments, contact points, speeds, delays and friction of every lane, lanes last."""
+    """Return masses, moments, contact points, speeds, delays and friction of every lane, lanes last."""
     masses = np.tile(MASSES[:, None], LANES)
-    # A central contact whose equivalent mass is the effective mass of the one off the line.
+    # Central contact whose equivalent mass is the effective mass of the one off the line.
     masses[:, LIGHT] *= effective_mass() / 350
     points, speeds = np.zeros((3, LANES)), np.tile([[0.0], [0.0], [-0.005]], LANES)
     points[:, OFF:LIGHT] = ARM[:, None]
@@ -68,7 +68,7 @@ TURNED, BOOST = Rotation.from_rotvec([0.5, -1.0, 2.0]), np.array([0.03, -0.07, 0
 
 
 def start(masses, speeds, begin):
-    """(bodies, states) of NumPy's arrays; the last lane's world is turned and boosted."""
+    """Return (bodies, states) as NumPy arrays; the last lane's world is rotated and boosted."""
     zero = np.zeros((3, LANES))
     gap = speeds * -begin
     places = [zero.copy(), OFFSETS[0][:, None] + gap - OFFSETS[1][:, None]]
@@ -131,7 +131,7 @@ def simulate(loop, given, points, delays, friction):
 
 
 def simulated(*loop):
-    """What the program returns, each part (lanes, ticks, components)."""
+    """Return the program's results, each part (lanes, ticks, components)."""
     masses, points, speeds, delays, friction = cases()
     given = start(masses, speeds, 0.02 + PERIOD / 3)
     found = simulate(Loop(*loop), *jax.tree.map(jnp.asarray, (given, points, delays, friction)))
@@ -144,7 +144,7 @@ def seen():
 
 
 def energy_error(seen, lane, mass, speed):
-    """Kinetic energy gained, as a share of that of the approach."""
+    """Return the gained kinetic energy as a share of that of the approach."""
     energy = seen["energy"][lane, :, 0]
     assert np.all(seen["force"][lane, -20:] == 0)
     return (energy[-1] - energy[0]) / (mass * speed**2 / 2)

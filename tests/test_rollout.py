@@ -38,13 +38,13 @@ from jaxhil.simulation.rollout import rollout, run_contacts, stretch_length
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import draw_noise
 
-# Parabolas stand for the force that a lagging sensor follows; of restitution.
+# Restitution tolerance: the oracle uses parabolas for the force behind a lagging sensor.
 ACCURACY = {
     name: 1e-7 for name, case in CASES.items() if "time_constant" in case.mechanism["rig"]["force_sensor"]
 }
-# A cubic stands for the motion on which the deepest point is found.
+# It uses a cubic for the motion near the deepest point.
 ACCURACY |= {name: 1e-7 for name in CASES if "elastoplastic" in name}
-# Corners of layers, and the sampling interval in which a contact is over, are not split.
+# Corners of layers, and the sampling interval in which a contact ends, are not split.
 WORK_ACCURACY = {
     "layers": 1e-4,
     "damped layers": 1e-4,
@@ -52,7 +52,7 @@ WORK_ACCURACY = {
     "rattling, the next touch at once": 3e-4,
 }
 
-# Each of these is the first of a program of its own; what they add is tested elsewhere, one by one.
+# Each of these is the first of a program of its own; their features are tested elsewhere, one by one.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
 SELDOM += ("hardening", "damped hardening", "elastoplastic", "rattling, lag")
@@ -63,7 +63,7 @@ every_case = pytest.mark.parametrize("name", slow_if_seldom)
 
 
 def both(name):
-    """(contact of the loop, contact of the oracle) for every contact of a case."""
+    """Return (contact of the loop, contact of the oracle) for every contact of a case."""
     return zip(cases.loop_contacts(name), cases.oracle_contacts(name), strict=True)
 
 
@@ -77,7 +77,7 @@ def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
             expected["approach_velocity"], rel=min(accuracy, 1e-7)
         )
         assert found["peak_command"] == pytest.approx(expected["peak_command"], rel=accuracy)
-        # Nothing, to the bit, where no limit binds.
+        # It is 0, to the bit, if no limit binds.
         shortfall = expected["position_shortfall"]
         assert found["position_shortfall"] == pytest.approx(shortfall, rel=1e-8, abs=0)
         assert shortfall == 0 or "velocity_limit" in CASES[name].mechanism["rig"]["simulator"]
@@ -96,7 +96,7 @@ def test_shortfall_is_zero_once_the_drives_have_caught_up():
 
 @every_case
 def test_rollout_peak_force_agrees_with_oracle(name):
-    # Dry friction changes sides at the deepest point, which lies between samples.
+    # Dry friction changes sign at the deepest point, which lies between samples.
     accuracy = 1e-3 if "preload" in name else 1e-4
     for found, expected in both(name):
         assert found["peak_force"] == pytest.approx(expected["peak_force"], rel=accuracy)
@@ -144,7 +144,7 @@ def test_rollout_with_sensor_lag_agrees_at_every_control_period():
         assert restitution == pytest.approx(expected["restitution"], rel=0, abs=accuracy)
 
 
-# What a lane's run looks like tick by tick.
+# Signals of a lane's run, tick by tick
 
 RECORDED = ("response error", "late position", "dead zone", "quantum", "range", "velocity limit")
 
@@ -180,14 +180,14 @@ def test_recorded_run_agrees_with_its_metrics(recorded):
     reached = metrics.status == OK
     assert reached[0].all() and reached[1].any()
     for name, found in metrics._asdict().items():
-        # What an excess is left of is rounded like it.
+        # The remainder of an excess is rounded like the excess.
         rounding = 1e-12 * np.max(metrics.peak_command[reached]) if name == "excess_variation" else 0
         np.testing.assert_allclose(
             found[reached], getattr(rolled, name)[reached], rtol=1e-12, atol=rounding, err_msg=name
         )
     for slot, lane in np.argwhere(reached):
         own = np.flatnonzero(ticks.active[:, lane] & (ticks.contact[:, lane] == slot))
-        # `active` ends with the tick at which the contact is over, which still belongs to it.
+        # `active` ends with the tick at which the contact ends; that tick still belongs to it.
         own = np.append(own, own[-1] + 1)
         velocity = ticks.signals.velocity_desired[own, lane]
         force, works = ticks.plant_signals.force[own, lane], [w[own, lane] for w in ticks.plant_signals.works]
@@ -195,7 +195,7 @@ def test_recorded_run_agrees_with_its_metrics(recorded):
         assert ticks.signals.age[own[0], lane] == 0 and velocity[0] == metrics.approach_velocity[slot, lane]
         assert abs(velocity[-1]) / velocity[0] == pytest.approx(metrics.restitution[slot, lane], rel=1e-12)
         assert np.abs(ticks.command[own, lane]).max() == metrics.peak_command[slot, lane]
-        # The vertex between samples is barely higher than the highest of them.
+        # The vertex between samples is barely higher than the highest sample.
         peak = metrics.peak_force[slot, lane]
         assert np.abs(force).max() <= peak <= 1.002 * np.abs(force).max()
         assert np.sum(force != 0) * PERIOD == pytest.approx(metrics.duration[slot, lane], rel=1e-12)
@@ -204,7 +204,7 @@ def test_recorded_run_agrees_with_its_metrics(recorded):
         assert velocity[-1] < 0 and force[-1] == 0
 
 
-# Lanes and programs.
+# Lanes and programs
 
 STICKY = mechanism(
     {"damping": [2.4 * (STIFFNESS * MASS) ** 0.5], "tension": True},
@@ -222,7 +222,7 @@ LANES = {
 
 @pytest.fixture(scope="module")
 def mixed():
-    """One program and what it says of the lanes above; a function of its own, whose programs are counted."""
+    """One program and its results for the lanes above, as a function whose programs are counted."""
 
     def run_mixed(*arguments):
         return rollout(*arguments)
@@ -244,7 +244,7 @@ def test_rollout_reports_a_status_for_every_lane(mixed):
         "padding": NOT_REACHED,
     }
     assert np.all(metrics.status[1:] == NOT_REACHED)
-    # A contact may last 10 s, and no run ends more than a stretch later.
+    # A contact may last 10 s, and no run ends more than a segment later.
     sticks = batch.names.index("sticks")
     assert 0 <= metrics.ticks[0, sticks] * PERIOD - 10.0 < 0.2
     assert metrics.restitution[0, batch.names.index("runs away")] > 1e3
@@ -274,11 +274,11 @@ def test_padding_lanes_are_inert(mixed):
     for name, values in metrics._asdict().items():
         if name == "status":
             continue
-        # There are no limits that a command could fall short by, nothing to probe with, no delay estimated.
+        # No limit can make a command fall short, no probe is set, and no delay is estimated.
         nothing = "ticks", "position_shortfall", "trajectory_error", "force_delay"
         expected = 0 if name in nothing else np.nan
         np.testing.assert_array_equal(values[:, lane], expected, err_msg=name)
-    # With nothing but padding the program does not even start.
+    # With padding alone the program does not even start.
     idle = batch.scenario._replace(contacts=jnp.zeros_like(batch.scenario.contacts))
     assert np.all(np.asarray(run(batch.loop, batch.gains, idle).status) == NOT_REACHED)
     # The first lane is the same, bit for bit, when all others are padding.
@@ -301,7 +301,7 @@ def test_rollout_of_another_mechanism_uses_the_same_program(mixed):
     draws = {"contact.stiffness": np.outer(np.linspace(0.5, 1.5, 5), [2e5, 1e5])}
     for seed in (0, 1):
         scenario = join([build_scenarios(other, draws, seed=seed)])
-        # Delay lines are sized in powers of two, in steps wide enough for such delays.
+        # Delay lines have lengths of powers of two, in steps wide enough for such delays.
         loop = build_loop(other, "phase_lead", scenario, energies=True, chatter=True)
         assert (loop.ring, loop.controller_ring) == (batch.loop.ring, batch.loop.controller_ring)
         result = run(batch.loop, per_lane(nominal_gains(other, "phase_lead"), 5), scenario)
@@ -309,7 +309,7 @@ def test_rollout_of_another_mechanism_uses_the_same_program(mixed):
     assert programs_of("run_mixed") == 1
 
 
-# Noise.
+# Noise
 
 NOISY = mechanism(
     {"law": "linear", "stiffness": [STIFFNESS, 2 * STIFFNESS]},
@@ -337,7 +337,7 @@ def noisy_run():
 
 @pytest.fixture(scope="module")
 def noise():
-    """What is added to force [N] and position [m], each (contacts, ticks, lanes)."""
+    """Return the noise added to force [N] and position [m], each (contacts, ticks, lanes)."""
     scenario = noisy_batch(6)[2]
     age = np.broadcast_to(np.arange(400)[:, None], (400, 6))
     both = jax.jit(draw_noise, static_argnums=(0, 1), compiler_options=QUICK)

@@ -23,7 +23,7 @@ from jaxhil.sixdof.vectors import Vector, components, inverse, matrix, vector
 SEEDED = np.random.default_rng(5)
 AXES = SEEDED.normal(size=(3, 40))
 AXES /= np.linalg.norm(AXES, axis=0)
-# On both sides of where series begin, and as near to 0 and to half a turn as numbers go.
+# Both sides of the limit of the series, and as near to 0 and to half a turn as numbers allow.
 ANGLES = np.r_[0.0, 1e-300, 1e-160, 1e-20, 1e-9, 1e-4, np.linspace(1e-3, 0.6, 17), np.linspace(0.7, 3.1, 15),
                np.pi - 1e-9, np.pi]  # fmt: skip
 THETA = AXES * ANGLES
@@ -67,7 +67,7 @@ def test_exponential_and_rotation_agree_with_scipy(found):
 def test_logarithm_inverts_the_exponential(found):
     np.testing.assert_allclose(found[2][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     np.testing.assert_allclose(found[7][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
-    # Half a turn either way is the same rotation.
+    # Half a turn in either direction is the same rotation.
     np.testing.assert_allclose(np.linalg.norm(found[2][:, -1]), np.pi, rtol=1e-15)
     np.testing.assert_allclose(np.abs(found[2][:, -1] @ AXES[:, -1]), np.pi, rtol=1e-15)
 
@@ -110,7 +110,7 @@ def test_rotation_derivatives_at_zero_are_those_of_the_series():
 
     zero = jnp.zeros(3)
     slopes = jax.jit(jax.jacfwd(there_and_back))(zero)
-    # Column i is how the vector changes with theta_i.
+    # Column i is the change of the vector with theta_i.
     crossed = -np.cross(np.asarray(components(rate)), np.eye(3)).T
     expected = [crossed, np.eye(3), crossed / 2, -crossed / 2]
     np.testing.assert_allclose(slopes, expected, atol=1e-16)

@@ -50,7 +50,7 @@ def test_controller_reset_forgets_and_next_contact_keeps_identification():
     controller.next_contact()
     assert controller.identified == (stiffness, damping)
     carried = run(controller, ticks)
-    # All but the identified parameters is fresh: as if they had been the initial ones.
+    # Only the identified parameters persist, as if they had been the initial ones.
     known = gain_document()
     known["gains"]["initial_stiffness"]["value"] = stiffness
     known["gains"]["initial_damping"].update(value=damping, lower=-1e6)

@@ -17,7 +17,7 @@ from jaxhil.rig.limits import LIMITS
 
 
 def beyond(mechanism: Mechanism) -> list[tuple]:
-    """What is not admitted of each gain's bounds and nominal value."""
+    """Return the bounds and nominal values of gains that are not admitted."""
     found = []
     for name, law in COMPENSATORS.items():
         for gain in law.gains:
@@ -43,7 +43,7 @@ def test_bounds_admit_settings():
 
 
 def log(low: float, high: float) -> st.SearchStrategy[float]:
-    """Numbers of every order from `low` to `high`."""
+    """Return numbers of every order of magnitude from `low` to `high`."""
     return st.floats(math.log(low), math.log(high)).map(lambda value: min(max(math.exp(value), low), high))
 
 

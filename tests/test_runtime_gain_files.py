@@ -24,7 +24,7 @@ def refused(document: Any, *words: str) -> str:
 
 
 def paths(node: Any, path: tuple = ()) -> list[tuple]:
-    """The paths of every entry, at any depth."""
+    """Yield the paths of every entry, at any depth."""
     found = [path] if path else []
     entries = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, value in entries:
@@ -102,14 +102,14 @@ def test_gain_file_digest_covers_content_but_not_date_and_timings():
     assert digest(dict(reversed(document.items()))) == stated
     document["seed"] = 1
     assert digest(document) != stated
-    # Recorded from `sha256sum` over the canonical text itself.
+    # Recorded from `sha256sum` of the canonical text itself.
     assert digest({"b": 1.5, "a": "\u00e9", "sha256": "", "created": "", "timings": {}}) == (
         "58cb8a469294078eeafef7f1c22eb93d48a3fe96f63021dee6f65daf4b817635"
     )
 
 
 def change(*path_and_value: Any) -> dict[str, Any]:
-    """A response-error document with one entry replaced, or removed where the value is `...`."""
+    """Return a response-error document with one entry replaced, or removed where the value is `...`."""
     *path, key, value = path_and_value
     document = gain_document()
     container = at(document, tuple(path))

@@ -33,7 +33,7 @@ from jaxhil.rig.limits import LIMITS
 
 
 def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
-    """Uniform motion out of contact; the time and position that come next."""
+    """Simulate uniform motion out of contact; return the next time and position."""
     for n in range(ticks):
         position = start + 5e-6 * n
         assert controller.step(0.0, position, 5e-3, position - 1e-5, n * PERIOD) == 0.0
@@ -68,7 +68,7 @@ def test_bad_readings_are_bridged_then_trip(fault):
         )
         assert controller.faults == fault
         assert controller.tripped is (n > 2)
-        # Bridged, the last good force stands in; where the position is bad, the force is what is read.
+        # While bridged, the last good force is used; where the position is bad, the force is the reading.
         assert command == (0.0 if n > 2 else 3.0 if measured is None else 3.0 + n)
     assert controller.seen == controller.cause == fault
 
@@ -95,7 +95,7 @@ def test_force_that_is_constant_in_contact_is_stuck(side):
             first = n
             break
     if side > 0:
-        # 7 N since tick 1: the travel from there is 5 um a tick.
+        # 7 N since tick 1: from there on the travel is 5 um a tick.
         assert controller.cause == FORCE_STUCK and first in (1 + 40, 1 + 41)
     else:
         assert first is None
@@ -173,7 +173,7 @@ def test_force_limit_trips_and_the_force_fades():
     controller = limited()
     for n in range(10):
         assert controller.step(100.0 * (n + 1), 1e-4 * n, 0.0, 1e-4 * n) == 100.0 * (n + 1)
-    # From 1000 N, 1001 N is beyond: the force goes to 0 by 100 N a tick.
+    # From a limit of 1000 N, 1001 N is beyond it: the force goes to 0 by 100 N a tick.
     forces = [controller.step(1001.0, 2e-3, 0.0, 2e-3) for _ in range(12)]
     assert controller.cause == FORCE_LIMIT
     assert forces == [*(1000.0 - 100.0 * (n + 1) for n in range(10)), 0.0, 0.0]
@@ -217,7 +217,7 @@ def test_command_after_a_trip_brakes_and_rests_out_of_contact(start):
     braking = 0.5 * PERIOD**2
     assert all(abs(b - a) <= braking * (1 + 1e-6) for a, b in itertools.pairwise(changes))
     assert min(changes) > -1e-5 * (1 + 1e-6)
-    # The way that braking takes is v^2/2a.
+    # Braking takes a distance of v^2/2a.
     length = 0.01**2 / (2 * 0.5) + 1e-5
     assert max(sent) < start + 1e-4 + length
     assert controller.at_rest and -0.01 < sent[-1] < (-5e-4 if start > -0.01 else -9e-3)
@@ -255,7 +255,7 @@ def test_reset_after_a_trip_makes_no_bump():
         if sent == position:
             break
     assert sent == position and not controller.tripped
-    # Caught up, the limit is one again.
+    # Once the command has caught up, the limit applies again.
     for _ in range(5):
         controller.position_command(position + 1e-3, 5e-3, 0.0)
     assert controller.cause == VELOCITY_LIMIT

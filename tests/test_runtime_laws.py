@@ -16,11 +16,11 @@ from jaxhil.rig.filters import DelayLine, LeadFilter, VelocityFilter
 
 
 def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndarray, np.ndarray]:
-    """F_c and theta per tick of the response-error law, written with whole signals and matrices.
+    """Return F_c and theta per tick of the response-error law, computed with whole signals and matrices.
 
-    Lead and velocity are state-space models discretised by the bilinear transform; the delay is an
-    interpolation of the whole record, the contact's share of each period a length on the polygon;
-    the identification is textbook recursive least squares, weighted, with its covariance bounded.
+    Lead and velocity are state-space models discretised by the bilinear transform. The delay interpolates the
+    whole record, and the contact's share of each period is a length on the polygon. The identification is
+    textbook weighted recursive least squares with bounded covariance.
     """
     gain = {name: entry["value"] for name, entry in document["gains"].items()}
     period = document["control_period"]
@@ -69,20 +69,20 @@ def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndar
 
 
 def covariance_of(identification) -> tuple[float, float, float]:
-    """P_11, P_12 and P_22 of P = U D U'."""
+    """Return P_11, P_12 and P_22 of P = U D U'."""
     u, d_1, d_2 = identification.coupling, identification.stiffness_variance, identification.damping_variance
     return d_1 + u * u * d_2, u * d_2, d_2
 
 
 def bounded(covariance: np.ndarray, most: tuple[float, float]) -> np.ndarray:
-    """The covariance with d_1 = P_11 - P_12^2/P_22 and d_2 = P_22 at most their initial values."""
+    """Return the covariance with d_1 = P_11 - P_12^2/P_22 and d_2 = P_22 at most their initial values."""
     factor = np.array([[1.0, covariance[0, 1] / covariance[1, 1]], [0.0, 1.0]])
     d_1 = covariance[0, 0] - factor[0, 1] * covariance[0, 1]
     return factor @ np.diag([min(d_1, most[0]), min(covariance[1, 1], most[1])]) @ factor.T
 
 
 def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.ndarray:
-    """The share of each period that the polygon through `start` and the signal lies in (low, high)."""
+    """Return each period's share in which the polygon through `start` and the signal is in (low, high)."""
     ends = np.stack([np.concatenate([[start], signal[:-1]]), signal])
     bottom, top = ends.min(axis=0), ends.max(axis=0)
     inside = np.maximum(np.minimum(top, high) - np.maximum(bottom, low), 0.0)
@@ -91,7 +91,7 @@ def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.nda
 
 
 def triangle(share: np.ndarray) -> np.ndarray:
-    """Two periods' triangle over the time beyond a threshold, of which each period has a share."""
+    """Return each period's share of a two-period triangle over the time beyond a threshold."""
     before = np.concatenate([[0.0], share[:-1]])
     return (share**2 + before**2) / 2 + share * before * (2 - share - before)
 
@@ -106,10 +106,10 @@ def bilinear(
     state: float,
     before: float,
 ) -> np.ndarray:
-    """Trapezoidal simulation of z' = a z + c u, y = b z + d u, from the sample before the first.
+    """Return the trapezoidal simulation of z' = a z + c u, y = b z + d u, from the sample before the first.
 
-    For the lead, (1 + T_1 s)/(1 + T_2 s) = T_1/T_2 + (1 - T_1/T_2)/(1 + T_2 s); for the filtered
-    derivative, 1/tau - (1/tau)/(1 + tau s).
+    For the lead, (1 + T_1 s)/(1 + T_2 s) = T_1/T_2 + (1 - T_1/T_2)/(1 + T_2 s); for the filtered derivative,
+    1/tau - (1/tau)/(1 + tau s).
     """
     output = np.empty(len(signal))
     previous = before
@@ -165,7 +165,7 @@ def test_law_that_leads_the_force_commands_the_position_itself(name):
 
 def test_response_term_acts_while_the_aligned_position_is_in_contact():
     controller = Controller.from_dict(gain_document(identification_delay=0.0, initial_stiffness=1e5))
-    # No force, so nothing is identified: only the side of the surface decides, and for how long.
+    # Without force nothing is identified: only the side of the surface counts, and the time spent there.
     for measured, stiffness in [(-1e-4, 0.0), (1e-4, 9e4), (-1e-9, 0.0), (0.0, 0.0), (1e-9, 9e4)]:
         controller.reset()
         forces = [controller.step(0.0, measured + 1e-5, 0.0, measured) for _ in range(4)]
@@ -175,7 +175,7 @@ def test_response_term_acts_while_the_aligned_position_is_in_contact():
 
 def test_response_term_fades_by_where_the_surface_was_left():
     document = gain_document(identification_delay=0.0, initial_stiffness=1e5, response_error_damping=0.0)
-    for left in (0.0, 0.25, 0.5, 1.0):  # of the period after the last tick in contact
+    for left in (0.0, 0.25, 0.5, 1.0):  # share of the period after the last tick in contact
         controller = Controller.from_dict(document)
         places = [1e-6, 1e-6, left * 1e-6, (left - 1) * 1e-6, -1e-6, -1e-6]
         forces = [controller.step(0.0, x + 1e-5, 0.0, x) for x in places]
@@ -210,7 +210,7 @@ def test_delay_line_interpolates_its_samples(periods):
 
 
 def test_delay_line_keeps_whole_delays_whole():
-    # 0.003/0.001 and its like round either way.
+    # Values like 0.003/0.001 round either way.
     for whole in range(40):
         line = DelayLine(whole * 0.001, 0.001)
         line.start(0.0, 0.0)

@@ -37,7 +37,10 @@ def watched(clearance: float | None = None, **limits: float) -> Controller:
 def bounce(
     controller: Controller, *, late: int = 0, damping: float = 0.0, clearance: float = math.inf, ticks=3000
 ) -> tuple[int, list[float], list[float]]:
-    """An ideal rig under `none`, the force `late` ticks late: tick of the trip, positions, velocities."""
+    """Simulate an ideal rig under `none`, the force `late` ticks late.
+
+    Return the tick of the trip, positions and velocities.
+    """
     position, velocity = -1e-4, SPEED
     forces = [0.0] * (late + 1)
     positions, velocities = [], []
@@ -56,7 +59,7 @@ def bounce(
 
 
 def restitution_of(late: int) -> float:
-    """Of one contact, unwatched."""
+    """Return the restitution of one contact without a watchdog."""
     controller = Controller.from_dict(gain_document("none"))
     _, positions, velocities = bounce(controller, late=late, ticks=400)
     assert positions[-1] < 0
@@ -82,7 +85,7 @@ def test_watchdog_stops_divergence_once_the_contact_has_ended():
     assert controller.cause == RESTITUTION
     assert f"contact 1: restitution {divergence:.4g}, expected 1" in controller.status
     assert velocities[-1] == pytest.approx(-divergence * SPEED, rel=1e-12)
-    # Out of contact since 5 ms, and the force is 3 ticks late.
+    # Out of contact for 5 ms; the force is 3 ticks late.
     left = next(n for n in range(len(positions)) if velocities[n] < 0 and positions[n] < 0)
     assert n - left in (4, 5, 6)
 
@@ -102,7 +105,7 @@ def test_watchdog_audits_every_contact_between_two_surfaces():
     _, _, velocities = bounce(controller, clearance=2e-3, late=1, ticks=6000)
     turns = sum(a * b < 0 for a, b in itertools.pairwise(velocities))
     assert turns > 5 and controller._watchdog.contacts in (turns - 1, turns)
-    # With each contact 3 % faster, the first is stopped before the far surface is reached.
+    # Each contact is 3 % faster; the first is stopped before the far surface is reached.
     controller = watched(2e-3)
     _, positions, _ = bounce(controller, clearance=2e-3, late=1)
     assert controller.cause == RESTITUTION and controller._watchdog.contacts == 1
@@ -127,7 +130,7 @@ def test_watchdog_detects_a_model_that_does_not_integrate_its_force():
     position, velocity = -1e-4, SPEED
     for n in range(500):
         force = controller.step(STIFFNESS * max(position, 0.0), position, velocity, position, n * PERIOD)
-        velocity -= PERIOD * force / (1.02 * MASS)  # another mass than the watchdog was given
+        velocity -= PERIOD * force / (1.02 * MASS)  # a mass that differs from the watchdog's
         position += PERIOD * velocity
     assert controller.cause == ENERGY_BALANCE
 
@@ -141,7 +144,7 @@ def test_watchdog_trips_on_a_contact_that_does_not_end():
 
 
 def test_expected_restitution_follows_the_stiffness_of_the_contact():
-    # e* = 1 - 0.1 (sqrt(k0/k) - 1): a contact of another stiffness is expected to come back otherwise.
+    # e* = 1 - 0.1 (sqrt(k0/k) - 1): a contact of another stiffness has another expected restitution.
     controller = watched(
         reference_stiffness=4 * STIFFNESS,
         expected_1=0.95,
@@ -165,7 +168,7 @@ def test_expectation_is_its_polynomial_within_its_ranges():
     z = 400.0 / (2 * math.sqrt(1e5 * 300.0))
     values = [1, p, p**2, p**3, w, w**2, p * w, z, z**2, p * z, w * z]
     assert found == pytest.approx(sum(0.01 * (n + 1) * value for n, value in enumerate(values)), rel=1e-12)
-    # Beyond the ranges, and for a stiffness that cannot be: the ranges' ends.
+    # Beyond the ranges, and for an impossible stiffness, the ends of the ranges are used.
     p, w, z = 0.75, 0.75, -0.5
     values = [1, p, p**2, p**3, w, w**2, p * w, z, z**2, p * z, w * z]
     end = sum(0.01 * (n + 1) * value for n, value in enumerate(values))

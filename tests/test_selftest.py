@@ -16,8 +16,8 @@ from bundles import TICKS, run_selftest, signed, small_files
 from tuning.bundle import selftest
 from tuning.bundle.manifest import is_text
 
-MUTATIONS = 50  # of each text file
-OWN_MUTATIONS = 40  # of the self-test itself, each in a process of its own
+MUTATIONS = 50  # mutations of each text file
+OWN_MUTATIONS = 40  # mutations of the self-test itself, each in a process of its own
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def files():
 
 @pytest.fixture
 def folder(files, tmp_path):
-    """The small bundle, to be damaged."""
+    """A copy of the small bundle, to be damaged."""
     place = tmp_path / "bundle"
     for name, content in files.items():
         (place / name).parent.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def folder(files, tmp_path):
 
 
 def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
-    """The self-test as a rig engineer runs it, where no package can be imported."""
+    """Run the self-test as a rig engineer does, where no package can be imported."""
     command = [sys.executable, *python, str(folder / "selftest.py"), *arguments]
     ran = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=cwd, check=False)
     return ran.returncode, ran.stdout, ran.stderr
@@ -64,7 +64,7 @@ def test_selftest_uses_nothing_that_a_rig_lacks(folder):
 
 
 def mutated(source, content):
-    """One character changed into another one, or left out, and the line on which it stood."""
+    """Change or drop one character; return the text and the line of the change."""
     place = source.randrange(len(content))
     old = chr(content[place])
     choices = string.digits if old.isdigit() else string.printable
@@ -108,12 +108,12 @@ def test_selftest_never_passes_a_change_of_itself(files, folder):
     content = files["selftest.py"]
     program = content.index(b"def main")
     for turn in range(OWN_MUTATIONS):
-        # Of docstrings and constants too, but above all of what runs.
+        # Include docstrings and constants, but above all code that runs.
         begin = program if turn % 4 else 0
         changed, _ = mutated(source, content[begin:])
         (folder / "selftest.py").write_bytes(content[:begin] + changed)
         code, out, err = in_a_bare_process(folder)
-        # What is no Python any more is reported by Python itself.
+        # Python itself reports text that is no Python any more.
         assert code != 0 and "selftest.py" in out + err, (changed, out, err)
 
 

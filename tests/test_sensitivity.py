@@ -9,7 +9,7 @@ STIFF_ENOUGH = 0.05  # the box adds its square to the region, relatively
 
 
 def quadratic():
-    """J of two combinations of three gains: a stiff one, a weaker one; the third is free."""
+    """Return J of two combinations of three gains: a stiff one and a weaker one; the third gain is free."""
     return np.array([[300.0, 300.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
@@ -40,7 +40,7 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     for gain in range(4):
         alone = found.alone[gain] * np.eye(4)[gain]
-        # The others at their best: along the gain's column of the covariance.
+        # With the other gains at their best: along the gain's column of the covariance.
         together = found.together[gain] * covariance[gain] / covariance[gain, gain]
         for step in (alone, together):
             assert np.max(np.abs(step)) < STIFF_ENOUGH

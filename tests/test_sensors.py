@@ -13,7 +13,7 @@ from jaxhil.simulation.sensors import threefry, white_noise
 ours = jax.jit(threefry, compiler_options=QUICK)
 
 
-# Of the authors' library, Random123: key, counter, result.
+# Vectors of the authors' library, Random123: key, counter, result.
 @pytest.mark.parametrize(
     "key, counter, result",
     [
@@ -43,6 +43,6 @@ def test_noise_samples_are_normal(dtype, largest):
     assert drawn.dtype == dtype
     samples = np.asarray(drawn, float)
     assert kstest(samples.ravel(), "norm").pvalue > 0.01
-    # The kurtosis tells of the tails; that of a normal sample is 3 +- sqrt(96 / number).
+    # The kurtosis shows the tails; that of a normal sample is 3 +- sqrt(96 / number).
     assert np.mean(samples**4) == pytest.approx(3, abs=4 * np.sqrt(96 / samples.size))
     assert 4 < np.abs(samples).max() < largest

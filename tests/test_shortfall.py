@@ -17,7 +17,7 @@ from jaxhil.simulation.metrics import NOT_REACHED, OK
 from jaxhil.simulation.rollout import start
 
 LATE = 0.011  # s of force delay: uncompensated, a contact ends faster than it begins
-LIMITS = {  # m/s, and whether it binds
+LIMITS = {  # speed [m/s], and whether the limit binds
     "none": (np.inf, False),
     "far above": (100 * VELOCITY, False),
     "above the rebounds": (7 * VELOCITY, False),
@@ -27,7 +27,7 @@ LIMITS = {  # m/s, and whether it binds
 
 
 class Leading(NoCompensator):
-    """Commands where the model will be a little later."""
+    """Compensator that commands where the model will be a little later."""
 
     lead: float
 
@@ -36,7 +36,7 @@ class Leading(NoCompensator):
 
 
 class LeadingOracle(oracle.NoCompensator):
-    """The same, for the oracle."""
+    """Oracle of the same compensator."""
 
     def __init__(self, lead):
         self.lead = lead
@@ -46,14 +46,14 @@ class LeadingOracle(oracle.NoCompensator):
 
 
 def limited(limit, damping, force_delay=LATE):
-    """Two contacts under a velocity limit [m/s]; one where the drives cannot follow its rebound."""
+    """Return two contacts under a velocity limit [m/s]; the drives cannot follow the rebound of one."""
     simulator = SECOND_ORDER | ({"velocity_limit": limit} if np.isfinite(limit) else {})
     contacts = 2 if limit > 1.5 * VELOCITY or damping > 1e3 else 1
     return Case(mechanism({"damping": [damping]}, simulator, force_delay, contacts=contacts))
 
 
 CONTACTS = {name: limited(limit, 300.0) for name, (limit, _) in LIMITS.items()}
-# As fast as the drives go, exactly, and slower ever after.
+# Exactly as fast as the drives, and slower ever after.
 CONTACTS["just reached"] = limited(VELOCITY, 6000.0, 0.0)
 BINDING = [name for name, (_, binds) in LIMITS.items() if binds]
 
@@ -77,7 +77,7 @@ def batch():
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def shortfalls_found(request, batch):
-    """Shortfalls [m] of every contact, by the case's name."""
+    """Return shortfalls [m] of every contact, by the case's name."""
     scenario = batch.scenario if request.param == "float64" else single(batch.scenario)
     metrics = batch._replace(scenario=scenario).run()
     assert metrics.position_shortfall.dtype == request.param

@@ -20,9 +20,9 @@ COMMAND = re.compile(
     r"`(?:jaxhil|pytest|python3?) [^`]+`|^(?:\$ )?(?:jaxhil|pytest|python3?) |^```python", re.M
 )
 NUMBER = re.compile(r"\d+\.\d+|\d+")
-# What takes more than minutes, or a rig's logs.
+# Commands that take more than minutes, or need a rig's logs.
 LEFT_OUT = ("rig", "compare", "identify", "monitor")
-# Pages in the order in which a reader takes them, each with what the ones before it wrote.
+# Pages in the order in which a reader takes them, each with the files of the pages before.
 ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
@@ -37,7 +37,7 @@ def test_plots_stand_below_the_command_that_prints_them(page):
 
 
 def shown(page):
-    """Commands of a page with the lines below each, in order."""
+    """Return the commands of a page with the lines below each, in order."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text":
@@ -89,11 +89,11 @@ def test_logs_commands_print_what_is_shown(tmp_path):
             assert {words(line) for line in lines.splitlines()} <= {words(line) for line in found}
             print("\n" + "\n".join(line.rstrip() for line in found), end="")
         if "--guess" in command:
-            # What only the rig's owner knows.
+            # Values that only the rig's owner knows.
             draft = (tmp_path / "logs.toml").read_text().replace("# [bodies]", "[bodies]")
             (tmp_path / "logs.toml").write_text(draft.replace("# equivalent_mass", "equivalent_mass"))
 
 
 def words(line):
-    """A line without its numbers."""
+    """Return a line without its numbers."""
     return " ".join(NUMBER.sub("N", line).split())

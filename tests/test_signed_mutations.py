@@ -34,11 +34,11 @@ from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_docume
 from jaxhil.rig.limits import LIMITS, NO_LIMITS
 
 TICKS = 12
-COMPILED = "phase_lead", "response_error"  # every day: compiling takes its time
+COMPILED = "phase_lead", "response_error"  # every day: compiling takes long
 
 
 def load(path: Path) -> GainFile | None:
-    """What the runtime makes of a file; None if it refuses it."""
+    """Load a file into the runtime; return None if it is refused."""
     try:
         gain_file = check_gain_document(read_gain_document(path), str(path))
         Controller(gain_file, str(path))
@@ -49,7 +49,7 @@ def load(path: Path) -> GainFile | None:
 
 
 def is_within_bounds(gain_file: GainFile) -> bool:
-    """Whether the code's bounds admit every number."""
+    """Return whether the code's bounds admit every number."""
     gains, limits = COMPENSATORS[gain_file.compensator].gains, gain_file.limits
     return (
         CONTROL_PERIODS[0] <= gain_file.control_period <= CONTROL_PERIODS[1]
@@ -65,14 +65,14 @@ def is_within_bounds(gain_file: GainFile) -> bool:
 
 
 def drive(gain_file: GainFile, rows: np.ndarray, in_c: Collection[str]) -> None:
-    """Its commands stay within its limits, and so within the code's; C does what Python does."""
+    """Check that a controller's commands stay within its limits and the code's; C agrees with Python."""
     results = controller_in_python(gain_file, rows)
     limits, period = gain_file.limits, gain_file.control_period
     force, position = results[:, 0], results[:, 1]
     assert np.all(np.abs(force) <= min(limits["force_limit"], FORCES[1]))
     assert np.all((position >= POSITIONS[0]) & (position <= POSITIONS[1]))
     same_run = rows[1:, 0] != NEXT_CONTACT
-    # Outside the stroke only where the drives read so as a run began, and not further out.
+    # Outside the stroke only if the drives were there when a run began, and never further out.
     outside = np.maximum(limits["command_lowest"] - position, position - limits["command_highest"])
     assert np.all(np.diff(np.maximum(outside, 0.0))[same_run] <= 0.0)
     moved = np.abs(np.diff(position))[same_run]
@@ -85,7 +85,7 @@ def drive(gain_file: GainFile, rows: np.ndarray, in_c: Collection[str]) -> None:
 
 
 def as_numbers(document: dict) -> GainFile:
-    """The numbers of a document whose form is good, whatever they are."""
+    """Return the numbers of a document whose form is good, whatever they are."""
 
     def number(value: float) -> float:
         try:
@@ -108,7 +108,7 @@ def as_numbers(document: dict) -> GainFile:
 
 
 def longest_line(gain_file: GainFile) -> float:
-    """The longest delay in periods; 0 where a period is none."""
+    """Return the longest delay in periods; 0 if a period is none."""
     numbers = {**gain_file.limits, **gain_file.gains}
     period = gain_file.control_period
     delays = c99_cases.delays(gain_file.compensator) if period > 0.0 else ()
@@ -116,7 +116,10 @@ def longest_line(gain_file: GainFile) -> float:
 
 
 def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str, int]:
-    """Change and sign `count` files; how many loaded and were refused. These `laws` are driven in C too."""
+    """Change and sign `count` files; return how many loaded and were refused.
+
+    These `laws` are driven in C too.
+    """
     in_c = laws if c99_cases.COMPILER is not None else ()
     rng = random.Random(seed)
     source = np.random.default_rng(seed)
@@ -135,12 +138,12 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
             assert is_within_bounds(gain_file), text
             drive(gain_file, rng.choice(pool), in_c)
         elif only_numbers:
-            # Where form and digest are good, it is refused for its numbers: C refuses them too.
+            # Form and digest are good: C also refuses the file for its numbers.
             numbers = as_numbers(document)
             if numbers.compensator in in_c and text == json.dumps(document):
                 line = longest_line(numbers)
                 assert line > 100_000.0 or not is_within_bounds(numbers), text
-                # By how much a line is too long, C counts in whole periods.
+                # C counts the excess length of a line in whole periods.
                 if not 100_000.0 < line < 100_002.0:
                     made = c99_cases.loaded(numbers.compensator)
                     assert not made.begin(packed(numbers.compensator, numbers)), text
@@ -176,5 +179,5 @@ def test_thousand_flipped_bits_load_no_other_content(tmp_path):
         if found is not None:
             loaded += 1
             assert found == expected and digest(read_gain_document(path)) == document["sha256"]
-    # Of date and timings, which the digest does not cover, and of blanks.
+    # The digest does not cover date and timings, nor blanks.
     assert loaded < 200

@@ -36,7 +36,7 @@ def as_public(key):
 
 @pytest.fixture
 def key(tmp_path):
-    """The files of a pair of keys, private and public."""
+    """Files of a pair of keys, private and public."""
     pair = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
     files = tmp_path / "key.pem", tmp_path / "public.pem"
     for file, text in zip(files, (as_private(pair), as_public(pair)), strict=True):
@@ -82,7 +82,7 @@ def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
     found = tuning.verify(folder, key=tmp_path / "other.pem")
     expected = "manifest.sig: found another, allowed the manifest's by the key given"
     assert not found.good and found.reasons == [expected] and found.document["self_test"] == []
-    # Resealed after a change, as whoever has no key could: all but the signature fits.
+    # Reseal after a change, as anybody without the key could: all but the signature fits.
     files = small_files()
     shorter = files["vectors.csv"].rpartition(b"\n1,")[0] + b"\n"
     placed(folder, signed({**files, "vectors.csv": shorter}, json.loads(files["gains.json"])))

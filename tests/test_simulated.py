@@ -15,7 +15,7 @@ from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 class LargeLaw(NoCompensator):
-    """No compensation, said to take a large step."""
+    """Compensator `none` with a large step, as it says."""
 
     waits_for_contact: ClassVar[bool] = True
     is_large: ClassVar[bool] = True

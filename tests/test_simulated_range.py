@@ -16,7 +16,7 @@ LANES = 6
 
 
 def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[str, Any], dict[str, float]]]:
-    """The mechanisms of a form that end well and that the oracle vouches for, and how far figures differ."""
+    """Compare metrics of the mechanisms of a form that end well and that the oracle vouches for."""
     rng = np.random.default_rng(seed)
     drawn = [form.draw(rng, longest) for _ in range(lanes)]
     mechanisms = [validated(one) for one in drawn]

@@ -18,7 +18,7 @@ from tuning.bundle.single_file import runtime_source
 
 @pytest.fixture(scope="module", params=sorted(COMPENSATORS))
 def exported(request, tmp_path_factory):
-    """A folder with the runtime for one compensator in one file, beside a gain file of it."""
+    """Write the runtime for one compensator as one file, beside a gain file of it."""
     folder = tmp_path_factory.mktemp("single")
     (folder / "jaxhil_runtime.py").write_text(runtime_source(request.param))
     (folder / "gains.json").write_text(json.dumps(gain_document(request.param)))

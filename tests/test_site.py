@@ -75,7 +75,7 @@ def test_options_named_in_the_guide_exist(reference):
     seen = 0
     for page in (ROOT / "README.md", *(ROOT / "notebooks" / "guide").glob("*.md")):
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-        # To the end of the words in code, or of the line.
+        # Up to the end of the words in code, or of the line.
         for command, rest in re.findall(r"\bjaxhil ([a-z]+)((?: [^\s`]+|\n[^`\n]+(?=`))*)", text):
             for option in re.findall(r"(?<= )--?[a-z][a-z-]*", rest) if command in parts else ():
                 assert re.search(rf"(?<![\w-]){option}(?![\w-])", parts[command]), (
@@ -93,7 +93,7 @@ def test_site_build_fails_for_undocumented_options_and_gains(reference, monkeypa
 
     @dataclasses.dataclass
     class Options:
-        """An option that nobody explains."""
+        """Options with an option that has no help text."""
 
         depth: Annotated[float, tyro.conf.arg(metavar="NUMBER")] = 1.0
 
@@ -168,7 +168,7 @@ def site(tmp_path_factory):
 
 
 class Page(HTMLParser):
-    """Addresses that a page leads to, what it loads, and the names of its places."""
+    """Links of a page, the files it loads, and the names of its anchors."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()

@@ -25,16 +25,16 @@ from jaxhil.sixdof.vectors import vector
 
 pytestmark = pytest.mark.slow
 DRAWS, PERIOD = 256, 1e-3
-LANES = 2 * DRAWS  # of a probe, then of a ring
-STEP = 2e-5  # of each number, relative: few touches begin at another tick for it
+LANES = 2 * DRAWS  # lanes of a probe, then of a ring
+STEP = 2e-5  # relative step of each number: few touches begin at another tick because of it
 BY = ("stiffness", "dissipation", "friction", "force delay", "axes' delays", "axes' frequencies")
 POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # of the ring, for radius 1
 HALF_ANGLE = 0.75  # rad, of the drogue
-AWAY = 10.0  # m: where candidates are that the lane does not have
+AWAY = 10.0  # m: the place of candidates that the lane does not have
 
 
 def contact(scales):
-    """The candidates, their stiffness, dissipation and friction scaled."""
+    """Return the candidates with scaled stiffness, dissipation and friction."""
     stiffness, dissipation, friction = scales
     is_ring = np.arange(LANES) >= DRAWS
 
@@ -60,7 +60,7 @@ def bodies():
 
 
 def drawn():
-    """Offsets (2), attitudes (3) and twists (6) at the first touch, (number, lanes)."""
+    """Draw offsets (2), attitudes (3) and twists (6) at the first touch, (number, lanes)."""
     seeded = np.random.default_rng(7)
     offset = seeded.uniform(-0.04, 0.04, (2, LANES))
     theta = seeded.uniform(-0.03, 0.03, (3, LANES))
@@ -74,7 +74,7 @@ def drawn():
 
 @jax.jit
 def started(offset, theta, twist):
-    """States shortly before the first touch."""
+    """Return states shortly before the first touch."""
     height = touching_height(contact(np.ones(3)), *offset, exponential(vector(theta)))
     pose = jnp.concatenate([offset, height[None], theta])
     return meeting(bodies(), pose, twist, (0.02 + PERIOD / 3) * jnp.ones(LANES))
@@ -94,8 +94,11 @@ def scenario(scales, start):
 
 @jax.jit
 def passes_over(start):
-    """Lanes whose probe goes from the drogue's bottom to its wall, or back, while it touches in space: there
-    the surface's curvature jumps, and steps see it to 1e-8 of the energy, a hundred times worse than else."""
+    """Return the lanes whose probe passes from the drogue's bottom to its wall, or back, in ideal contact.
+
+    The surface's curvature jumps there, and steps conserve the energy to 1e-8, a hundred times worse than
+    elsewhere.
+    """
     space = Space(bodies(), contact(np.ones(3)), ())
     _, seen = follow(space, start, jnp.full(LANES, PERIOD), 300, jnp.full(LANES, 2 * PERIOD))
     at, (probe, _) = seen.pose.position, seen.forces

@@ -113,7 +113,7 @@ def test_episode_does_not_depend_on_the_start_of_its_run(judged):
 
 @partial(jax.jit, static_argnums=(0, 2))
 def followed(loop, given, ticks):
-    """Of every tick the depth on the hardware and in the numerical model, and the model's kinetic energy."""
+    """Return depths on the hardware and in the model, and the model's kinetic energy, at every tick."""
     _, seen = run(loop, {}, given, ticks)
 
     def of(states):
@@ -130,7 +130,7 @@ def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(judged):
         np.asarray(one)[:, BIASED] for one in followed(build_loop(given, **STATIC), given, 400)
     )
     touches, (model, *_) = np.flatnonzero(depths > 0), np.flatnonzero(own >= 0)
-    # Nothing for the delay and two periods, and for the longest that is waited for.
+    # Zero for the delay and two periods, and for the longest waiting time.
     over = touches[-1] + 7 + 100 + 1
     change = energy[over] - energy[model - 1]
     np.testing.assert_allclose(judged.metrics.energy_change[0, BIASED], change, rtol=1e-10)

@@ -215,7 +215,7 @@ JUNK = st.recursive(
 
 
 def places(node, path=()):
-    """The path of every value in a raw table."""
+    """Yield the path of every value in a raw table."""
     entries = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, value in entries:
         yield (*path, key)

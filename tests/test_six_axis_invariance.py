@@ -37,7 +37,7 @@ def bodies():
 
 
 def start(pair):
-    """Either body's states, whatever its frames."""
+    """Return the states of both bodies, whatever their frames."""
     target = build_state(
         pair.target, place([0, 0, 0], BATCH), place([0, 0, 0], BATCH), identity(jnp.ones(1)),
         place([1e-3, 2e-3, -1e-3], BATCH),
@@ -50,7 +50,7 @@ def start(pair):
 
 
 def after(pair, states, group):
-    """The bodies' states after the contact, and the energy lost in it."""
+    """Return the bodies' states after the contact, and the energy lost in it."""
     space, time, longest = Space(pair, (group,), ()), lanes(DURATION, BATCH), lanes(1e-3, BATCH)
 
     @jax.jit
@@ -63,7 +63,7 @@ def after(pair, states, group):
 
 
 def close(found, expected, before):
-    """To 1e-9 of what the contact changed, which is not nothing."""
+    """Compare to 1e-9 of what the contact changed, which is not zero."""
     for one, other, begun in zip(found, expected, before, strict=True):
         for name in ("velocity", "spin", "position"):
             a, b, c = (np.asarray(components(getattr(state, name))) for state in (one, other, begun))
@@ -88,7 +88,7 @@ def test_contact_is_invariant_to_frames_and_names_of_the_bodies():
 
 
 def elsewhere(pair, before):
-    """Of a ball on an oblique plane, with the frames as they are, and moved and turned in their bodies."""
+    """Return a ball's contact with an oblique plane, with the frames unchanged and moved in their bodies."""
     normal, centre = place([[0.2], [-0.1], [0.97]], BATCH), place([[0.1], [0.2], [0.05]], BATCH)
     normal = (1 / np.sqrt(0.2**2 + 0.1**2 + 0.97**2)) * normal
     on_it, radius = place([[0.0], [0.0], [0.052]], BATCH), 0.02 * ONE

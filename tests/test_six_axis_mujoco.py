@@ -24,7 +24,7 @@ MASSES, LENGTH, STIFFNESS = (1800.0, 420.0), 0.5, 2e4
 PLACES = ((0.0, 0.0, 0.0), (0.1, -0.05, 2.6))
 VELOCITIES = ((0.0, 0.0, 0.0), (0.02, 0.01, 0.05))
 ANGULAR = ((0.01, -0.02, 0.005), (-0.03, 0.02, 0.05))
-# Ends of the tethers from the centres of mass, the target's and the chaser's.
+# Ends of the tethers relative to the centres of mass of target and chaser.
 ENDS = [
     ((0.3, 0.1, 1.0), (0.32, 0.12, -1.1187)),
     ((-0.4, 0.2, 0.9), (-0.5, 0.2, -1.2055)),
@@ -41,7 +41,7 @@ def test_twists_agree_with_mujoco(tethers):
 
 
 def ours(tethers, duration):
-    """Velocities of both (world axes), then angular velocities (body axes)."""
+    """Return velocities of both (world axes), then angular velocities (body axes)."""
     bodies = Pair(*(
         plain_body(mass, inertia, (0, 0, 0), BATCH) for mass, inertia in zip(MASSES, FULL, strict=True)
     ))  # fmt: skip

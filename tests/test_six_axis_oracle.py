@@ -61,7 +61,7 @@ CASES = {
 
 
 def started(case):
-    """The case with its bodies: C off T, turned, and moving towards it."""
+    """Place the bodies of the case: C off T, rotated, and moving towards it."""
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     apart = np.array([0.03, -0.025, case["height"]])
     chaser = (o1 + apart - TURN @ o2, np.array([1e-3, -2e-3, -0.025]), TURN, np.array([3e-3, -2e-3, 1e-3]))
@@ -107,7 +107,7 @@ def as_scenario(case):
 
 
 def close(states, expected, tolerance):
-    """Places and velocities against those of the other implementation."""
+    """Compare positions and velocities with those of the other implementation."""
     for state, (r, v, attitude, _) in zip(states, expected, strict=True):
         np.testing.assert_allclose(np.asarray(components(state.velocity))[:, 0], v, atol=tolerance)
         np.testing.assert_allclose(np.asarray(components(state.position))[:, 0], r, atol=tolerance)

@@ -73,7 +73,7 @@ def test_latches_and_robots_are_built_as_specified():
     assert scenario.simulator.delay[:, 0].tolist() == [0.008] * 6 + [0.016] * 6
     own = load_any("claw-two-arms", APART).mechanism
     assert build_scenarios(own).simulator.delay[:, 0].tolist() == [0.008] * 12
-    # Late by the share that each robot has.
+    # Each robot is late by its share.
     lag = 0.9 / (np.pi * np.array([14.0, 12.0]))
     delay = 0.004 + 0.7 * (lag[0] + 0.008) + 0.3 * (lag[1] + 0.016)
     late = meaning(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
@@ -83,7 +83,7 @@ def test_latches_and_robots_are_built_as_specified():
 
 
 def central(name):
-    """A built-in mechanism of one axis, one contact of it, as two bodies that meet on their line."""
+    """Return one contact of a built-in mechanism of one axis as two bodies that meet on their line."""
     one = load_any(name, {"approach.contacts": 1}).mechanism
     raw = to_builtins(one)
     body = {"mass": 2 * one.bodies.mass, "inertia": [3.0, 4.0, 5.0]}
@@ -179,7 +179,7 @@ def test_simulate_runs_a_six_axis_builtin(jaxhil, tmp_path, name):
     np.testing.assert_allclose(np.linalg.norm(parts), episode["twist_error"], rtol=1e-6)
     assert episode["status"] == document["status"] == ("captured" if captured else "rebounded")
     assert (document["meaning"]["frequency"] is None) == captured
-    # Without a force from outside momentum stays what it was: the target's was 0.
+    # Without an external force momentum is constant: the target's was 0.
     mechanism = load_any(name).mechanism
     momenta = [mechanism.target.mass * np.array(document["final"]["v1"])]
     momenta.append(mechanism.chaser.mass * np.array(document["final"]["v2"]))
@@ -202,7 +202,7 @@ def test_simulate_runs_a_six_axis_builtin(jaxhil, tmp_path, name):
 
 
 def check_table(ticks, mechanism, final):
-    """What a table says of bodies, poses and wrenches belongs together, and leads to the end of the run."""
+    """Check that bodies, poses and wrenches of a table are consistent, and lead to the end of the run."""
 
     def of(name, suffixes):
         return np.stack([ticks[f"{name}_{suffix}"] for suffix in suffixes.split()], axis=1)
@@ -216,20 +216,20 @@ def check_table(ticks, mechanism, final):
         own = getattr(mechanism, body)
         assert not np.any(own.interface_rotation)
         places[body] = of(body, "x y z") + turns[body].apply(own.interface)
-    # Where C is against T.
+    # Pose of C relative to T.
     back = turns["target"].inv()
     np.testing.assert_allclose(
         back.apply(places["chaser"] - places["target"]), of("desired", "x y z"), atol=1e-12
     )
     turned = (back * turns["chaser"]).as_rotvec()
     np.testing.assert_allclose(turned, of("desired", "rx ry rz"), atol=1e-12)
-    # What the command does to the chaser in a period.
+    # Effect of the command on the chaser in a period.
     force = turns["target"].apply(of("command", "fx fy fz"))
     change = mechanism.chaser.mass * np.diff(velocities["chaser"], axis=0)
     np.testing.assert_allclose(change, period * force, atol=1e-9 * np.abs(force).max())
     np.testing.assert_allclose(mechanism.target.mass * np.diff(velocities["target"], axis=0), -change,
                                atol=1e-9 * np.abs(force).max())  # fmt: skip
-    # Of the real contact there is a force where something is deep.
+    # The real contact has a force where something is deep.
     depths = [ticks[name] for name in ticks.dtype.names if name.startswith("depth_")]
     forces = [ticks[name] for name in ticks.dtype.names if name.startswith("force_")]
     assert len(depths) == len(forces) > 0 and np.any(np.array(forces)[np.array(depths) > 0] > 0)

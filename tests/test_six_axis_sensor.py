@@ -40,13 +40,13 @@ def tool():
 
 
 def along(time):
-    """Coordinates at a time."""
+    """Return the coordinates at a time."""
     at = MOTION[0] + time * MOTION[1] + time**2 / 2 * MOTION[2]
     return Coordinates(vector(at[:3]), vector(at[3:]))
 
 
 def moving():
-    """Pose, twist and acceleration at time 0."""
+    """Return pose, twist and acceleration at time 0."""
 
     def motion(time):
         return motion_of(*jax.jvp(along, (time,), (jnp.ones_like(time),)))
@@ -113,7 +113,7 @@ def test_wrong_tool_parameters_leave_part_of_gravity():
     lighter = tool_load(carried._replace(mass=0.98 * carried.mass), level, still, still, down)
     left = undo_moving(reading, lighter, level).force - wrench().force
     np.testing.assert_allclose(components(left), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
-    # The contact's own force turns with the measured attitude, too.
+    # The contact's own force rotates with the measured attitude, too.
     tilted = level._replace(attitude=exponential(triple([0.03, 0.0, 0.0])))
     left = undo_moving(read_moving(jax.tree.map(jnp.zeros_like, load), load, level), load, tilted).force
     np.testing.assert_allclose(left.y, 0.03 * 12 * 9.80665, rtol=2e-4)

@@ -1,4 +1,4 @@
-"""Six-axis sweeps: scenarios repeat to the bit; rows and gains on a cluster do not change if a worker dies."""
+"""Six-axis sweeps: scenarios repeat to the bit; a cluster keeps rows and gains if a worker dies."""
 
 import json
 
@@ -34,7 +34,7 @@ def gains(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def here(gains):
-    """Swept here."""
+    """Sweep computed locally."""
     return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
 
 
@@ -49,7 +49,7 @@ def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
     ran = jaxhil("replay", here.folder, 31)
     assert ran.code == 0 and "Episodes" in ran.out and "to the bit" in ran.out
 
-    # What is drawn is that scenario, and no other, until it is over.
+    # The draw is that scenario, and no other, until it ends.
     with computing():
         ticks = recorded(build_sweep(here.manifest), 7)
     touching = ticks.depth.max(axis=1) > 0

@@ -16,7 +16,10 @@ SMITH = {"smith_predictor": 1.0, "smith_hybrid": 0.5}
 
 
 def expected_decay(share, lag, delay):
-    """Of the root of s^2 + omega^2 C(s) e^(-s (lag + delay)) = 0, a share of the predictor's in C."""
+    """Return the decay of the root of s^2 + omega^2 C(s) e^(-s (lag + delay)) = 0.
+
+    C has the given share of the predictor.
+    """
 
     def equation(s):
         force = (1 + share * lag * s / (1 + lag * s / 2)) * (1 + delay * s)
@@ -42,7 +45,7 @@ def test_smith_predictor_loop_grows_as_its_root(name):
     gains = {"phase_lead": delay, "simulator_lag": lag}
     found = without_period(name, 2.5, gains, simulator__delay=lag, force_sensor__delay=delay)
     expected = [expected_decay(SMITH[name], *one) for one in LAGS]
-    # Of second order in T is left, and of a discrete predictor: 1e-4 at these periods.
+    # Errors of second order in T and of a discrete predictor remain: 1e-4 at these periods.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
     assert np.ptp(expected) > 0.005
 

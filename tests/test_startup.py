@@ -33,7 +33,7 @@ DEBUGGING = {
 
 
 def run(*arguments, shell=None, **variables):
-    """A command as a process of its own; `shell` is what a shell puts after it."""
+    """Run a command as a process of its own; `shell` is appended to its command line."""
     command = [*COMMAND, *arguments]
     if shell is not None:
         command = ["bash", "-c", f'"$@" {shell}', "bash", *command]

@@ -68,7 +68,7 @@ def test_hexapod_pose_derivatives_agree_with_differences():
 
 
 def moved(kinematics, axes, amplitude):
-    """Coordinates that the sensor meets while the command swings."""
+    """Return the coordinates that the sensor has while the command swings."""
     shape = jnp.asarray([1.0, -0.5, 0.7, 0.8, 0.6, -0.9])[:, None] * jnp.ones((6, 2))
     number = kinematics.command(shape).shape[0]
     late = lanes([4.4e-3] * number, BATCH)
@@ -102,7 +102,7 @@ def test_two_equal_robots_are_one():
     one, two = (jax.jit(moved, static_argnums=(1, 2)) for _ in range(2))
     expected = np.asarray(one(TaskSpace(), 12.0, 0.01))
     np.testing.assert_allclose(two(TwoRobots(share), 12.0, 0.01), expected, atol=1e-14)
-    # A slow robot of the target shows where it has a share.
+    # A slow robot of the target shows whether it has a share.
     slow = jnp.concatenate([lanes([12.0] * 6, BATCH), lanes([3.0] * 6, BATCH)])
     found = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
     apart = np.max(np.abs(found - expected), axis=(0, 2))

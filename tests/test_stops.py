@@ -42,7 +42,7 @@ def recorded(loaded):
 
 
 def limited(loaded, **limits):
-    """The gain document with these limits."""
+    """Return the gain document with these limits."""
     document = {**loaded.document, "limits": limits_section(limits)}
     return {**document, "sha256": digest(document)}
 
@@ -58,7 +58,7 @@ def test_run_without_limits_is_not_stopped(loaded, recorded):
 
 
 def reaches(lane):
-    """What the nominal run needs of every guard's limit, worked out from its record alone."""
+    """Return the value of every guard's limit that the nominal run needs, from its record alone."""
     signals, period = lane.signals, 1e-3
     same = np.asarray(signals.age)[1:] > 0
     sent = np.asarray(lane.sent)
@@ -164,7 +164,7 @@ def test_verify_names_the_cause_that_stopped_the_closed_loop(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     report = verify(check_document(limited(loaded, **limits)), scenarios=1)
     assert not report.verdict and report.stop.fault == "restitution" and report.stop.contact == 1
-    # Contacts that are not reached for that have no line of their own.
+    # Contacts that are not reached because of that have no line of their own.
     assert len(report.reasons) == 1 and report.reasons[0] == f"closed loop: {report.stop.text}"
     assert [one.status for one in report.closed_loop] == ["ok", "not reached", "not reached"]
     assert verify(loaded, scenarios=1).stop is None

@@ -38,7 +38,7 @@ def repeated(name, probability, repeats):
     return [subset_simulation(performance, inputs, limit(probability), seed) for seed in range(repeats)]
 
 
-# On the way to 1e-6 it passes 1e-4.
+# The run to 1e-6 passes 1e-4.
 @pytest.mark.parametrize("probability", (pytest.param(1e-4, marks=pytest.mark.slow), 1e-6))
 @pytest.mark.parametrize("name", LIMIT_STATES)
 def test_subset_interval_contains_the_probability(name, probability, capsys):
@@ -53,7 +53,7 @@ def test_subset_interval_contains_the_probability(name, probability, capsys):
             end="",
         )
     assert inside >= 17
-    # It says something: well within a factor of two either way.
+    # The interval is informative: well within a factor of two either way.
     assert all(0.5 < result.probability / probability < 2.0 for result in results)
     assert all(result.high / result.low < 5 for result in results)
 
@@ -136,7 +136,7 @@ def test_subset_counts_nonfinite_performance_as_failed(broken):
     results = [subset_simulation(performance, 2, 1e9, seed) for seed in range(20)]
     assert sum(result.low <= truth <= result.high for result in results) >= 17
     assert np.all(np.isinf(results[0].worst_values))
-    # Of equally bad ones the likeliest.
+    # Among equally bad scenarios, the likeliest comes first.
     assert np.all(np.diff(np.sum(results[0].worst_points ** 2, axis=1)) >= 0)
     assert np.all(results[0].worst_points[:, 0] > 3.5) and np.all(results[0].worst_points[:, 0] < 3.7)
 

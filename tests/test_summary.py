@@ -43,13 +43,13 @@ def full_document():
         "approach_velocity": {"low": 0.005, "high": 0.005, "unit": "m/s"},
         "force": {"low": 15.0, "high": 83.0, "unit": "N"},
     }
-    # Values that stand for themselves, and some limits that are none.
+    # Values that stand for themselves, and some missing limits.
     limits = {name: None if place % 7 == 3 else 1.5 + place for place, name in enumerate(LIMITS)}
     return with_limits(made, limits, RATES)
 
 
 class Page(HTMLParser):
-    """The page's text, its tags in balance, and what it refers to."""
+    """The page's text, its balanced tags, and its references."""
 
     def __init__(self, content):
         super().__init__()
@@ -141,7 +141,7 @@ def test_summary_has_one_picture(made, page, tmp_path):
     for colour in COLOURS.values():
         wanted = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
         assert np.sum(np.all(np.abs(pixels - wanted) < 0.02, axis=-1)) > 100, colour
-    # Nothing touches the picture's edge.
+    # Nothing touches the edge of the picture.
     edges = [pixels[:3], pixels[-3:], pixels[:, :3], pixels[:, -3:]]
     assert all(np.all(edge == 1.0) for edge in edges)
 

@@ -29,7 +29,7 @@ MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 
 
 def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
-    """Rows and tally of a sweep."""
+    """Return rows and tally of a sweep."""
     store = open_store(folder, label, resume=True)
     more = {} if computer is None else {"computer": computer}
     _, tally = run_sweep(store, lambda *_: None, lambda number, tally: each(tally), **more)
@@ -39,7 +39,7 @@ def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Computed here."""
+    """Sweep computed locally."""
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
@@ -61,7 +61,7 @@ def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch,
     waited = Event()
 
     def answer(listening):
-        """Whoever still waits after a minute is let go."""
+        """Answer a call; release whoever still waits after a minute."""
         with listening.accept()[0] as accepted:
             accepted.sendall(says)
             waited.wait(60)

@@ -16,8 +16,10 @@ NAN = np.nan
 
 
 def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ideal=(10.0, 1.0)):
-    """Rows of a sweep of two contacts; errors and status (2, lanes); `ideal` peak force [N] and duration [s],
-    beside `peak_force` and a duration of 1 s."""
+    """Return rows of a sweep of two contacts; errors and status are (2, lanes).
+
+    `ideal` holds peak force [N] and duration [s], beside `peak_force` and a duration of 1 s.
+    """
     parsed = check_document(case(2, force_sensor={"range": 1e6})).mechanism
     errors, status = np.array(errors, float), np.array(status, np.int32)
     lanes = errors.shape[1]
@@ -79,7 +81,7 @@ def test_failed_run_is_a_row_with_a_cause():
         "timeout",
         "not reached",
     ]
-    # What is known of a contact that did not end stays; what only its end tells is missing.
+    # Known values of a contact that did not end stay; those that only its end gives are missing.
     np.testing.assert_array_equal(np.isnan(found["restitution_1"]), [True, True, False, False])
     assert np.isfinite(found["peak_force_1"]).all()
     np.testing.assert_array_equal(np.isnan(found["peak_force_2"]), [True, True, False, True])
@@ -93,7 +95,7 @@ def test_force_beyond_the_sensors_range_is_saturation():
 def test_binding_limit_of_the_motion_simulator_is_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
     found = rows(errors, status, shortfall=1e-9)
-    # It says more than an error, and less than a contact that does not end; it is known of that one, too.
+    # It ranks above an error and below a contact that does not end; it is known for that one, too.
     assert outcomes(found) == ["saturated", "saturated", "timeout"] and found["failed"].all()
     np.testing.assert_array_equal(found["position_shortfall_2"], 1e-9)
     assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]
@@ -105,7 +107,7 @@ def test_binding_limit_of_the_motion_simulator_is_saturation():
         ((5.0, 1.0), "good"),
         ((4.99, 1.0), "unlike the ideal contact"),
         ((100.0, 1.0), "good"),  # softer than the ideal contact
-        ((10.0, 0.4981), "good"),  # two control periods of 2 ms are how a duration is counted
+        ((10.0, 0.4981), "good"),  # durations are counted in two control periods of 2 ms
         ((10.0, 0.4979), "unlike the ideal contact"),
         ((10.0, 2.0079), "good"),
         ((10.0, 2.0081), "unlike the ideal contact"),

@@ -36,7 +36,7 @@ def store(gains, tmp_path_factory):
 
 @pytest.fixture
 def own(gains, store, tmp_path):
-    """A store that only one test sees, and the command that goes on with it."""
+    """A store that only one test uses, and the command that continues it."""
     folder = tmp_path / "own"
     shutil.copytree(store, folder)
     return folder, ["sweep", gains, *TINY, "-o", folder, "--limit", "1.5", "--resume"]
@@ -80,7 +80,7 @@ def test_sweep_without_failures_is_good(jaxhil, gains, tmp_path):
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
     assert (tmp_path / "best-sweep" / "manifest.json").is_file()
-    # A title stays in one line above a table that is narrower.
+    # A title stays on one line above a narrower table.
     assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 
 
@@ -146,7 +146,7 @@ KEPT = ("studies/drivers-16.json", "studies/rare-1.6-10x1000.json")
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Subset simulation with few samples, and no pictures."""
+    """Options for subset simulation with few samples, and no pictures."""
     monkeypatch.setattr("tuning.sweeps.studies.rare_failure", partial(rare_failure, samples=20))
     monkeypatch.setattr("tuning.sweeps.pictures.write_pictures", lambda *_: [])
 
@@ -178,7 +178,7 @@ def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
     second = jaxhil(*again, *STUDIES, "--json")
     assert second[1] == first[1]
     assert all(f"as kept in {folder / one}\n" in second[2] for one in KEPT)
-    # Of another argument nothing is kept.
+    # Nothing is saved for another argument.
     with pytest.raises(pytest.fail.Exception):
         jaxhil(*again, "--drivers", "32")
 
@@ -189,7 +189,7 @@ def test_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
     new = [*("sweep", gains, *TINY, "-o", tmp_path / "other", "--limit", "1.5"), *STUDIES]
     ran = jaxhil(*new)
     assert ran[0] == 1 and "as kept" not in ran[2]
-    # The same manifest: the same studies, to the bit.
+    # The same manifest gives the same studies, to the bit.
     for one in KEPT:
         assert (tmp_path / "other" / one).read_bytes() == (folder / one).read_bytes()
     refused(jaxhil(*new), "other", "--resume")
@@ -229,7 +229,7 @@ def test_damaged_study_is_run_again(jaxhil, own, quick):
 
 
 def unwritable(ran, name):
-    """One line and exit code 2; the verdict was printed nevertheless."""
+    """Check for one line and exit code 2; the verdict is printed nevertheless."""
     code, out, err = ran
     assert code == 2 and err.splitlines()[-1].startswith("jaxhil: ") and err.count("jaxhil: ") == 1
     assert f"{name}: cannot be written: " in err.splitlines()[-1]

@@ -21,7 +21,7 @@ from tuning.sweeps.tally import Probability, add_rows, empty_tally, failure_prob
 
 pytestmark = pytest.mark.slow
 
-BAR = 0.935  # of repeated sweeps, for stated 95 %
+BAR = 0.935  # probability of repeated sweeps, for stated 95 %
 SWEEPS, NUMBER = 1000, 256
 LOOK = 32  # scenarios
 LOW, HIGH = 0.002, 0.006  # m/s
@@ -30,7 +30,7 @@ TRUTHS = 0.3, 0.05
 
 
 def repeated(truth, sampling):
-    """The rows of sweeps that differ by their seeds."""
+    """Return the rows of sweeps that differ by their seeds."""
     sensor = {"range": (HIGH - truth * (HIGH - LOW)) * math.sqrt(STIFFNESS * MASS)}
     raw = mechanism({}, IDEAL, 0.0, period=2e-4, force_sensor=sensor)
     parsed = validated({**raw, "uncertainty": SPEEDS})
@@ -59,7 +59,7 @@ def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
         failure_probability(add_rows(empty_tally(replicates, NUMBER), rows))
         for rows in repeated(truth, sampling)
     ]
-    # The pooled sweeps see the closed form itself.
+    # The pooled sweeps agree with the closed form itself.
     pooled = np.mean([one.value for one in found])
     assert pooled == pytest.approx(truth, abs=4 * math.sqrt(truth * (1 - truth) / (SWEEPS * NUMBER)))
     check(found, truth, sampling, capsys)

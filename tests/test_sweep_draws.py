@@ -48,7 +48,7 @@ def test_replicates_are_sobol_sequences_and_no_two_are_the_same():
     replicates = points.reshape(64, REPLICATES, 5)
     for replicate in range(REPLICATES):
         for column in replicates[:, replicate].T:
-            # One point in each of 64 equal cells: what scrambling keeps of the sequence.
+            # One point in each of 64 equal cells: scrambling preserves this property of the sequence.
             np.testing.assert_array_equal(np.sort(np.floor(column * 64)), np.arange(64))
     assert len(np.unique(points[:REPLICATES, 0])) == REPLICATES
     assert np.all((points > 0) & (points < 1))

@@ -38,7 +38,7 @@ def test_manifest_survives_a_round_trip():
 
 
 def test_manifest_has_a_width_if_there_is_one():
-    # Without it a manifest is what it was before there were any.
+    # Without it a manifest is as it was before widths existed.
     assert b"until_width" not in encode(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
     assert decode(encode(wide), "f") == wide and wide.until_width == 0.1

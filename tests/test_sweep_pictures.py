@@ -92,7 +92,7 @@ def test_stiffness_and_force_delay_are_plotted_first(usual):
 def test_inputs_with_strongest_rank_correlation_are_plotted_otherwise(lost):
     made, mechanism, rows = lost
     assert make_plan(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
-    # What drives the error is made known to the plan, against the real one.
+    # The plan gets other sensitivities of the error than the real ones.
     size = rows["approach.phase_2"]
     made_up = {**rows, "worst_error": size, "outcome": np.zeros(NUMBER, int)}
     assert make_plan(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
@@ -244,7 +244,7 @@ def test_every_axis_is_labelled_with_its_unit(request, name, limit):
         FigureCanvasAgg(figure).draw()
         named = [axes for axes in figure.axes if axes.axison]
         assert named
-        # Above a map no axis is named twice, and a colour bar has one.
+        # Above a map no axis is named twice; a colour bar has one.
         mapped = figure is drawn[0] and name != "phases"
         across = named[1:2] if mapped else named
         labels = [*(axes.get_ylabel() for axes in named), *(axes.get_xlabel() for axes in across)]

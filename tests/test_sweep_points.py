@@ -15,7 +15,7 @@ NUMBER = 100
 
 @pytest.fixture(scope="module")
 def asked():
-    """A sweep, points, realisations of noise, and what they give."""
+    """A sweep, points, realisations of noise, and their results."""
     sweep = build_sweep(manifest(case(force_sensor={"noise_std": 1.0})))
     inputs = np.random.default_rng(0).uniform(size=(NUMBER, 3))
     noise = np.arange(NUMBER) % 7
@@ -28,7 +28,7 @@ def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
     ran, found = [], []
 
     def interrupted(sweep, pieces):
-        # As of a cluster: in any order, and none twice.
+        # As on a cluster: in any order, and none twice.
         for number, one in enumerate(run_here(sweep, list(pieces)[::-1])):
             if number == 3:
                 raise KeyboardInterrupt

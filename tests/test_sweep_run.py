@@ -30,7 +30,7 @@ UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a numb
 
 
 class Log(list):
-    """Rows reported, found and computed."""
+    """Log of rows reported, found and computed."""
 
     def __init__(self):
         self.found, self.computed = 0, 0
@@ -209,7 +209,7 @@ def test_sweep_with_parts_in_any_order_stops_at_the_same_look(stopped, tmp_path)
 
     store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, computer=shuffled)
     assert again == tally and parts_of(store) == parts
-    # With gaps too.
+    # The order has gaps too.
     store.part_path(0).unlink()
     store.part_path(2).unlink()
     log = Log()
@@ -222,7 +222,7 @@ def test_sweep_ends_at_its_largest_number_of_scenarios(whole, tmp_path):
     label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
     store, _, tally = Log().sweep(tmp_path / "store", label=label)
     assert tally.scenarios == 300 and same_rows(all_rows(store), rows) == []
-    # What lies beyond the stop of a sweep is removed, should an interruption have left it.
+    # Parts beyond the stop of a sweep are removed if an interruption has left them.
     wide = read_store(store.folder)._replace(manifest=msgspec.structs.replace(label, until_width=WIDE))
     _, tally = run_sweep(wide, lambda *_: None, lambda *_: None)
     assert tally.scenarios < 300 and len(parts_of(store)) == -(-tally.scenarios // 32)

@@ -35,7 +35,7 @@ SLOTS = error_slots(("error",), 2)
 
 
 def made_up(part, label=MANIFEST, seed=0):
-    """Rows of a part, made up, with gaps."""
+    """Return made-up rows of a part, with gaps."""
     first, number = label.part_rows(part)
     generator = np.random.default_rng([seed, part])
     rows = {}
@@ -183,7 +183,7 @@ def test_store_refuses_a_missing_column_by_name(tmp_path):
     difference = "columns: found others than this version writes"
     with refused("other code", difference):
         open_store(folder, MANIFEST, resume=True)
-    # It can still be read, with a word of warning.
+    # It can still be read, with a warning.
     assert unlike_here(read_store(folder).manifest) == [difference] and not unlike_here(MANIFEST)
 
 

@@ -33,7 +33,7 @@ COUNTS = st.integers(0, 2**40)
 
 
 def same(one, other):
-    """The same named tuples to the bit: texts, numbers, arrays, nan and the sign of 0."""
+    """Return whether named tuples are the same to the bit: texts, numbers, arrays, nan and the sign of 0."""
     if isinstance(one, np.ndarray):
         return (one.shape, one.dtype, one.tobytes()) == (other.shape, other.dtype, other.tobytes())
     if isinstance(one, tuple):
@@ -136,12 +136,12 @@ def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
     read = decode(MANIFEST, request, json.dumps(document).encode())
     if read is not None:
         again = json.loads(encode(MANIFEST, request, read))
-        # Another digest, where 1 was said for 1.0.
+        # Another digest, if 1 was written for 1.0.
         assert {**again, "sha256": document["sha256"]} == document
 
 
 def test_study_that_json_cannot_express_is_not_written(store):
-    # Where no nan can be, there is no sign for it.
+    # Where no nan can be, it has no symbol.
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):
@@ -190,7 +190,7 @@ def test_study_is_read_only_for_the_same_arguments_and_sweep(store):
         read_study(store, RareRequest(1.5, samples=500, replicates=2)) is None
         and read_study(store, RareRequest(1.5)) is None
     )
-    # Nor one that another file's name was given to.
+    # The same holds for a study renamed to another file's name.
     os.replace(study_path(store, IndicesRequest(128)), study_path(store, IndicesRequest(64)))
     os.replace(study_path(store, RareRequest(1.5, 1000, 2)), study_path(store, RareRequest(1.6, 1000, 2)))
     assert (

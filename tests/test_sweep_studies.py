@@ -19,7 +19,7 @@ from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_prob
 
 pytestmark = pytest.mark.users_options
 
-# Of a linear contact the error does not depend on how fast it is entered.
+# The error of a linear contact does not depend on its approach speed.
 IDLE = {"approach.velocity": {"distribution": "uniform", "factor": [0.5, 2.0]}}
 
 
@@ -29,7 +29,7 @@ def sweep_of(document, **choices):
 
 @pytest.fixture(scope="module")
 def whole():
-    """A sweep with an input that does nothing, and the rows of all its scenarios."""
+    """A sweep with an input that has no effect, and the rows of all its scenarios."""
     sweep = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     halves = [run_chunk(sweep, first, 1024) for first in (0, 1024)]
     return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
@@ -51,7 +51,7 @@ def test_input_without_effect_has_no_sensitivity(whole):
 
 
 def test_variance_of_a_single_input_is_all_its_own():
-    # One input beside the phase; the law of total variance, by brute force, with the phase's mean in cells.
+    # One input beside the phase: the law of total variance by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
     found = {one.input: one for one in error_indices(sweep, 256).inputs}
     cells = (np.arange(64) + 0.5) / 64
@@ -74,7 +74,7 @@ def test_correlated_inputs_count_as_one():
         "contact.stiffness": [1],
         "approach.phase": [3],
     }
-    # The velocity of a linear contact does nothing: what it comes with has the delay's share.
+    # The velocity has no effect in linear contact: the correlated pair has the delay's share.
     joint, *others = sorted(error_indices(together, 128).inputs, key=lambda one: "delay" not in one.input)
     assert joint.input == "rig.force_sensor.delay + approach.velocity" and len(others) == 2
     alone = next(one for one in error_indices(apart, 128).inputs if "delay" in one.input)
@@ -92,7 +92,7 @@ def test_noise_is_an_input_of_the_study():
     }
     assert shares[NOISE].total_low > 0.1 and found.inputs[0].input != "bodies.equivalent_mass"
     assert shares["bodies.equivalent_mass"].total_high < 1e-3
-    # Without noise nothing is left of it.
+    # Without noise its index is zero.
     quiet = error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
     assert NOISE not in {one.input for one in quiet.inputs}
 
@@ -132,7 +132,7 @@ def test_rare_failures_are_reproducible(whole):
 
 
 def test_other_failures_fail_at_any_limit():
-    # A force sensor that reads no more than a little of the force.
+    # A force sensor that reads only a little of the force.
     sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
     assert rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 

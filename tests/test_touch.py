@@ -35,7 +35,7 @@ SHAPES = {
     "box": Box(place(0.1, 0, 0), TURN, place(0.5, 0.3, 0.1), *numbers(0.05)),
 }
 SLANT = (np.cos(0.75), 0, -np.sin(0.75))
-# A ray from the first point along the second meets the surface at the distance that is given.
+# A ray from the first point along the second meets the surface at the given distance.
 MET = {
     "plane": ((1.1, 0, 0), (-0.6, 0, -0.8), 0.6),
     "ball": ((0.1, 0.2, 1.3), (0, 0, -1), 0.6),
@@ -63,7 +63,7 @@ def test_distance_has_unit_slope_along_its_normal(name):
         return found.distance, normal, slopes, distance(points - found.distance[None] * normal)
 
     distances, normals, slopes, landed = seen(jnp.asarray(POINTS))
-    # On the line between two nearest points of a surface there is no gradient; no point here is on one.
+    # There is no gradient midway between two nearest points of a surface; no test point is there.
     np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1, rtol=1e-12)
     np.testing.assert_allclose(np.broadcast_to(normals, slopes.shape), slopes, atol=1e-9)
     beyond = np.asarray(distances) > -0.02
@@ -100,7 +100,7 @@ def pose_and_twist():
 
 
 def moved(pose, twist, time):
-    """The pose a short time later."""
+    """Return the pose a short time later."""
     turn = exponential(time * twist.angular)
     w = turn.w * pose.attitude.w - jnp.sum(components(turn.v) * components(pose.attitude.v), axis=0)
     u, v = components(turn.v)[:, 0], components(pose.attitude.v)[:, 0]

@@ -72,7 +72,7 @@ class Toy(ContactLaw):
         depth = fitted["stiffness"] / np.maximum(fitted["square"], 1e-9)
         return {**super().file_values(fitted, entry), "contact.doubling_depth": depth}
 '''
-# The file's keys, its refusals and the rig's rehearsal: all of that without JAX.
+# The file's keys, its refusals and the rig's rehearsal all work without JAX.
 WITHOUT_JAX = """
 import sys
 from jaxhil.errors import InputError
@@ -133,7 +133,7 @@ print(contact.law, contact.stiffness[0], contact.damping[0], contact.doubling_de
 
 @pytest.fixture(scope="module")
 def copied(tmp_path_factory):
-    """The package with the toy law in it: one new file and one entry."""
+    """A copy of the package with the toy law: one new file and one entry."""
     folder = tmp_path_factory.mktemp("copy")
     for part in ("jaxhil", "tuning"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))

@@ -71,7 +71,7 @@ class Toy(Compensator):
         self._before = 0.0
 ''',
 }
-# Agreement of JAX and runtime, derivatives, export with the bundle's self-test, of C, too.
+# Agreement of JAX and runtime, derivatives, and export with the bundle's self-test, in C too.
 RUN = (
     "test_compensators.py::test_jax_and_runtime_agree_on_contacts_and_on_noise",
     "test_compensators.py::test_compensator_gain_derivatives_match_finite_differences",
@@ -81,7 +81,7 @@ RUN = (
 
 @pytest.fixture
 def copied(tmp_path):
-    """The repository with a toy law in it."""
+    """A copy of the repository with a toy law in it."""
     folder = tmp_path / "copy"
     for part in ("jaxhil", "tuning", "tests"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))

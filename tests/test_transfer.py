@@ -27,12 +27,12 @@ def claw(*overrides):
 
 
 def behind(simulator):
-    """The claw behind another motion simulator with the delay of its own."""
+    """Return the claw behind another motion simulator with its own delay."""
     return claw(f"rig.simulator={{delay=0.004, model={simulator}}}", "uncertainty={}")
 
 
 def anywhere(mechanism, compensator, seed=0):
-    """Gains anywhere within their bounds."""
+    """Return gains anywhere within their bounds."""
     generator, gains = np.random.default_rng(seed), {}
     for gain in COMPENSATORS[compensator].gains:
         lower, upper = gain.lower(mechanism), gain.upper(mechanism)
@@ -58,7 +58,7 @@ def test_distance_is_zero_to_itself_and_symmetric():
 @pytest.mark.parametrize(
     "override, expected",
     [
-        # Four times as stiff is twice as fast; damping of the same damper counts half as much.
+        # Four times the stiffness is twice as fast; damping of the same damper counts half as much.
         ("contact.stiffness=[497420.0]", math.hypot(math.log(2), math.pi * 0.015)),
         ("contact.damping=[0.0]", math.pi * 0.03),
         ("rig.force_sensor.delay=0.009", math.pi / 2 * OMEGA * 0.005),
@@ -71,7 +71,7 @@ def test_distance_is_zero_to_itself_and_symmetric():
         ("rig.control_period=0.003", math.pi / 2 * OMEGA * 0.002),
         ("contact.law='linear'", math.hypot(1, math.pi * 0.03)),
         ("contact.clearance=0.1", 1.0),
-        # What the restitution does not hang on.
+        # Values that do not change the restitution.
         ("approach.velocity=0.01", 0.0),
         ("name='other'", 0.0),
     ],
@@ -106,7 +106,7 @@ def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
     assert nearest(claw("contact.stiffness=[8e4]"), known).source == "soft"
 
 
-# Carrying over
+# Transfer
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
@@ -133,7 +133,7 @@ def test_transferred_gains_move_with_the_literature_and_the_range():
     # A range of 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
     assert carried["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
     assert carried["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
-    # Logarithmic: one and a half times the literature's one period.
+    # The literature's one period times one and a half, logarithmically.
     assert carried["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
 
 
@@ -171,7 +171,7 @@ def test_prior_starts_replace_the_last_starts(task, validation):
     (points,) = choose_starts(validation, 3, 0, first=[[given]])
     np.testing.assert_array_equal(points[:2], usual[:2])
     assert validation.gains(0, points[2]) == pytest.approx(given, rel=1e-12)
-    # It begins at the very gains: its first value is theirs.
+    # It begins at exactly these gains: its first value is theirs.
     (starts,) = solve_tasks([task], [points], 6)
     errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, given, task.scenarios).error[0], 0)
     assert starts[2].history[0] == pytest.approx(objective_value(RMS, errors), rel=1e-9)
@@ -199,7 +199,7 @@ def test_prior_start_never_ends_worse_than_it_was(task, validation, solved):
 
 @pytest.fixture
 def in_blocks(monkeypatch):
-    """Where starts come from when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
+    """Return the origin of starts when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
     monkeypatch.setattr(tune_all, "BLOCK", 2)
 
     def block(tasks, settings, work, near):

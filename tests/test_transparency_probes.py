@@ -37,7 +37,7 @@ SMALL = TuneSettings(scenarios=4, starts=2, steps=4, validation=15, objective=WE
 
 
 def kind(scenarios, number):
-    """One lane of each scenario: 0 plain, 1 early, 2 late, 3 damped."""
+    """Return one lane of each scenario: 0 plain, 1 early, 2 late, 3 damped."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
@@ -62,7 +62,7 @@ def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
             end = solve_ivp(motion, (0, 0.5), [0, velocity], **tight).y[1, -1]
             assert known[lane] == pytest.approx(-end / velocity, abs=2e-5)
             assert own.reference.restitution[0, lane] == known[lane]
-            # It tells a law that hears the push from one that does not.
+            # The push separates a law that reacts to it from one that does not.
             assert abs(known[lane] - probed.plain[lane]) > 0.01
 
 
@@ -102,7 +102,7 @@ def task():
 
 
 def of_training(task, gains):
-    """Restitution errors of scenarios and of copies, and all peaks' excesses, on the training scenarios."""
+    """Return restitution errors of scenarios and copies, and all peak excesses, in training."""
     outcome = evaluate(task.loop, gains, task.scenarios)
     assert outcome.good[outcome.wanted].all()
     error, excess, _ = (np.asarray(term)[0] for term in contact_terms(outcome))

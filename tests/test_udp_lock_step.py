@@ -43,7 +43,7 @@ def test_first_contacts_are_those_of_the_closed_loop(name):
     found = rig.contacts[: len(wanted)]
     assert [one.restitution for one in found] == [one.restitution for one in wanted]
     assert [one.begun for one in found] == [one.begun for one in wanted]
-    # Run after run, through the lists of the mechanism again and again, at the nominal speed.
+    # Run after run, cycle through the lists of the mechanism at the nominal speed.
     numbers = [one.number for one in rig.contacts]
     assert len(numbers) > len(wanted)
     assert numbers == [i % mechanism.approach.contacts for i in range(len(numbers))]
@@ -52,7 +52,7 @@ def test_first_contacts_are_those_of_the_closed_loop(name):
 
 
 class Unreliable:
-    """Packets lost with a probability, or held back by up to so many ticks."""
+    """Network that loses packets with a probability, or holds them back by up to so many ticks."""
 
     def __init__(self, drops, ticks, seed):
         self.random, self.drops, self.ticks = Random(seed), drops, ticks
@@ -115,7 +115,7 @@ def test_long_gap_is_left_to_the_controller(varying):
     gap = MOST_MADE_UP + 1
     answer = task.answer(a_reading(1 + gap, force=7.0))
     assert task.made_up == 0 and not answer.words and answer.faults & MISSED_TICK
-    # Model time is rig time: it went on under the last force.
+    # Model time is rig time: the model continued under the last force.
     mass, period = mechanism.bodies.equivalent_mass, mechanism.rig.control_period
     assert answer.velocity == pytest.approx(first.velocity - (gap + 1) * period * 7.0 / mass, rel=1e-12)
     tripped = task.answer(a_reading(60, force=7.0))
@@ -233,7 +233,7 @@ def test_tare_comes_before_the_first_run():
     assert law.bias == pytest.approx(3.0, abs=1e-12)
     assert next(i for i, one in enumerate(answers) if one.flags & READY) == 49
     assert rig.contacts and rig.contacts[0].status == "ok"
-    # What is left of the bias would push the model all the way through its approach.
+    # The rest of the bias would push the model all the way through its approach.
     quiet = load("rig-300kg").mechanism
     expected = packets(quiet, controller(quiet, "none", {}), 600)[0].contacts[0]
     assert rig.contacts[0].restitution == pytest.approx(expected.restitution, abs=1e-6)

@@ -94,9 +94,9 @@ def test_ticks_that_took_too_long_are_replayed(varying):
         record.add(tick + 10, cpu, cpu)
     record.keep(encode_reading(a_reading(5), 3))
     record.add(15, 1, 3_000_000_000)
-    assert record.count == record.kept == 4  # what does not fit is not kept
+    assert record.count == record.kept == 4  # rows that do not fit are dropped
     again = replayed(lambda: prepared(mechanism), record, 1e9)
-    # The machine's second is not needed a second time.
+    # The machine's second is not needed again.
     assert list(again) == [11] and 0 < again[11] < 1e9
     assert replayed(lambda: pytest.fail("nothing to go through"), record, 1e10) == {}
 
@@ -131,7 +131,7 @@ def test_contacts_without_commands_because_of_the_machine_are_not_evaluated(vary
 
 
 class Sleepy(EmptyTask):
-    """A rig that is held up once."""
+    """Rig that is held up once."""
 
     held = 0.03
 

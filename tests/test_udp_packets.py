@@ -54,7 +54,7 @@ ANSWER = encode_answer(Answer(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
 
 
 def mutated(packet):
-    """Bytes of any kind: none like a packet, cut, lengthened, or with a few bytes changed."""
+    """Return any bytes: none like a packet, cut, lengthened, or with a few bytes changed."""
     place = st.integers(0, len(packet) - 1)
     change = st.lists(st.tuples(place, st.integers(0, 255)), max_size=4)
 
@@ -136,7 +136,7 @@ def test_single_packet_of_any_number_makes_at_most_a_window_of_others_old(newest
     sequence.is_newer(wild)
     following = newer(sequence, *range(newest + 1, newest + WINDOW + 3))
     first = following.index(True)
-    # Right after the packet, or where that was ahead within the window, from there.
+    # Right after the packet, or from its place if that was ahead within the window.
     assert first <= WINDOW and all(following[first:])
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 
@@ -145,7 +145,7 @@ def test_first_packet_after_many_lost_ones_is_lost_too():
     for gap in (WINDOW + 1, 10**6, 2**31 - 10):
         sequence = Sequence(5)
         assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
-    # A wild one, and another: neither follows the other.
+    # Two wild numbers, neither of which follows the other.
     assert newer(Sequence(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
-    # From behind, never: that may be a record of what was sent before.
+    # Never from behind: that may be a record of what was sent before.
     assert not any(newer(Sequence(2**31), *range(1000)))

@@ -119,7 +119,7 @@ def test_interrupted_rig_reports_what_it_measured(tmp_path):
         seen.append(line)
         if "empty loop" in line:
             break
-    # While the empty loop lasts: the run is never reached.
+    # Interrupt during the empty loop: the run is never reached.
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)

@@ -26,7 +26,7 @@ SILENCE = 0.5  # s
 
 
 class Rig:
-    """One that plays to the process at `address`."""
+    """Rig that plays to the process at `address`."""
 
     def __init__(self, stack, address, number=1):
         self.socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -61,7 +61,7 @@ class Rig:
 
 
 class Process:
-    """The controller's process, its record once it has ended, and rigs for it."""
+    """Process of the controller, its record once it has ended, and rigs for it."""
 
     def __init__(self, folder, stack, *options):
         gains, self._record = folder / "gains.json", folder / "ticks.json"
@@ -74,7 +74,7 @@ class Process:
         return Rig(self._stack, self._address)
 
     def ended(self):
-        """Exit code and record."""
+        """Return exit code and record."""
         code = self._process.wait(20)
         return code, json.loads(self._record.read_text())
 
@@ -87,7 +87,7 @@ class Process:
 
 @pytest.fixture
 def process(tmp_path):
-    """`process(*options)`: a controller's process."""
+    """Return `process(*options)`, which starts a controller's process."""
     with ExitStack() as stack:
 
         def made(*options):
@@ -100,7 +100,7 @@ def process(tmp_path):
 
 @contextmanager
 def flood(*senders):
-    """Packets that are sent while something is waited for: `next` sends one of each."""
+    """Packets that are sent during a wait: `next` sends one of each."""
 
     def once():
         for rig, packet in senders:
@@ -117,7 +117,7 @@ def test_controller_process_answers_its_rig_and_nobody_else(process):
     stranger.open()  # who asks has no session yet
     rig.prepare()
     stranger.tell(a_reading(50))
-    # One packet with the largest number, with the rig's session even: it is not from there.
+    # One packet with the largest number, even with the rig's session, but from another address.
     guesser.session = rig.session
     guesser.tell(a_reading(0, 2**32 - 1))
     guesser.tell(a_reading(0, 99, event=STOP))
@@ -157,7 +157,7 @@ def test_packet_with_wild_number_does_not_block_the_controller(process):
     for number in (2**32 - 1, 2**31, 2**31 - 1, 5000, 0):
         rig.tell(a_reading(0, number))
     assert [rig.ask(a_reading(tick)).tick for tick in range(3)] == [0, 1, 2]
-    # Rig and network were away for long: one packet more is lost.
+    # Rig and network were away for long: one more packet is lost.
     rig.tell(a_reading(3, 5000))
     assert rig.ask(a_reading(4, 5001)).tick == 4
     rig.tell(a_reading(0, 99, event=STOP))
@@ -174,7 +174,7 @@ def test_replayed_packet_is_dropped(process):
         rig.tell(a_reading(tick))
     assert rig.hears_nothing()
     assert rig.ask(a_reading(4)).position > before[-1].position
-    # Nor do such packets keep the session alive.
+    # Such packets do not keep the session alive either.
     begun = time.monotonic()
     with flood((rig, encode_reading(a_reading(4), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:

@@ -19,7 +19,7 @@ NOMINAL = [124355.0, 373065.0, 62177.5]
 
 
 def mechanism_with(path, entry, **values):
-    """The base mechanism with one uncertain key; `values` set other keys, `a__b` for a.b."""
+    """Return the base mechanism with one uncertain key; `values` set other keys, `a__b` for a.b."""
     raw = copy.deepcopy(BASE)
     for dotted, value in values.items():
         *tables, key = dotted.split("__")
@@ -98,7 +98,7 @@ def test_values_in_the_unit_of_a_list_belong_to_its_first_entry():
     assert stats.kstest(values[:, 0], stats.norm(1.0, 0.1).cdf).pvalue > 0.01
     own = draw(mechanism_with("contact.damping", normal | {"independent": True}), 4096, 1)
     assert stats.kstest(own["contact.damping"][:, 1], stats.norm(2.0, 0.1).cdf).pvalue > 0.01
-    # Nominally undamped contact can be given damping.
+    # Nominally undamped contact can get damping.
     undamped = mechanism_with("contact.damping", absolute, contact__damping=[0.0, 0.0])
     values = draw(undamped, 1000, 1)["contact.damping"]
     assert np.all((values >= 2.0) & (values <= 4.0)) and np.all(values[:, 0] == values[:, 1])
@@ -337,7 +337,7 @@ def test_every_draw_lies_between_the_extremes(name):
     ends = extremes(parsed)
     for path, values in draw(parsed, 2000, 5).items():
         assert np.all(np.minimum(*ends[path]) <= values) and np.all(values <= np.maximum(*ends[path]))
-        # They are ends that can be reached, not any bounds.
+        # These ends can be reached; they are not just any bounds.
         assert np.all(np.ptp(ends[path], axis=0) <= 4 * np.ptp(values, axis=0))
 
 

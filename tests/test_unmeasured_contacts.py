@@ -19,7 +19,7 @@ DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # m, where the virtual spring alone
 
 
 def rig(plane: float = 0.0, simulator: dict | None = None, **sensor: float) -> Mechanism:
-    """A contact whose surface lies deeper by `plane` [m]."""
+    """Return a contact whose surface lies deeper by `plane` [m]."""
     made = mechanism(
         {}, simulator or {"model": "ideal"}, 0.004, 2, force_sensor=sensor, period=1e-3, contact_plane=plane
     )
@@ -27,7 +27,7 @@ def rig(plane: float = 0.0, simulator: dict | None = None, **sensor: float) -> M
 
 
 def run(made: Mechanism, seed: int = 0):
-    """Statuses and peak forces of the contacts, as simulated and as the rig's own watch has them."""
+    """Return statuses and peak forces of the contacts, from the simulation and from the rig's watchdog."""
     _, gains = choose_gains(made, "virtual_contact", {"virtual_stiffness": VIRTUAL, "virtual_damping": 0.0})
     simulated = jaxhil.simulate(made, "virtual_contact", gains, seed=seed)
     watched, _ = closed_loop(made, "virtual_contact", gains)

@@ -84,28 +84,28 @@ def test_verification_with_the_same_seed_gives_the_same_report(varying):
 
 
 class Late(ON_THE_RIG["response_error"]):
-    """Forgets what it identified when the next contact begins."""
+    """Runtime that forgets the identification when the next contact begins."""
 
     def next_contact(self):
         self.reset()
 
 
 class Loose(ON_THE_RIG["response_error"]):
-    """Rounds in single precision."""
+    """Runtime that rounds in single precision."""
 
     def step(self, *signals):
         return float(np.float32(super().step(*signals)))
 
 
 class Leading(ON_THE_RIG["response_error"]):
-    """Commands a position ahead of the numerical model."""
+    """Runtime that commands a position ahead of the numerical model."""
 
     def position_command(self, position, velocity, acceleration):
         return position + 1e-6 * velocity
 
 
 class Failing(ON_THE_RIG["response_error"]):
-    """Divides by zero at high force."""
+    """Runtime that divides by zero at high force."""
 
     def step(self, force, *others):
         return super().step(force / (force < 20.0), *others)
@@ -146,7 +146,7 @@ def test_verification_refuses_single_precision(varying):
 
 
 def lane_of(measured, force, gain_file):
-    """The lane whose commands the runtime itself gives for these readings."""
+    """Return the lane whose commands the runtime itself gives for these readings."""
     ticks = len(measured)
     signals = Signals(
         np.array(force, float),
@@ -172,23 +172,23 @@ def test_verification_counts_ticks_near_a_threshold(gain_file):
     measured[20] = 3e-18  # instead of 0: in contact, but by less than rounding
     force = np.where(measured > 0, 1e5 * measured, 0.0)
     force[30] = 10.0 * (1 + 1e-12)
-    force[3] = 10.0  # not in contact: nothing is decided by this force
+    force[3] = 10.0  # not in contact: this force decides nothing
     lane = lane_of(measured, force, gain_file)
     assert np.nonzero(near_threshold(lane.signals, gain_file))[0].tolist() == [22, 30]
     seen = replay(lane, gain_file)
     assert (seen.ticks, seen.compared, seen.near, seen.parted) == (40, 40, 2, None)
     assert seen.difference == seen.near_difference == 0.0
-    # Of a second surface at -9e-5 m: the force of tick 3 decides, and so does the position at tick 4.
+    # Second surface at -9e-5 m: the force of tick 3 decides, and so does the position at tick 4.
     two_sided = gain_file._replace(clearance=9e-5)
     assert np.nonzero(near_threshold(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
 
 
 def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
     measured = np.arange(-20, 20) * 5e-6
-    measured[20:23] = -3e-18, 3e-18, 6e-18  # a standstill at the surface: rounding has the say
+    measured[20:23] = -3e-18, 3e-18, 6e-18  # standstill at the surface: rounding decides
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
     lane = lane_of(measured, force, gain_file)
-    # The other side took the second of these ticks to be free: no response, nothing identified.
+    # The other side took the second of these ticks as free: no response, nothing identified.
     measured[21] = -3e-18
     other = lane_of(measured, force, gain_file)
     parted = replay(lane._replace(command=other.command, identified=other.identified), gain_file)

@@ -34,7 +34,7 @@ CHOSEN = {
 
 
 def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
-    """Damped contacts in coarse ticks, compensated so that some runs are good and some are not."""
+    """Return damped contacts in coarse ticks, compensated so that some runs are good and some are not."""
     contact = {"damping": [400.0], **contact}
     raw = mechanism(contact, {**SECOND_ORDER, "natural_frequency": 20.0}, **parts)
     parsed = validated({**raw, "uncertainty": UNCERTAIN})

@@ -29,7 +29,7 @@ def bits(value):
 
 
 def document(values, limits):
-    """A document whose gains have these values, whatever a compensator would say of them."""
+    """Return a document whose gains have these values, whatever a compensator would say of them."""
     made = copy.deepcopy(gain_document("response_error"))
     for name, value in zip(made["gains"], values, strict=True):
         made["gains"][name]["value"] = value
@@ -109,7 +109,7 @@ def test_matlab_struct_is_read_back(made):
 
 
 def mat_elements(content):
-    """(type, bytes) of the elements of MATLAB's level 5 format, as its published description has them."""
+    """Yield (type, bytes) of the elements of MATLAB's level 5 format, by its published description."""
     place = 0
     while place < len(content):
         kind, size = struct.unpack_from("<II", content, place)
@@ -122,7 +122,7 @@ def mat_elements(content):
 
 
 def mat_value(content):
-    """The value of a matrix element: a struct of one element, a text, or a matrix of doubles."""
+    """Return the value of a matrix element: a struct of one element, a text, or a matrix of doubles."""
     parts = list(mat_elements(content))
     kind = parts[0][1][0]
     if kind == 2:
