@@ -161,15 +161,15 @@ def test_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
 @where_kept
 @pytest.mark.parametrize("changed", ["jaxhil", "tuning"])
 def test_program_is_rebuilt_if_sources_change(tmp_path, monkeypatch, changed):
-    kept = tmp_path / "kept"
-    kept.mkdir()
+    folder = tmp_path / "kept"
+    folder.mkdir()
     importlib.import_module("tuning")
-    run(kept)
+    run(folder)
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").write_text("changed = True\n")
     monkeypatch.setattr(importlib.import_module(changed), "__file__", str(package / "__init__.py"))
-    check(run(kept))
+    check(run(folder))
     assert len(traced) == 2
 
 
@@ -278,8 +278,8 @@ def test_cached_program_solves_equations_in_process_that_traced_none(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
     run = partial(subprocess.run, [sys.executable, str(script)], capture_output=True, text=True, check=True)
-    said = [run(env={**os.environ, CACHE: str(tmp_path)}).stdout for _ in range(2)]
-    assert said == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
+    outputs = [run(env={**os.environ, CACHE: str(tmp_path)}).stdout for _ in range(2)]
+    assert outputs == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
 
 
 @where_kept

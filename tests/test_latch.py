@@ -32,19 +32,19 @@ def test_latch_captures_deep_aligned_bodies_and_holds_them():
     """Check for no force before the capture, none at first, and a spring from there on."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
-    held = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
+    state = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
     step = jax.jit(latch_wrench)
     for position, theta in (([0, 0, -5e-4], [0, 0, 0]), ([0, 0, -2e-3], [0.06, 0, 0])):
-        wrench, held = step(one, held, at(position, theta), still)
-        assert not held.caught.any() and not np.any(components(wrench.force))
+        wrench, state = step(one, state, at(position, theta), still)
+        assert not state.caught.any() and not np.any(components(wrench.force))
     caught = [3e-3, 0, -2e-3]
-    wrench, held = step(one, held, at(caught, [0.01, 0, 0]), still)
-    assert held.caught.all() and np.max(np.abs(components(wrench.force))) < 1e-12
+    wrench, state = step(one, state, at(caught, [0.01, 0, 0]), still)
+    assert state.caught.all() and np.max(np.abs(components(wrench.force))) < 1e-12
     # Also from far away, and about T's origin.
-    wrench, held = step(one, held, at([3e-3, 0, 0.098], [0.01, 0, 0]), still)
+    wrench, state = step(one, state, at([3e-3, 0, 0.098], [0.01, 0, 0]), still)
     np.testing.assert_allclose(components(wrench.force)[:, 0], [0, 0, -2e4], atol=1e-9)
     np.testing.assert_allclose(components(wrench.moment)[:, 0], [0, 3e-3 * 2e4, 0], atol=1e-9)
-    assert held.caught.all()
+    assert state.caught.all()
 
 
 @pytest.mark.slow
@@ -62,18 +62,18 @@ def test_latches_together_hold_as_much_as_each_alone():
     def after(latches):
         held = init_latch(latches, at([0, 0, 0.01], [0, 0, 0]))
         poses = [([0, 0, -5e-3], [0.02, 0, 0]), ([0.01, 0, -8e-3], [0.01, 0.02, 0.03])]
-        given = jax.tree.map(lambda *parts: jnp.stack(parts), *(at(*pose) for pose in poses))
-        return jax.lax.scan(lambda held, pose: latch_wrench(latches, held, pose, motion)[::-1], held, given)
+        stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *(at(*pose) for pose in poses))
+        return jax.lax.scan(lambda held, pose: latch_wrench(latches, held, pose, motion)[::-1], held, stacked)
 
     held, together = after(all_three)
     assert held.caught.shape == (3, 1) and held.caught.all()
     # Alone: the other latches are never deep enough.
     alone = [after(all_three._replace(depth=jnp.where(one[:, None], 1e-3, jnp.inf))) for one in np.eye(3) > 0]
     assert all(held.caught.sum() == 1 for held, _ in alone)
-    for found, *parts in zip(
+    for result, *parts in zip(
         *map(jax.tree.leaves, (together, *(wrench for _, wrench in alone))), strict=True
     ):
-        np.testing.assert_allclose(found, sum(parts), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(result, sum(parts), rtol=1e-9, atol=1e-9)
     assert np.max(np.abs(components(together.force))) > 1e3
 
 
@@ -84,11 +84,11 @@ def test_latch_spring_is_conservative():
     way = 0.8 * np.stack([np.cos(phase) - 1, np.sin(phase), 0.5 * np.sin(2 * phase)])
     rates = 0.8 * np.stack([-np.sin(phase), np.cos(phase), np.cos(2 * phase)])
     one, still = latch(True), Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
-    held = init_latch(one, at([0, 0, 0], [0, 0, 0]))
+    state = init_latch(one, at([0, 0, 0], [0, 0, 0]))
 
     @jax.jit
     def power(theta, rate):
-        wrench, _ = latch_wrench(one, held, Pose(still.linear, exponential(vector(theta))), still)
+        wrench, _ = latch_wrench(one, state, Pose(still.linear, exponential(vector(theta))), still)
         angular = left_jacobian(vector(theta), vector(rate))
         return jnp.sum(components(wrench.moment) * components(angular))
 

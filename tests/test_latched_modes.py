@@ -77,8 +77,8 @@ def test_latched_modes_grow_under_delay_as_characteristic_roots(delays):
     if len(set(delays)) == 1:
         by_lambert = 2 / late[0] * lambertw(1j * np.max(frequencies) * late[0] / 2)
         np.testing.assert_allclose(root, by_lambert, rtol=1e-9)
-    found = _growth(signal[:, 200::APART], root)
-    assert abs(found - root) < 1e-4 * abs(root), (found, root)
+    result = _growth(signal[:, 200::APART], root)
+    assert abs(result - root) < 1e-4 * abs(root), (result, root)
 
 
 def test_response_error_with_true_stiffness_removes_the_rig():

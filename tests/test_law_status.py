@@ -93,7 +93,7 @@ def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
     position, velocity = model.start
     model.place(position, velocity)
     plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
-    rows, faults, said = [], [], []
+    rows, faults, statuses = [], [], []
     for tick in range(LONGEST):
         force, measured = plant.read()
         readings = [force, model.position, model.velocity, measured, tick * period]
@@ -103,12 +103,12 @@ def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
         plant.move(law.position_command(*motion))
         rows.append([c99_cases.TICK, *readings, 1.0, *motion])
         faults.append(law.faults)
-        said.append(law.law_status)
+        statuses.append(law.law_status)
         touching = readings[1] > surface or measured > surface
         entered, quiet = entered or touching, 0 if touching else quiet + 1
         if entered and quiet > AFTER:
             break
-    return Ran(np.array(rows), np.array(faults), said)
+    return Ran(np.array(rows), np.array(faults), statuses)
 
 
 def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainFile]:
@@ -137,16 +137,16 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
 )
 def test_contact_status_is_the_status_of_most_ticks(name, limits):
     """Expect it after the contact, on one tick, without a trip; with the energy audit and without."""
-    law, found = ran(name, limits)
+    law, result = ran(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
     assert (record.number, record.status) == (1, wanted)
     assert law.status == "ok" and names(law.seen) == ([] if wanted == "identified" else ["law_in_doubt"])
-    (raised,) = np.nonzero(found.faults) if wanted != "identified" else ([len(found.faults)],)
+    (raised,) = np.nonzero(result.faults) if wanted != "identified" else ([len(result.faults)],)
     assert len(raised) == 1
-    said = found.said[: raised[0]]
-    assert record.ticks == len(said) - said.count("out_of_contact") > 50
+    statuses = result.said[: raised[0]]
+    assert record.ticks == len(statuses) - statuses.count("out_of_contact") > 50
     for status in ("unsure", "saturated", "too_short", "noisy"):
-        assert getattr(record, status) == said.count(status)
+        assert getattr(record, status) == statuses.count(status)
 
 
 @pytest.mark.parametrize("nearer", [1e-3, 4e-3])
@@ -259,8 +259,8 @@ def test_contact_under_way_is_evaluated_when_next_is_announced():
     for limits in LIMITS.values():
         mechanism, made = gain_file(KINDS["8 Hz"], {**limits, "settling": 5.0})
         law = Controller(made)
-        found = run(mechanism, law)
-        assert not np.any(found.faults) and law.last_contact.number == 0
+        result = run(mechanism, law)
+        assert not np.any(result.faults) and law.last_contact.number == 0
         law.next_contact()
         assert law.faults == law.seen == LAW_IN_DOUBT and not law.tripped
         assert law.last_contact[:2] == (1, "too_short")
@@ -272,8 +272,8 @@ def test_restitution_trip_reports_status_of_the_law():
     """Expect both faults on one tick; a fault that does not trip is no cause."""
     mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
     law = Controller(made)
-    found = run(mechanism, law)
-    assert RESTITUTION | LAW_IN_DOUBT in found.faults and law.cause == RESTITUTION
+    result = run(mechanism, law)
+    assert RESTITUTION | LAW_IN_DOUBT in result.faults and law.cause == RESTITUTION
     assert law.status.startswith("tripped: restitution (contact 1: restitution ")
     assert law.status.endswith(", law too short)")
 
@@ -282,8 +282,8 @@ def test_restitution_trip_reports_status_of_the_law():
 def test_laws_without_status_report_none(name):
     mechanism = load("suite-noisy").mechanism
     law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
-    found = run(mechanism, law)
-    assert set(found.said) == {"unstated"} and law.last_contact == ContactRecord()
+    result = run(mechanism, law)
+    assert set(result.said) == {"unstated"} and law.last_contact == ContactRecord()
     law.next_contact()
     assert not law.seen & LAW_IN_DOUBT and law._watchdog.contacts == 1
     assert law.last_contact.number == 0
@@ -326,8 +326,8 @@ def test_contact_status_follows_from_status_counts(counts, status):
 def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = ()) -> Iterator[Mechanism]:
     """Yield that many draws of a suite, with the changes."""
     drawn = draw(load(f"suite-{suite}", list(changes)).mechanism, number, seed)
-    for place in range(number):
-        one = {path: values[place].tolist() for path, values in drawn.items()}
+    for index in range(number):
+        one = {path: values[index].tolist() for path, values in drawn.items()}
         one["approach.phase"] = one["approach.phase"][0]
         yield load(
             f"suite-{suite}", [*changes, *(f"{path}={value}" for path, value in one.items())]
@@ -343,14 +343,14 @@ def test_share_of_doubtful_ticks_separates_short_contacts(suite):
     """
     contacts = 200
     doubt, short = np.empty((2, contacts))
-    for place, mechanism in enumerate(contacts_of(suite, 5, contacts)):
+    for index, mechanism in enumerate(contacts_of(suite, 5, contacts)):
         law = controller(mechanism, LAW, literature_gains(mechanism, LAW))
-        run(mechanism, law, place)
+        run(mechanism, law, index)
         record = law.last_contact
         assert record.number == 1
         doubts = record.unsure + record.too_short + record.noisy
-        doubt[place] = doubts / record.ticks
-        short[place] = record.too_short > 0
+        doubt[index] = doubts / record.ticks
+        short[index] = record.too_short > 0
     known = doubt[short == 0]
     print(
         f"{suite}: {len(known)} contacts that are not too short, in doubt on up to "
@@ -390,17 +390,17 @@ WRONG = {
 def test_identified_contacts_hardly_ever_err(wrong):
     """Expect few errors above 1.5 %, whatever is wrong; if nothing is wrong, 98 in 100 are identified."""
     (changes, known), contacts = WRONG[wrong], 100
-    told = load("suite-noisy", list(known)).mechanism
+    mechanism_known = load("suite-noisy", list(known)).mechanism
     odd = identified = 0
     for suite in ("noisy", "hertz", "hardening", "layered"):
-        errors, said = np.empty(contacts), []
-        for place, mechanism in enumerate(contacts_of(suite, 6, contacts, (*changes, *known))):
-            law = controller(mechanism, LAW, literature_gains(told, LAW))
-            velocity = run(mechanism, law, place).rows[:, ROW.index("velocity")]
-            errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
-            said.append(law.last_contact.status)
-        counts = {status: said.count(status) for status in sorted(set(said))}
-        passed = np.abs(errors[[status == "identified" for status in said]])
+        errors, statuses = np.empty(contacts), []
+        for index, mechanism in enumerate(contacts_of(suite, 6, contacts, (*changes, *known))):
+            law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
+            velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
+            errors[index] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
+            statuses.append(law.last_contact.status)
+        counts = {status: statuses.count(status) for status in sorted(set(statuses))}
+        passed = np.abs(errors[[status == "identified" for status in statuses]])
         rms = float(np.sqrt(np.mean(errors**2)))
         print(f"{wrong}, {suite}: error {rms:.2f} % rms, {np.max(np.abs(errors)):.2f} % at most")
         print(f"  {counts}, identified: {np.max(passed, initial=0.0):.2f} % at most")
@@ -424,15 +424,15 @@ def restitution(mechanism: Mechanism) -> float:
 @pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
 def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
     """Cover a damper whose loss is offset by the unmodelled lag, so that it reads like no damper."""
-    contacts, told = 60, load("suite-damped").mechanism
-    errors, said = np.empty(contacts), []
+    contacts, mechanism_known = 60, load("suite-damped").mechanism
+    errors, statuses = np.empty(contacts), []
     changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()
-    for place, mechanism in enumerate(contacts_of("damped", 6, contacts, changes)):
-        law = controller(mechanism, LAW, literature_gains(told, LAW))
-        velocity = run(mechanism, law, place).rows[:, ROW.index("velocity")]
-        errors[place] = 100 * (abs(velocity[-1]) / velocity[0] - restitution(mechanism))
-        said.append(law.last_contact.status)
-    identified = np.array([status == "identified" for status in said])
+    for index, mechanism in enumerate(contacts_of("damped", 6, contacts, changes)):
+        law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
+        velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
+        errors[index] = 100 * (abs(velocity[-1]) / velocity[0] - restitution(mechanism))
+        statuses.append(law.last_contact.status)
+    identified = np.array([status == "identified" for status in statuses])
     wrong = np.sum(identified & (np.abs(errors) > 1.5))
     print(f"damped, lag {lag:g} s: error {np.sqrt(np.mean(errors**2)):.2f} % rms, {np.sum(identified)} of")
     print(f"  {contacts} identified, of these {wrong} wrong by more than 1.5 %")
@@ -444,8 +444,8 @@ def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
 def test_slow_contacts_are_identified():
     """Run contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
-    told = load("suite-noisy", list(changes)).mechanism
-    for place, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):
-        law = controller(mechanism, LAW, literature_gains(told, LAW))
-        run(mechanism, law, place)
-        assert law.last_contact.status == "identified", place
+    mechanism_known = load("suite-noisy", list(changes)).mechanism
+    for index, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):
+        law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
+        run(mechanism, law, index)
+        assert law.last_contact.status == "identified", index

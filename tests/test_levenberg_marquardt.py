@@ -60,9 +60,9 @@ def test_minimum_on_bounds_is_that_of_bounded_linear_least_squares():
     starts = np.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])
     solution = solve(tilted, None, targets, bounds, starts, np.array(30))
     matrix = np.array([[1.0, 0.9], [0.9, 1.0], [0.1, -0.1]])
-    for target, found, curvature in zip(targets, solution.coordinates, solution.curvature, strict=True):
+    for target, result, curvature in zip(targets, solution.coordinates, solution.curvature, strict=True):
         best = lsq_linear(matrix, matrix @ target, bounds=(0, 1), tol=1e-12).x
-        np.testing.assert_allclose(found, best, atol=2e-5)
+        np.testing.assert_allclose(result, best, atol=2e-5)
         np.testing.assert_allclose(curvature, matrix.T @ matrix)
 
 

@@ -69,11 +69,11 @@ def test_explicit_integrator_answers_a_tick_late():
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
     moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]
-    found = integrator_of_all(moved, 1e-3)
-    assert found == "explicit_euler" and integrator_of_all(runs[:0], 1e-3) is None
-    check_rows_of(moved, timing, found)
+    result = integrator_of_all(moved, 1e-3)
+    assert result == "explicit_euler" and integrator_of_all(runs[:0], 1e-3) is None
+    check_rows_of(moved, timing, result)
     with pytest.raises(InputError, match=r'"sent", but .* allowed row = "tick" or computing_delay = 1$'):
-        check_rows_of(moved, replace(timing, row="sent"), found)
+        check_rows_of(moved, replace(timing, row="sent"), result)
 
 
 def test_tick_of_readings_is_not_reported_without_noise_or_enough_runs():

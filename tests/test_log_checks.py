@@ -21,9 +21,9 @@ def model(integrator, row, sign=1):
     """Return commands of a model under a given force, and the rows in which a logger writes them."""
     times = PERIOD * np.arange(900)
     force = 40 * np.sin(np.pi * times / 0.25) ** 2 * ((times > 0.1) & (times < 0.6))
-    x, v, found = -5e-3, 0.02, []
+    x, v, result = -5e-3, 0.02, []
     for one in force:
-        found.append((x, v))
+        result.append((x, v))
         a = -one / MASS
         if integrator == "semi_implicit_euler":
             v += PERIOD * a
@@ -32,7 +32,7 @@ def model(integrator, row, sign=1):
             x, v = x + PERIOD * v + PERIOD**2 * a / 2, v + PERIOD * a
         else:
             x, v = x + PERIOD * v, v + PERIOD * a
-    x, v = np.array(found).T
+    x, v = np.array(result).T
     shift = 1 if row == "sent" else 0
     xd, vd, force = x[shift:], v[shift:], force[: len(x) - shift]
     xm = np.concatenate([x[0] - 2e-5 * np.arange(LAG, 0, -1), x[:-LAG]])[: len(xd)]
@@ -45,8 +45,8 @@ def test_rows_of_another_tick_are_detected_with_any_integrator(tmp_path, integra
     path = write_csv(tmp_path / "a.csv", model(integrator, row))
     assert read(path, timing={"row": row}).runs[0].kind == "contact"
     other = "tick" if row == "sent" else "sent"
-    assert f'timing.row: found "{other}"' in (found := message(path, timing={"row": other}))
-    assert f'({integrator}) in rows that are "{row}"' in found
+    assert f'timing.row: found "{other}"' in (result := message(path, timing={"row": other}))
+    assert f'({integrator}) in rows that are "{row}"' in result
     if row == "tick":
         assert read(path, timing={"row": "after"}).notes == ()
 
@@ -103,8 +103,8 @@ def test_wrong_channels_of_a_free_run_are_detected(tmp_path):
 
 
 def test_held_readings_are_noted(tmp_path):
-    held = sway() | {"xm": np.repeat(sway()["xm"][::4], 4)}
-    (note,) = read(write_csv(tmp_path / "a.csv", held), "free").notes
+    log = sway() | {"xm": np.repeat(sway()["xm"][::4], 4)}
+    (note,) = read(write_csv(tmp_path / "a.csv", log), "free").notes
     assert "the same in 75 % of rows, as if each reading was held for 4 of them" in note
     rounded = sway() | {"xm": np.round(sway()["xm"], 5)}
     assert read(write_csv(tmp_path / "b.csv", rounded), "free").notes == ()

@@ -21,12 +21,12 @@ def stamps(rows=20_000, jitter=0.0, drift=0.0, lost=(), seed=0):
 def test_every_row_gets_its_tick(jitter, drift):
     lost = [5, 700, 701, 702, 703, *range(3000, 3060), 12_000, 12_002, 19_998]
     times, tick = stamps(jitter=jitter, drift=drift, lost=lost)
-    found = ticks_of(times, PERIOD, "a")
-    np.testing.assert_array_equal(found.tick, tick)
-    assert found.clock.lost == len(lost)
+    result = ticks_of(times, PERIOD, "a")
+    np.testing.assert_array_equal(result.tick, tick)
+    assert result.clock.lost == len(lost)
     # The slope of a line through n points that scatter by s has a standard deviation of s sqrt(12 / n^3) / T.
-    assert abs(found.clock.drift - 1e6 * drift) < 1e-3 + 4e6 * jitter / PERIOD * np.sqrt(12 / 20_000**3)
-    assert abs(found.clock.jitter - jitter) <= 0.03 * jitter + 1e-3 * PERIOD
+    assert abs(result.clock.drift - 1e6 * drift) < 1e-3 + 4e6 * jitter / PERIOD * np.sqrt(12 / 20_000**3)
+    assert abs(result.clock.jitter - jitter) <= 0.03 * jitter + 1e-3 * PERIOD
 
 
 def test_rows_with_a_stamp_in_a_neighbouring_tick_stay_in_order():
@@ -40,8 +40,8 @@ def test_few_rows_and_counted_rows_get_their_ticks():
     for rows in (2, LOT - 1, LOT, LOT + 1, 2 * LOT + 1):
         times, tick = stamps(rows)
         np.testing.assert_array_equal(ticks_of(times, PERIOD, "a").tick, tick)
-    found = counted(7, PERIOD)
-    assert found.tick.tolist() == [*range(7)] and found.clock.jitter == found.clock.lost == 0
+    result = counted(7, PERIOD)
+    assert result.tick.tolist() == [*range(7)] and result.clock.jitter == result.clock.lost == 0
 
 
 def test_unusable_stamps_are_refused():

@@ -112,11 +112,11 @@ def test_log_formats_give_the_same_campaign(tmp_path, name, write):
         pytest.importorskip("pymatreader")
     path, columns = write(tmp_path / name)
     absent = dict.fromkeys(set(CHANNELS) - set(columns))
-    (found,) = read(path, **columns, **absent).runs
+    (result,) = read(path, **columns, **absent).runs
     (text,) = read(write_csv(tmp_path / "text.csv", LOG), **absent).runs
-    np.testing.assert_array_equal(found.tick, text.tick)
+    np.testing.assert_array_equal(result.tick, text.tick)
     for channel in set(columns) - {"time"}:
-        np.testing.assert_array_equal(getattr(found, channel), getattr(text, channel))
+        np.testing.assert_array_equal(getattr(result, channel), getattr(text, channel))
     with pytest.raises(InputError, match="column 'nothing': found none of this name, allowed"):
         read(path, **columns | {"position_desired": "nothing"}, **absent)
 
@@ -128,11 +128,11 @@ def test_torn_log_or_missing_library_is_refused_in_one_line(tmp_path, suffix):
     path.write_bytes(b"torn" * 100)
     with pytest.raises(InputError) as caught:
         open_log(path).read(["t"])
-    found = str(caught.value)
-    assert found.startswith(f"{path}: ") and found.isprintable()
+    result = str(caught.value)
+    assert result.startswith(f"{path}: ") and result.isprintable()
     assert (
-        "cannot be read: " in found
-        or "which is not installed: python3 -m pip install 'jaxhil[logs]'" in found
+        "cannot be read: " in result
+        or "which is not installed: python3 -m pip install 'jaxhil[logs]'" in result
     )
 
 
@@ -209,9 +209,9 @@ OWN_CLOCKS = [
 def test_channels_that_begin_apart_are_read_at_their_own_times(tmp_path, name, write, late):
     """Expect the force of the command's tick, whatever row it is written in."""
     path, columns = write(tmp_path / name, LOG, late)
-    found = read(path, **columns)
-    (run,) = found.runs
-    assert any("F" in note and "has a clock of its own" in note for note in found.notes)
+    result = read(path, **columns)
+    (run,) = result.runs
+    assert any("F" in note and "has a clock of its own" in note for note in result.notes)
     shift = round(late / PERIOD)
     first = np.flatnonzero(LOG["xd"] == run.position_desired[0])[0]
     rows = np.arange(first, first + len(run.tick))
@@ -231,13 +231,13 @@ def test_channels_of_other_rates_and_clocks_are_read_or_refused_in_one_line(tmp_
         read(path, **columns | {"time": "vd", "velocity_desired": None})
     asammdf = pytest.importorskip("asammdf")
     fast = np.arange(0.1, 0.55, 1e-4)
-    for place, (times, values) in enumerate(((fast, np.interp(fast, LOG["t"], LOG["F"])),
+    for index, (times, values) in enumerate(((fast, np.interp(fast, LOG["t"], LOG["F"])),
                                              (LOG["t"][::2], LOG["F"][::2]))):  # fmt: skip
         with asammdf.MDF() as file:
             names = [name for name in LOG if name not in ("t", "F")]
             file.append([asammdf.Signal(samples=LOG[n], timestamps=LOG["t"], name=n) for n in names])
             file.append([asammdf.Signal(samples=values, timestamps=times, name="F")])
-            file.save(tmp_path / f"{place}.mf4")
+            file.save(tmp_path / f"{index}.mf4")
     (run,) = read(tmp_path / "0.mf4", **columns).runs
     assert 448 <= len(run.tick) <= 450
     first = np.flatnonzero(LOG["xd"] == run.position_desired[0])[0]

@@ -28,17 +28,17 @@ def test_draft_mapping_reads_its_logs(tmp_path, names, factors):
     other = write_csv(tmp_path / "morning.csv", dict(zip(names, columns, strict=True)))
     text = draft([day, other])
     (tmp_path / "map.toml").write_text(text.replace("# [bodies]", "[bodies]").replace("# equ", "equ"))
-    found = read_campaign([day, other], load_mapping(tmp_path / "map.toml"))
-    assert [run.kind for run in found.runs] == ["contact", "free"]
-    np.testing.assert_allclose(found.runs[0].position_desired, LOG["xd"], atol=1e-15)
-    np.testing.assert_allclose(found.runs[0].position_measured, LOG["xm"], atol=1e-15)
-    np.testing.assert_allclose(found.runs[0].force_measured, LOG["F"], atol=1e-12)
-    assert found.timing.control_period == 1e-3
+    result = read_campaign([day, other], load_mapping(tmp_path / "map.toml"))
+    assert [run.kind for run in result.runs] == ["contact", "free"]
+    np.testing.assert_allclose(result.runs[0].position_desired, LOG["xd"], atol=1e-15)
+    np.testing.assert_allclose(result.runs[0].position_measured, LOG["xm"], atol=1e-15)
+    np.testing.assert_allclose(result.runs[0].force_measured, LOG["F"], atol=1e-12)
+    assert result.timing.control_period == 1e-3
     assert 'files = "contact*.csv"' in text and 'files = ["morning.csv"]' in text
 
 
 def test_draft_mapping_recognises_own_columns_and_refuses_unknown_ones(tmp_path):
-    own = (
+    names = (
         "time",
         "force_measured",
         "force_command",
@@ -47,9 +47,9 @@ def test_draft_mapping_recognises_own_columns_and_refuses_unknown_ones(tmp_path)
         "position_measured",
     )
     columns = (LOG["t"], LOG["F"], LOG["Fc"], LOG["xd"], LOG["vd"], LOG["xm"], np.zeros(600))
-    path = write_csv(tmp_path / "run.csv", dict(zip((*own, "contact"), columns, strict=True)))
+    path = write_csv(tmp_path / "run.csv", dict(zip((*names, "contact"), columns, strict=True)))
     text = draft([path])
-    for name in own:
+    for name in names:
         assert f'{name} = {{ column = "{name}"' in text
     assert 'contact_index = { column = "contact" }' in text
     path = write_csv(tmp_path / "a.csv", {"a": LOG["t"], "b": LOG["xd"]})

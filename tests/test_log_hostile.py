@@ -69,8 +69,8 @@ def mutated(text: bytes, changes) -> bytes:
         if kind == "cut":
             text = text[: numbers[0]]
         elif kind == "flip" and text:
-            place = numbers[0] % len(text)
-            text = text[:place] + bytes([text[place] ^ numbers[1]]) + text[place + 1 :]
+            index = numbers[0] % len(text)
+            text = text[:index] + bytes([text[index] ^ numbers[1]]) + text[index + 1 :]
     return text
 
 
@@ -81,11 +81,11 @@ def check(kind, changes, timing):
         with suppress(InputError):
             assert draft([path]).startswith("# A draft")
         try:
-            found = read(path, kind, timing=timing)
+            result = read(path, kind, timing=timing)
         except InputError as error:
             assert str(error).isprintable() and str(error).startswith(f"{path}: ")
             return
-        for run in found.runs:
+        for run in result.runs:
             assert np.all(np.diff(run.tick) == 1)
             assert np.all(np.isfinite(run.position_desired))
             assert np.all(np.isfinite(run.position_measured[run.valid]))

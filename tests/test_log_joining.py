@@ -29,27 +29,27 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
     columns["force_measured"] = columns["position_measured"]
     clocks = dict.fromkeys(columns, sampled if stamps is None else stamps) | {"position_desired": rows}
     named = {"position_desired": "xd", "position_measured": "xm", "force_measured": "F"}
-    found, times, notes = join("a", columns, clocks, named, PERIOD)
-    kept = found["position_desired"].astype(int)
-    assert len(times) == len(kept) == len(found["position_measured"])
+    result, times, notes = join("a", columns, clocks, named, PERIOD)
+    kept = result["position_desired"].astype(int)
+    assert len(times) == len(kept) == len(result["position_measured"])
     assert np.all(np.isin(times, rows))
-    if "force_late" in found:
+    if "force_late" in result:
         # Forces are not interpolated: each is one of the readings, and its delay is reported.
-        assert np.all(np.isin(found["force_measured"], columns["force_measured"]))
+        assert np.all(np.isin(result["force_measured"], columns["force_measured"]))
         moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
-        at = PERIOD * kept + found["force_late"]
-        assert np.max(np.abs(found["force_late"])) <= (0.51 * PERIOD if jitter == 0.0 else 0.7 * PERIOD)
-        assert np.max(np.abs(found["force_measured"] - smooth(at))) < moved
-    return kept, found["position_measured"], notes
+        at = PERIOD * kept + result["force_late"]
+        assert np.max(np.abs(result["force_late"])) <= (0.51 * PERIOD if jitter == 0.0 else 0.7 * PERIOD)
+        assert np.max(np.abs(result["force_measured"] - smooth(at))) < moved
+    return kept, result["position_measured"], notes
 
 
 @pytest.mark.parametrize("late", [5.0, -7.0, 0.0])
 @pytest.mark.parametrize("jitter", [0.0, 5e-5])
 def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
     sampled = PERIOD * (np.arange(ROWS - 40) + late)
-    kept, force, notes = joined(sampled, scattered(sampled, jitter, 2), jitter=jitter)
-    np.testing.assert_array_equal(force, smooth(PERIOD * (late + np.arange(ROWS)))[(kept - int(late))])
-    assert kept[0] == max(late, 0) and kept[-1] == ROWS - 41 + late
+    ticks, force, notes = joined(sampled, scattered(sampled, jitter, 2), jitter=jitter)
+    np.testing.assert_array_equal(force, smooth(PERIOD * (late + np.arange(ROWS)))[(ticks - int(late))])
+    assert ticks[0] == max(late, 0) and ticks[-1] == ROWS - 41 + late
     assert "taken at their own times" in notes[0]
     assert f"{40 + max(0, -late):.0f} rows at which a channel was not read" in notes[1]
 
@@ -79,9 +79,9 @@ def test_joined_readings_are_those_of_the_rows_times(late, rate, jitter, lost, e
 
 def test_gap_in_a_channel_drops_its_rows():
     sampled = np.delete(PERIOD * np.arange(ROWS), slice(1000, 1200)) + 4e-4
-    kept, _, notes = joined(sampled)
-    assert not np.any((kept > 1000) & (kept < 1200)) and "interpolated between their own times" in notes[0]
-    assert len(kept) == ROWS - 200 - 2
+    ticks, _, notes = joined(sampled)
+    assert not np.any((ticks > 1000) & (ticks < 1200)) and "interpolated between their own times" in notes[0]
+    assert len(ticks) == ROWS - 200 - 2
 
 
 @pytest.mark.parametrize(
@@ -119,8 +119,8 @@ def test_channels_that_hold_their_value_are_not_interpolated():
     columns = {"position_desired": rows, "contact_index": np.repeat([0.0, 3.0], ROWS // 2)}
     columns["mode"] = np.array(["free"] * (ROWS // 2) + ["contact"] * (ROWS // 2), object)
     clocks = {"position_desired": rows, "contact_index": rows - 4e-4, "mode": rows + 3e-4}
-    found, _, _ = join("a", columns, clocks, {name: name for name in columns}, PERIOD)
-    assert set(found["contact_index"]) == {0.0, 3.0} and set(found["mode"]) == {"free", "contact"}
+    result, _, _ = join("a", columns, clocks, {name: name for name in columns}, PERIOD)
+    assert set(result["contact_index"]) == {0.0, 3.0} and set(result["mode"]) == {"free", "contact"}
 
 
 def separate(late, rows=580):
@@ -211,8 +211,8 @@ def test_any_clock_is_joined_or_refused_in_one_line(place, value, count, rate, w
         rows[whose][place % len(rows[whose])] = value
     columns = {name: np.zeros(len(one)) for name, one in rows.items()}
     try:
-        found, times, _ = join("a", columns, rows, {name: name for name in rows}, PERIOD)
+        result, times, _ = join("a", columns, rows, {name: name for name in rows}, PERIOD)
     except InputError as error:
         assert str(error).isprintable() and str(error).startswith("a: ")
         return
-    assert all(len(one) == len(times) and np.all(np.isfinite(one)) for one in found.values())
+    assert all(len(one) == len(times) and np.all(np.isfinite(one)) for one in result.values())

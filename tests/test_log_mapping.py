@@ -68,10 +68,10 @@ def test_mapping_file_is_equivalent_to_its_table(tmp_path):
         files = "*.csv"
         kind = "rest"
     """)
-    found = load_mapping(path)
-    assert found.channels.time.rate == 500.0 and found.channels.time.column is None
-    assert found.runs[0].files == ["*.csv"] and found.timing.row == "tick"
-    assert found.runs[0].names(tmp_path / "x.csv") and not found.runs[0].names(tmp_path / "x.mf4")
+    result = load_mapping(path)
+    assert result.channels.time.rate == 500.0 and result.channels.time.column is None
+    assert result.runs[0].files == ["*.csv"] and result.timing.row == "tick"
+    assert result.runs[0].names(tmp_path / "x.csv") and not result.runs[0].names(tmp_path / "x.mf4")
     assert mapping_of(FULL, "map").runs[1].names(tmp_path / "day1" / "x.mf4")
     with pytest.raises(InputError, match=r"none.toml: found no such file, allowed a mapping file"):
         load_mapping(tmp_path / "none.toml")

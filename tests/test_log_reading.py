@@ -26,25 +26,25 @@ def same(one, other):
 
 def test_log_is_read_as_it_was_written(tmp_path):
     path = write_csv(tmp_path / "a.csv", LOG)
-    found = read(path)
-    assert [(run.kind, run.source, set(run.contact_index)) for run in found.runs] == [
+    result = read(path)
+    assert [(run.kind, run.source, set(run.contact_index)) for run in result.runs] == [
         ("contact", "a.csv", {0}),
         ("contact", "a.csv", {1}),
     ]
     for channel, column in CHANNELS.items():
         if channel != "time":
-            whole = np.concatenate([getattr(run, channel) for run in found.runs])
+            whole = np.concatenate([getattr(run, channel) for run in result.runs])
             np.testing.assert_array_equal(whole, LOG[column])
-    np.testing.assert_array_equal(np.concatenate([run.tick for run in found.runs]), np.arange(1200))
-    for run in found.runs:
+    np.testing.assert_array_equal(np.concatenate([run.tick for run in result.runs]), np.arange(1200))
+    for run in result.runs:
         assert run.valid.all() and run.time_stamp_error < 1e-12
         assert run.speed == pytest.approx(5e-3, rel=1e-3)
         # Cut midway between the contacts.
         touched = np.flatnonzero(run.force_command)
         assert 100 < touched[0] and touched[-1] < len(run.tick) - 100
-    assert found.equivalent_mass == MASS and found.timing.control_period == PERIOD
-    assert found.sources == {"a.csv": hashlib.sha256(path.read_bytes()).hexdigest()}
-    assert found.notes == ()
+    assert result.equivalent_mass == MASS and result.timing.control_period == PERIOD
+    assert result.sources == {"a.csv": hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert result.notes == ()
     # The last entry of a prior's list repeats.
     (one, two) = read_campaign([path], mapping(), load("rig-300kg").mechanism).runs
     assert set(one.contact_index) == set(two.contact_index) == {0}
@@ -60,7 +60,7 @@ def test_text_dialects_and_parquet_are_read_alike(tmp_path):
     same(plain, read(german, text={"decimal": ","}))
     bare = write_csv(tmp_path / "e.csv", LOG)
     bare.write_text(bare.read_text().partition("\n")[2])
-    same(plain, read(bare, **{name: str(place + 1) for place, name in enumerate(CHANNELS)}))
+    same(plain, read(bare, **{name: str(index + 1) for index, name in enumerate(CHANNELS)}))
     more = LOG | {"note": np.array(["x"] * 1200), "xd2": LOG["xd"]}
     parquet.write_table(
         pa.table(more | {"t": pa.array(LOG["t"] * 1e3).cast(pa.float64())}), tmp_path / "f.parquet"
@@ -79,13 +79,13 @@ def test_text_dialects_and_parquet_are_read_alike(tmp_path):
 def test_log_units_signs_and_offsets_are_applied(tmp_path):
     shown = LOG | {"xd": -1e3 * LOG["xd"] - 7.0, "F": LOG["F"] / 4.4482216152605 * 10}
     path = write_csv(tmp_path / "a.csv", shown)
-    found = read(
+    result = read(
         path,
         position_desired={"column": "xd", "unit": "mm", "sign": -1, "offset": 7.0},
         force_measured={"column": "F", "unit": "lbf", "scale": 0.1},
     )
-    x = np.concatenate([run.position_desired for run in found.runs])
-    force = np.concatenate([run.force_measured for run in found.runs])
+    x = np.concatenate([run.position_desired for run in result.runs])
+    force = np.concatenate([run.force_measured for run in result.runs])
     np.testing.assert_allclose(x, LOG["xd"], atol=1e-17)
     np.testing.assert_allclose(force, LOG["F"], rtol=1e-14, atol=1e-14)
 
@@ -121,10 +121,10 @@ def test_simulated_run_is_read_as_it_was(tmp_path):
     mechanism = load("varying").mechanism
     run = jaxhil.simulate(mechanism)
     run.to_csv(tmp_path / "run.csv")
-    found = read_campaign([tmp_path / "run.csv"], prior=mechanism)
-    assert [list(set(one.contact_index)) for one in found.runs] == [[0], [1], [2]]
-    assert (found.equivalent_mass, found.timing.command_hold) == (350.0, "linear")
-    for one, contact in zip(found.runs, run.contacts, strict=True):
+    result = read_campaign([tmp_path / "run.csv"], prior=mechanism)
+    assert [list(set(one.contact_index)) for one in result.runs] == [[0], [1], [2]]
+    assert (result.equivalent_mass, result.timing.command_hold) == (350.0, "linear")
+    for one, contact in zip(result.runs, run.contacts, strict=True):
         assert one.speed == pytest.approx(contact.approach_velocity, rel=1e-9)
         np.testing.assert_array_equal(
             one.position_desired, run.position_desired[run.contact == one.contact_index[0]]

@@ -18,28 +18,28 @@ TOUCH = 260  # a row in the middle of the first touch
 
 
 def cut(lost, without=(), cuts=()):
-    kept = np.setdiff1d(np.arange(1200), lost)
-    channels = {name: None if name in without else LOG[column][kept] for name, column in CHANNELS.items()}
-    channels["contact_index"] = np.repeat([0, 1], 600)[kept]
-    return stretches(kept, channels, np.array(cuts, int), PERIOD, MASS)
+    rows = np.setdiff1d(np.arange(1200), lost)
+    channels = {name: None if name in without else LOG[column][rows] for name, column in CHANNELS.items()}
+    channels["contact_index"] = np.repeat([0, 1], 600)[rows]
+    return stretches(rows, channels, np.array(cuts, int), PERIOD, MASS)
 
 
 @pytest.mark.parametrize(("lost", "error"), [(1, 1e-17), (2, 1e-17), (3, 1e-8)])
 def test_lost_commands_are_restored_as_the_model_made_them(lost, error):
     gone = np.arange(TOUCH, TOUCH + lost)
-    (found,) = cut(gone)
-    np.testing.assert_array_equal(found.tick, np.arange(1200))
-    assert np.flatnonzero(~found.valid).tolist() == gone.tolist()
-    assert np.max(np.abs(found.channels["position_desired"] - LOG["xd"])) <= error
+    (result,) = cut(gone)
+    np.testing.assert_array_equal(result.tick, np.arange(1200))
+    assert np.flatnonzero(~result.valid).tolist() == gone.tolist()
+    assert np.max(np.abs(result.channels["position_desired"] - LOG["xd"])) <= error
     for name in ("position_measured", "force_measured", "force_command"):
-        np.testing.assert_array_equal(np.isnan(found.channels[name]), ~found.valid)
-        np.testing.assert_array_equal(found.channels[name][found.valid], LOG[CHANNELS[name]][found.valid])
-    assert set(found.channels["contact_index"]) == {0, 1}
+        np.testing.assert_array_equal(np.isnan(result.channels[name]), ~result.valid)
+        np.testing.assert_array_equal(result.channels[name][result.valid], LOG[CHANNELS[name]][result.valid])
+    assert set(result.channels["contact_index"]) == {0, 1}
 
 
 def test_lost_commands_without_the_model_are_mostly_restored_by_a_cubic():
-    (found,) = cut([TOUCH, TOUCH + 1], without=["force_command"])
-    assert np.max(np.abs(found.channels["position_desired"] - LOG["xd"])) < 1e-7
+    (result,) = cut([TOUCH, TOUCH + 1], without=["force_command"])
+    assert np.max(np.abs(result.channels["position_desired"] - LOG["xd"])) < 1e-7
     (many,) = cut([TOUCH, TOUCH + 4, TOUCH + 6, TOUCH + 7, 1198], without=["velocity_desired"])
     assert np.max(np.abs(many.channels["position_desired"] - LOG["xd"])) < 1e-6
     assert len(many.tick) == 1200

@@ -28,8 +28,8 @@ def rounded(log, **quanta):
 
 def lose(log, share, seed=0):
     """Drop some rows."""
-    kept = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
-    return {name: column[kept] for name, column in log.items()}
+    rows = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
+    return {name: column[rows] for name, column in log.items()}
 
 
 def scatter(log, std, seed=1, samples=False):
@@ -45,9 +45,9 @@ def refused(tmp_path, log, **said):
     path = write_csv(tmp_path / "a.csv", log)
     with pytest.raises(InputError) as caught:
         read(path, **said)
-    found = str(caught.value)
-    assert found.isprintable() and found.startswith(f"{path}: ")
-    return found
+    result = str(caught.value)
+    assert result.isprintable() and result.startswith(f"{path}: ")
+    return result
 
 
 NO_COMMAND = {"force_command": None}
@@ -86,8 +86,8 @@ def test_channel_in_a_wrong_unit_is_refused_with_factor_and_unit(tmp_path, facto
 
 
 def test_wrong_mass_of_a_few_percent_is_found(tmp_path):
-    found = refused(tmp_path, scaled(LOG, Fc=1.03))
-    assert "(nearest: 360.5 kg), 1.03 times the force" in found
+    result = refused(tmp_path, scaled(LOG, Fc=1.03))
+    assert "(nearest: 360.5 kg), 1.03 times the force" in result
     assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
 
 
@@ -108,8 +108,8 @@ REAL = {
 @pytest.mark.parametrize("without", [(), ("velocity_desired",)])
 def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
     log, gone = REAL[name](LOG), dict.fromkeys(without)
-    found = read(write_csv(tmp_path / "a.csv", log), **gone)
-    assert found.notes == () and all(run.force_command is not None for run in found.runs)
+    result = read(write_csv(tmp_path / "a.csv", log), **gone)
+    assert result.notes == () and all(run.force_command is not None for run in result.runs)
     assert 'in rows that are "tick"' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
     assert "(nearest: 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
     assert "pulls the model forward" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
@@ -117,21 +117,21 @@ def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
 
 def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"Fc": 5.0 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
-    found = read(write_csv(tmp_path / "a.csv", noise))
-    (note,) = found.notes
+    result = read(write_csv(tmp_path / "a.csv", noise))
+    (note,) = result.notes
     assert "a.csv: force_command: ignored, since M x_d'' = -F_c leaves" in note
-    assert all(run.force_command is None for run in found.runs)
-    found = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
-    assert "force_command: ignored, since it is 0 N in every contact" in "\n".join(found.notes)
+    assert all(run.force_command is None for run in result.runs)
+    result = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
+    assert "force_command: ignored, since it is 0 N in every contact" in "\n".join(result.notes)
     # The measured force is then compared with the momentum of the positions.
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
 
 def test_velocity_that_does_not_match_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"vd": 5e-3 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
-    found = read(write_csv(tmp_path / "a.csv", noise))
-    assert "velocity_desired: ignored, since position_desired does not move by it" in "\n".join(found.notes)
-    assert all(run.velocity_desired is None for run in found.runs)
+    result = read(write_csv(tmp_path / "a.csv", noise))
+    assert "velocity_desired: ignored, since position_desired does not move by it" in "\n".join(result.notes)
+    assert all(run.velocity_desired is None for run in result.runs)
 
 
 def test_undetermined_row_is_noted(tmp_path):
@@ -171,8 +171,8 @@ def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lo
     try:
         holds, _ = check_command("a", stretch, contacts, PERIOD, MASS, "tick", "semi_implicit_euler")
     except InputError as error:
-        found = float(str(error).split("kg), ")[1].split(" times")[0])
-        assert factor != 1.0 and found == pytest.approx(factor, rel=0.05)
+        result = float(str(error).split("kg), ")[1].split(" times")[0])
+        assert factor != 1.0 and result == pytest.approx(factor, rel=0.05)
         return
     assert factor == 1.0 or not holds
     assert holds or quantum >= 1e-6

@@ -70,8 +70,8 @@ def test_tuning_lowers_for_cuda(monkeypatch):
     monkeypatch.setattr(program_cache, "prepare", lambda *program: programs.append(program))
     prepare_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
     ((function, static, arguments, _),) = programs
-    found = calls(lambda arguments: tuple(function(static, arguments)), arguments)
-    assert found == CHOLESKY
+    result = calls(lambda arguments: tuple(function(static, arguments)), arguments)
+    assert result == CHOLESKY
 
 
 def test_callback_into_python_is_detected():

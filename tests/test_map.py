@@ -56,12 +56,12 @@ def simulated_growth(run, period):
 @pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
 def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, changes):
     mechanism = jaxhil.load("varying", SOFT | changes)
-    found = growth(
+    result = growth(
         mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
     )
     run = jaxhil.simulate(mechanism, compensator)
     expected = simulated_growth(run, mechanism.rig.control_period)
-    assert found.per_second == pytest.approx(expected, rel=1e-5, abs=1e-8)
+    assert result.per_second == pytest.approx(expected, rel=1e-5, abs=1e-8)
 
 
 @pytest.mark.slow
@@ -115,14 +115,14 @@ def ideal(tmp_path_factory):
 
 
 def test_map_of_an_uncompensated_contact_is_that_of_theory(ideal):
-    found, folder = ideal
+    result, folder = ideal
     document = json.loads((folder / "map.json").read_text())
-    assert (folder / "map.png").stat().st_size > 20_000 and document["sha256"] == found.document["sha256"]
+    assert (folder / "map.png").stat().st_size > 20_000 and document["sha256"] == result.document["sha256"]
     theory = np.array(document["theory"]["series"])
     assert np.array(document["restitution"]) == pytest.approx(theory, abs=1e-3)
     assert np.array(document["error"]) == pytest.approx(theory - 1, abs=1e-3)
     root = np.array(document["theory"]["characteristic_root"])
-    assert document["spectral_radius"]["values"] == pytest.approx(growing(found, root), abs=1e-5)
+    assert document["spectral_radius"]["values"] == pytest.approx(growing(result, root), abs=1e-5)
 
 
 def growing(found, restitution):
@@ -135,8 +135,8 @@ def growing(found, restitution):
 
 
 def test_margins_end_at_the_stability_limit(ideal):
-    found, _ = ideal
-    nominal = found.document["nominal"]
+    result, _ = ideal
+    nominal = result.document["nominal"]
     [stiffness, delay] = (nominal["margins"]["error"][axis] for axis in "xy")
     assert stiffness["low"] is None and delay["low"] is None and nominal["margins"]["spectral_radius"] is None
     phase = math.sqrt(124355.0 / 350.0) * delay["high"]
@@ -147,9 +147,9 @@ def test_margins_end_at_the_stability_limit(ideal):
 
 
 def test_map_has_the_requested_axes(ideal):
-    found, _ = ideal
-    assert found.x[[0, -1]] == pytest.approx([5e4, 4e5]) and found.y[[0, -1]] == pytest.approx([5e-4, 8e-3])
-    assert found.error.shape == (5, 5) and found.document["x"]["nominal"] == 124355.0
+    result, _ = ideal
+    assert result.x[[0, -1]] == pytest.approx([5e4, 4e5]) and result.y[[0, -1]] == pytest.approx([5e-4, 8e-3])
+    assert result.error.shape == (5, 5) and result.document["x"]["nominal"] == 124355.0
 
 
 @pytest.mark.parametrize(
@@ -175,9 +175,9 @@ def test_map_reaches_theoretical_limits_at_small_control_periods():
     """Compare the contours of items 1 and 2 and the growth limit of item 5, each to 1e-3."""
     axes = "contact.stiffness=5e4:2e5", "rig.force_sensor.delay=0.0005:0.008"
     for period, allowed in ((4e-4, 1e-3), (1e-4, 1e-4)):
-        found = tuning.map(jaxhil.load("varying", IDEAL | {"rig.control_period": period}), *axes, points=12)
-        theory = np.array(found.document["theory"]["series"], float)
-        error = np.max(np.abs(found.restitution - theory))
+        result = tuning.map(jaxhil.load("varying", IDEAL | {"rig.control_period": period}), *axes, points=12)
+        theory = np.array(result.document["theory"]["series"], float)
+        error = np.max(np.abs(result.restitution - theory))
         print(f"\nT = {period:g} s: |e - e of item 1| at most {error:.2g}", end="")
         assert error < allowed
     damped = IDEAL | {"contact.law": "kelvin_voigt", "contact.damping": [500.0], "rig.control_period": 1e-4}

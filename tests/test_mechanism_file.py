@@ -203,11 +203,11 @@ def test_every_key_has_a_meaning_and_every_number_a_unit():
             return texts(kind.item_type) if isinstance(kind, ListType) else []
         return [*texts(kind.type), ((kind.extra_json_schema or {}).get("description"), kind.extra or {})]
 
-    said = {path: texts(kind) for path, kind in keys(schema_type())}
-    assert "rig.force_sensor.delay" in said and len(said) > 40
-    for path, found in said.items():
-        assert any(meaning for meaning, _ in found), path
-    assert any(extra.get("unit") == "s" for _, extra in said["rig.force_sensor.delay"])
+    described = {path: texts(kind) for path, kind in keys(schema_type())}
+    assert "rig.force_sensor.delay" in described and len(described) > 40
+    for path, result in described.items():
+        assert any(meaning for meaning, _ in result), path
+    assert any(extra.get("unit") == "s" for _, extra in described["rig.force_sensor.delay"])
     for path, message in (
         ("rig.control_period=1", "found 1, allowed a number > 0 s and <= 0.1 s"),
         ("rig.force_sensor.delay=2", "found 2, allowed a number from 0 to 1 s"),

@@ -156,9 +156,9 @@ def test_both_positions_start_inside_the_gap(changes, lag):
 def test_velocity_limit_below_the_approach_speed_is_refused():
     path = "rig.simulator.velocity_limit"
     speed = value_at(from_builtins(changed({}), "f"), "approach.velocity")
-    said = f"allowed a number >= {speed:g} m/s, the approach speed"
+    expected = f"allowed a number >= {speed:g} m/s, the approach speed"
     assert from_builtins(changed({path: speed}), "f")
-    assert f": {path}: found {0.99 * speed!r}, {said}" in refusal(changed({path: 0.99 * speed}))
+    assert f": {path}: found {0.99 * speed!r}, {expected}" in refusal(changed({path: 0.99 * speed}))
     for drawn in (
         {"approach.velocity": {"distribution": "uniform", "low": speed, "high": 1.01 * speed}},
         {path: {"distribution": "loguniform", "factor": [0.99, 1.5]}},

@@ -57,11 +57,11 @@ def test_new_mechanism_file_has_every_key_at_its_default(written):
     }
     shown, path = {}, ""
     for line in text.splitlines():
-        if found := re.fullmatch(r"#?\[([\w.]+)\].*", line):
-            path = found[1] + "."
-        elif found := re.match(r"(#?)(\w+) =(.*)", line):
-            value = tomllib.loads("value =" + found[3]) if found[3].split("#")[0].strip() else {}
-            shown[path + found[2]] = (found[1], value.get("value"))
+        if result := re.fullmatch(r"#?\[([\w.]+)\].*", line):
+            path = result[1] + "."
+        elif result := re.match(r"(#?)(\w+) =(.*)", line):
+            value = tomllib.loads("value =" + result[3]) if result[3].split("#")[0].strip() else {}
+            shown[path + result[2]] = (result[1], value.get("value"))
     assert set(shown) == {name for name in defaults if '"' not in name}
     assert all(value == defaults[name] for name, (sign, value) in shown.items() if sign)
     # Compare with the file without comment signs, where the law uses the keys.

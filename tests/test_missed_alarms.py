@@ -41,8 +41,8 @@ def rates():
 
 
 def fault(rates, name):
-    (found,) = [one for one in rates["fault_runs"] if one["name"] == name]
-    return found
+    (result,) = [one for one in rates["fault_runs"] if one["name"] == name]
+    return result
 
 
 def test_injected_delay_is_that_of_theory(rates):
@@ -85,10 +85,11 @@ def test_watchdog_without_a_margin_misses_every_fault():
 
 
 def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
-    found = calibrated("phase_lead")
+    result = calibrated("phase_lead")
     # Nothing is late here: the literature's lead is already 0, and there is nothing to remove.
-    assert [one["name"] for one in found["fault_runs"]] == [one.name for one in FAULTS if one.name != "gains"]
-    assert fault(found, "force_delay")["runs"] == NUMBER
+    names = [kind.name for kind in FAULTS if kind.name != "gains"]
+    assert [run["name"] for run in result["fault_runs"]] == names
+    assert fault(result, "force_delay")["runs"] == NUMBER
 
 
 @pytest.mark.parametrize(
@@ -114,11 +115,11 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
         "missed_alarms": rate(0, 0),
         "fault_runs": [{**one, "counted": counted}],
     }
-    found = judged(rates, ALLOWED, 2048)
-    assert found["verdict"] == verdict and found["fault_runs"][0]["allowed"] == ALLOWED.missed_alarms
+    result = judged(rates, ALLOWED, 2048)
+    assert result["verdict"] == verdict and result["fault_runs"][0]["allowed"] == ALLOWED.missed_alarms
     if verdict == "unknown":
         tells = "about 190 such runs tell, there are 182" if counted else "a sweep of at least "
-        assert tells in found["unknown"][0]
+        assert tells in result["unknown"][0]
     # If too many drawn runs are missed, the result is bad, whatever the injected runs give.
     missed = judged({**rates, "missed_alarms": rate(50, 100)}, ALLOWED, 2048)
     assert missed["verdict"] == "bad"

@@ -66,10 +66,10 @@ def test_monitor_finds_no_deviation_without_noise(name):
     """Use a file whose laws, lags, latencies and holds are those of the independent rig."""
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
-    found = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
-    value = np.array([one.value for one in found.contacts])
-    told = np.isfinite(value).any(axis=0)
-    assert told[:4].all() and told[BIAS] == (name != "dead_zone") and not told[NOISE]
+    result = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
+    value = np.array([one.value for one in result.contacts])
+    is_finite = np.isfinite(value).any(axis=0)
+    assert is_finite[:4].all() and is_finite[BIAS] == (name != "dead_zone") and not is_finite[NOISE]
     # The generator's lag is a quadrature over a force that begins with a jump.
     allowed = 2e4 if name == "lagging" else 1.0
     bound = allowed * np.array([1e-9, 1e-5, 5e-8, 1e-9, 1e-9, np.inf, 1e-9])
@@ -77,11 +77,11 @@ def test_monitor_finds_no_deviation_without_noise(name):
 
 
 def test_monitor_of_a_matching_rig_scatters_as_predicted():
-    found = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
-    assert found.state == "good" and found.alarm is None and found.changes == ()
-    z = np.array([one.z for one in found.contacts])
+    result = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
+    assert result.state == "good" and result.alarm is None and result.changes == ()
+    z = np.array([one.z for one in result.contacts])
     assert z.shape == (6, len(NAMES)) and 0.7 < z.std() < 1.3
-    assert "all of 6 contacts" in found.verdict
+    assert "all of 6 contacts" in result.verdict
 
 
 CHANGES = {
@@ -101,15 +101,15 @@ DAILY = ("delay", "noise")
 def test_monitor_finds_and_names_a_change(what):
     other, name, value, within = CHANGES[what]
     before, after = contacts(CLEAN, seed=1, speeds=SPEEDS[:3]), contacts(other, seed=2, speeds=SPEEDS[:3])
-    found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
+    result = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
     assert (
-        found.state == "bad"
-        and found.since == 3
-        and [one.state for one in found.contacts[:3]] == ["good"] * 3
+        result.state == "bad"
+        and result.since == 3
+        and [one.state for one in result.contacts[:3]] == ["good"] * 3
     )
-    (change,) = (one for one in found.changes if one.name == name)
+    (change,) = (one for one in result.changes if one.name == name)
     assert change.value == pytest.approx(value, abs=within) and change.std < within
-    assert f"since contact 4 of 6 (touch_0.csv): {found.changes[0].name}" in found.verdict
+    assert f"since contact 4 of 6 (touch_0.csv): {result.changes[0].name}" in result.verdict
 
 
 def test_monitor_state_is_watch_if_the_file_covers_the_change():
@@ -117,8 +117,8 @@ def test_monitor_state_is_watch_if_the_file_covers_the_change():
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
     after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
-    found = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
-    assert found.state == "watch" and found.since == 6 and "covers it" in found.verdict
+    result = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
+    assert result.state == "watch" and result.since == 6 and "covers it" in result.verdict
 
 
 def test_monitor_correlates_numbers_as_the_file_says():

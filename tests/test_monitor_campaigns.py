@@ -24,12 +24,12 @@ CLEAN = campaigns.KINDS["clean"]
 @pytest.fixture(scope="module")
 def files():
     """Return files of the same rig, each identified from a different day."""
-    found = []
+    result = []
     for seed in range(FILES):
         day = campaigns.campaign("clean", 60_000 + seed)
         options = Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed)
-        found.append(from_builtins(identify(day, options=options).mechanism, "identified"))
-    return found
+        result.append(from_builtins(identify(day, options=options).mechanism, "identified"))
+    return result
 
 
 def contacts(name, seed, speeds):
@@ -52,9 +52,9 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
     z, alarms, number = [], 0, 0
     for seed, mechanism in enumerate(files):
         speeds = np.random.default_rng(seed).choice(SPEEDS, 250)
-        found = monitor(contacts("clean", seed, speeds), mechanism)
-        alarms, number = alarms + (found.alarm is not None), number + len(found.contacts)
-        z += [one.z for one in found.contacts]
+        result = monitor(contacts("clean", seed, speeds), mechanism)
+        alarms, number = alarms + (result.alarm is not None), number + len(result.contacts)
+        z += [one.z for one in result.contacts]
     print(f"{alarms} alarms in {number} contacts")
     for name, mean, std in zip(NAMES, np.mean(z, axis=0), np.std(z, axis=0), strict=True):
         print(f"  {name:18s} mean {mean:+.3f}, std {std:.3f} of the predicted")
@@ -65,7 +65,7 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
 @pytest.mark.parametrize("number", (15, 60))
 def test_monitor_finds_drifts_early(files, number):
     """Let the stiffness grow by 15 %, or the force delay by 0.6 ms, over so many contacts."""
-    found = {"stiffness [%]": [], "force delay [ms]": []}
+    result = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):
         speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)
         stiffer = monitor(contacts("drifting", seed, speeds), mechanism)
@@ -73,11 +73,11 @@ def test_monitor_finds_drifts_early(files, number):
         assert stiffer.state == later.state == "bad"
         assert "stiffness" in {one.name for one in stiffer.changes}
         assert "apparent damping" in {one.name for one in later.changes}
-        found["stiffness [%]"].append(15.0 * stiffer.alarm / (number - 1))
-        found["force delay [ms]"].append(0.6 * later.alarm / (number - 1))
-    for name, reached in found.items():
+        result["stiffness [%]"].append(15.0 * stiffer.alarm / (number - 1))
+        result["force delay [ms]"].append(0.6 * later.alarm / (number - 1))
+    for name, reached in result.items():
         print(f"{number} contacts: {name} when it was found: {np.round(reached, 2)}")
-    assert np.median(found["stiffness [%]"]) < 3.0
+    assert np.median(result["stiffness [%]"]) < 3.0
     if number > 15:
         # The first five of the fifteen are too slow to show a delay.
-        assert np.max(found["stiffness [%]"]) < 3.0 and np.max(found["force delay [ms]"]) < 0.3
+        assert np.max(result["stiffness [%]"]) < 3.0 and np.max(result["force delay [ms]"]) < 0.3

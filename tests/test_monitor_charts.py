@@ -30,12 +30,12 @@ def alarms(mean, lanes, contacts, rng):
         # Row i holds the sum from contact i on.
         sums[i % WINDOW] = 0.0
         sums += z
-        known = min(WINDOW, i + 1)
-        number = 1.0 + (i - np.arange(known)[:, None]) % WINDOW
+        window = min(WINDOW, i + 1)
+        number = 1.0 + (i - np.arange(window)[:, None]) % WINDOW
         up, down = np.maximum(up + z - 0.5, 0.0), np.maximum(down - z - 0.5, 0.0)
         average += 0.2 * (z - average)
         beyond = np.stack([
-            (sums[:known] ** 2 / number).max(axis=0) > LIMIT,
+            (sums[:window] ** 2 / number).max(axis=0) > LIMIT,
             (np.maximum(up, down) > CUSUM_LIMIT) | (np.abs(average) > AVERAGE_LIMIT / 3.0),
         ])  # fmt: skip
         first = np.where(beyond & (first == contacts), i, first)
@@ -50,8 +50,8 @@ def test_first_alarm_is_that_of_the_charts():
     for figure in range(3):
         first = next((i for i in range(40) if changes(z[: i + 1])[0][figure] > LIMIT), 40)
         series = iter(z[:, figure])
-        found = alarms(lambda i, series=series: next(series), 1, 40, Silent())
-        assert found[0, 0] == first
+        result = alarms(lambda i, series=series: next(series), 1, 40, Silent())
+        assert result[0, 0] == first
 
 
 class Silent:
@@ -73,8 +73,8 @@ def test_charts_have_stated_false_alarm_rate_and_find_jumps_before_others():
         ("a jump of 1", lambda i: 1.0), ("of 2", lambda i: 2.0), ("of 4", lambda i: 4.0),
         ("of 6", lambda i: 6.0), ("a drift of 0.1", lambda i: 0.1 * i), ("of 1", lambda i: 1.0 * i),
     ):  # fmt: skip
-        found = alarms(mean, 2000, 100, rng).mean(axis=1) + 1.0
+        delay = alarms(mean, 2000, 100, rng).mean(axis=1) + 1.0
         print(
-            f"{name} std a contact: found after {found[0]:.2f} contacts, by CUSUM and average {found[1]:.2f}"
+            f"{name} std a contact: found after {delay[0]:.2f} contacts, by CUSUM and average {delay[1]:.2f}"
         )
-        assert found[0] < 1.15 * found[1]
+        assert delay[0] < 1.15 * delay[1]

@@ -63,8 +63,8 @@ def placed(phases):
 
 def test_loop_has_the_placed_pole():
     gains, phase = placed([0.1, 0.3])
-    found = without_period("multi_parameter_lead", 1.6, gains, force_sensor__delay=phase / OMEGA)
-    np.testing.assert_allclose(np.exp(found), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
+    result = without_period("multi_parameter_lead", 1.6, gains, force_sensor__delay=phase / OMEGA)
+    np.testing.assert_allclose(np.exp(result), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
 
 
 def test_contact_has_the_desired_restitution():
@@ -117,6 +117,6 @@ def test_phase_lead_is_a_special_case_of_multi_parameter_lead():
     constants = Constants(jnp.asarray(1e-3), jnp.asarray(jnp.inf))
     ours = {"force_gain": 1.0, "force_rate_gain": 0.008, "lead_filter": 0.0013}
     theirs = {"phase_lead": 0.008, "lead_filter": 0.0013}
-    found = COMPENSATORS["multi_parameter_lead"].prepare(jax.tree.map(jnp.asarray, ours), constants)
+    result = COMPENSATORS["multi_parameter_lead"].prepare(jax.tree.map(jnp.asarray, ours), constants)
     expected = COMPENSATORS["phase_lead"].prepare(jax.tree.map(jnp.asarray, theirs), constants)
-    np.testing.assert_allclose(np.array(found), np.array(expected), rtol=1e-14)
+    np.testing.assert_allclose(np.array(result), np.array(expected), rtol=1e-14)

@@ -72,10 +72,10 @@ def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
     task = build_task(lead_task().mechanism, "phase_lead", 32, 0)
     validation = build_validation([task], 15, 0, work)
     chosen = choose_starts(validation, 4, seed)[0]
-    some, runs[:] = sum(runs), []
+    completed, runs[:] = sum(runs), []
     monkeypatch.setattr(scan, "_sums_squares", lambda *_: False)
     np.testing.assert_array_equal(chosen, choose_starts(validation, 4, seed)[0])
-    assert some < 0.8 * sum(runs)
+    assert completed < 0.8 * sum(runs)
 
 
 @pytest.mark.slow
@@ -84,15 +84,15 @@ def test_best_start_is_polished(tasks, validation):
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
     polished = finish(validation, early, 128, seed=0)
-    for index, (own, found) in enumerate(zip(early, polished, strict=True)):
+    for index, (own, result) in enumerate(zip(early, polished, strict=True)):
         if index == 1:
-            assert found is None
+            assert result is None
             continue
-        assert found is not None
+        assert result is not None
         best = min(own, key=lambda start: start.rms)
-        assert found.rms < best.rms
-        assert found.rms == pytest.approx(value(validation, index, found), rel=1e-12)
-        assert found.gains == validation.gains(index, found.coordinates)
+        assert result.rms < best.rms
+        assert result.rms == pytest.approx(value(validation, index, result), rel=1e-12)
+        assert result.gains == validation.gains(index, result.coordinates)
     failed = [[own[0]._replace(rms=np.nan)] for own in early]
     assert finish(validation, failed, 64, seed=0) == [None] * 3
 
@@ -117,22 +117,22 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
         heard.append(text)
         shares.append(share)
 
-    told = build_validation(tasks, 15, 0, Work(tell))
-    found = find_gains(told, searched(3, 9, 16))
+    validation_observed = build_validation(tasks, 15, 0, Work(tell))
+    result = find_gains(validation_observed, searched(3, 9, 16))
     assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (BATCHES - 1)
-    assert [len(one.starts) for one in found] == [3, 3 * BATCHES, 3]
+    assert [len(one.starts) for one in result] == [3, 3 * BATCHES, 3]
     assert len({text for text in heard if "batch" in text}) == BATCHES - 1
     assert all(0 <= share <= 1 for share in shares) and shares[-1] == 1
-    points = np.stack([start.coordinates for start in found[1].starts])
+    points = np.stack([start.coordinates for start in result[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
     # Steps cost 1 + 2 evaluations; the scan runs at full cost on at most 32 scenarios; 2 gains are polished.
-    assert found[0].evaluations == FEW + 3 * 3 + 32
-    assert found[1].evaluations == BATCHES * (FEW + 3 * 3) + 32
+    assert result[0].evaluations == FEW + 3 * 3 + 32
+    assert result[1].evaluations == BATCHES * (FEW + 3 * 3) + 32
 
 
 def test_single_start_is_the_literature_and_is_polished(tasks, validation):
-    found = find_gains(validation, searched(1, 2, 32))
-    for index, one in enumerate(found):
+    result = find_gains(validation, searched(1, 2, 32))
+    for index, one in enumerate(result):
         (start,) = one.starts
         assert one.best is not None and one.best.rms <= start.rms
         assert one.evaluations == 3 * start.steps + 64
@@ -164,9 +164,9 @@ def test_best_start_is_the_best_by_the_objective_itself(tasks, validation):
 def test_failed_task_leaves_the_others_their_best_gains(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = build_validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken), tasks[2]], 15, 0)
-    found, healthy = (find_gains(one, searched(3, 2, 16)) for one in (sick, validation))
+    result, healthy = (find_gains(one, searched(3, 2, 16)) for one in (sick, validation))
     for index in (0, 2):
-        mine, theirs = found[index].best, healthy[index].best
+        mine, theirs = result[index].best, healthy[index].best
         assert mine is not None and theirs is not None
         assert mine.rms == pytest.approx(theirs.rms, rel=1e-6)
 

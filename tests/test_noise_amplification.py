@@ -109,8 +109,8 @@ def test_noise_amplification_rises_early_in_contact_by_identification():
 
     # tenths of the contact
     np.testing.assert_allclose(noise(**LEAD_ALONE)[1], 1, atol=0.1)
-    gains, own = noise()
+    gains, noise_level = noise()
     covariance = gains["stiffness_covariance"]
-    known, large, huge = (noise(stiffness_covariance=covariance * times)[1] for times in (0, 10, 1e4))
-    assert known[0] < 1 < 1.1 < own[0] < large[0] < huge[0] < 1.6
-    assert max(max(spans[1:]) for spans in (own, large, huge)) < 1.1
+    fixed, large, huge = (noise(stiffness_covariance=covariance * times)[1] for times in (0, 10, 1e4))
+    assert fixed[0] < 1 < 1.1 < noise_level[0] < large[0] < huge[0] < 1.6
+    assert max(max(spans[1:]) for spans in (noise_level, large, huge)) < 1.1

@@ -99,4 +99,4 @@ def test_committed_notebook_is_small_and_names_no_machine(path):
         texts = [cell.source]
         for output in cell.get("outputs", []):
             texts += [output.get("text", ""), str(output.get("data", {}).get("text/plain", ""))]
-        assert not [found for text in texts if (found := MACHINE_PATH.search(text))]
+        assert not [result for text in texts if (result := MACHINE_PATH.search(text))]

@@ -90,9 +90,9 @@ def start(pair):
 
 def wrenches():
     """(steps, 6, lanes)."""
-    given = np.zeros((STEPS, 6, LANES))
-    given[:, :, PUSHED] = SEEDED.normal(size=(STEPS, 6, 1)) * 50
-    return given
+    wrenches_drawn = np.zeros((STEPS, 6, LANES))
+    wrenches_drawn[:, :, PUSHED] = SEEDED.normal(size=(STEPS, 6, 1)) * 50
+    return wrenches_drawn
 
 
 @jax.jit
@@ -128,8 +128,8 @@ GIVEN = wrenches()
 
 @pytest.fixture(scope="module")
 def run():
-    found = simulate(*begin(), jnp.asarray(GIVEN), jnp.asarray(PERIODS), jnp.asarray(SHARE))
-    return jax.tree.map(np.asarray, found)
+    result = simulate(*begin(), jnp.asarray(GIVEN), jnp.asarray(PERIODS), jnp.asarray(SHARE))
+    return jax.tree.map(np.asarray, result)
 
 
 def at_the_same_time(series):
@@ -138,13 +138,13 @@ def at_the_same_time(series):
 
 
 def test_free_top_follows_jacobis_solution_to_second_order(run):
-    found = AXES.inv().apply(at_the_same_time(run["angular"][0]).T).T
+    result = AXES.inv().apply(at_the_same_time(run["angular"][0]).T).T
     (one, two, three), (first, _, third) = MOMENTS, FREE
     second = third * np.sqrt(three * (one - three) / (two * (one - two)))
     rate = first * np.sqrt((one - three) * (one - two) / (two * three))
     modulus = (two - three) * second * third / (one * first * rate)
     sn, cn, dn, _ = ellipj(rate * 250 * PERIOD, modulus)
-    errors = np.linalg.norm(found - np.array([[first * dn], [-second * sn], [third * cn]]), axis=0)
+    errors = np.linalg.norm(result - np.array([[first * dn], [-second * sn], [third * cn]]), axis=0)
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.02)
     assert errors[-1] < 1e-6
     # It is passed on unchanged, to the bit.
@@ -161,8 +161,8 @@ def test_axisymmetric_top_has_closed_form_attitude(run):
     precessed = Rotation.from_rotvec(spin * time / SYMMETRIC[0])
     turned = Rotation.from_rotvec([0, 0, (1 - SYMMETRIC[2] / SYMMETRIC[0]) * SPUN[2] * time])
     expected = (precessed * first * turned)[:3]
-    found = Rotation.from_quat(at_the_same_time(run["attitude"]).T)
-    errors = (expected.inv() * found).magnitude()
+    result = Rotation.from_quat(at_the_same_time(run["attitude"]).T)
+    errors = (expected.inv() * result).magnitude()
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.02)
     assert errors[-1] < 1e-6
 
@@ -196,15 +196,15 @@ def test_six_axis_integrators_agree_with_one_axis_along_and_about_an_axis():
         state = lax.scan(step, build_state(body, still, still, turn, still), pushes)[0]
         return state.position.z, state.velocity.z, logarithm(state.attitude).z, state.spin.z
 
-    found = np.asarray(pushed(lanes(2.0, 3), lanes(np.diag(SYMMETRIC), 3), jnp.asarray(pushes)))
+    result = np.asarray(pushed(lanes(2.0, 3), lanes(np.diag(SYMMETRIC), 3), jnp.asarray(pushes)))
     for lane, (name, integrator) in enumerate(INTEGRATORS.items()):
         line, turn = (0.0, 0.0), (0.0, 0.0)
         for push in pushes:
             line = integrator(*line, push / 2.0, 0.1)
             turn = integrator(*turn, push / SYMMETRIC[2], 0.1)
         expected = [*line, turn[0], turn[1] * SYMMETRIC[2]]
-        np.testing.assert_allclose(found[:, lane], expected, rtol=1e-12, err_msg=name)
-    assert len(set(found[0])) == 3
+        np.testing.assert_allclose(result[:, lane], expected, rtol=1e-12, err_msg=name)
+    assert len(set(result[0])) == 3
 
 
 @jax.jit
@@ -232,10 +232,12 @@ def test_wrench_accelerates_the_relative_mass():
     normal /= np.linalg.norm(normal, axis=0)
     wrench[:, :3] = np.concatenate([normal, np.cross(point, normal, axis=0)])[:, :3]
     arguments = (jnp.asarray(part) for part in (wrench, point, normal))
-    found = [np.squeeze(np.stack(jax.tree.leaves(part))) for part in push_from_rest(pair, states, *arguments)]
-    found[0] = found[0] / 1e-9
+    result = [
+        np.squeeze(np.stack(jax.tree.leaves(part))) for part in push_from_rest(pair, states, *arguments)
+    ]
+    result[0] = result[0] / 1e-9
     for lane, (gained, moved, origin, mass, effective) in enumerate(
-        zip(*(np.moveaxis(part, -1, 0) for part in found), strict=True)
+        zip(*(np.moveaxis(part, -1, 0) for part in result), strict=True)
     ):
         np.testing.assert_allclose(mass, mass.T, rtol=1e-10, atol=1e-10 * np.max(mass))
         assert np.all(np.linalg.eigvalsh(mass) > 0)

@@ -216,21 +216,21 @@ def test_common_terms_are_those_that_any_objective_has():
 
 def against_differences(batch, jacobian):
     """Compare derivatives (problem, gain, residual) with central differences."""
-    own = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
+    jacobian_diagonal = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
     for gain in range(len(NAMES)):
         step = 1e-6 * GAINS[:, gain]
         up, down = GAINS.copy(), GAINS.copy()
         up[:, gain] += step
         down[:, gain] -= step
         difference = (run(batch, up)[0] - run(batch, down)[0]) / (2 * step[:, None])
-        scale = np.abs(own[:, gain]).max()
-        np.testing.assert_allclose(own[:, gain], difference, rtol=1e-5, atol=1e-7 * scale)
-    return own
+        scale = np.abs(jacobian_diagonal[:, gain]).max()
+        np.testing.assert_allclose(jacobian_diagonal[:, gain], difference, rtol=1e-5, atol=1e-7 * scale)
+    return jacobian_diagonal
 
 
 def test_objective_derivatives_are_central_differences(batch, known):
-    own = against_differences(batch, known[1])
-    parts = *np.split(own[..., :-1], 3, axis=-1), own[..., -1:]
+    jacobian_diagonal = against_differences(batch, known[1])
+    parts = *np.split(jacobian_diagonal[..., :-1], 3, axis=-1), jacobian_diagonal[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
 
 

@@ -124,7 +124,7 @@ def test_identified_values_of_another_mechanism_are_not_replaced(jaxhil, tmp_pat
 
 @pytest.mark.parametrize("names", [("a b", "a_b"), ("Rig", "rig"), ("..", "..."), ("é", "e\u0301")])
 def test_mechanisms_of_one_call_share_no_folder(jaxhil, tmp_path, names):
-    files = [named(tmp_path / f"{place}.toml", name) for place, name in enumerate(names)]
+    files = [named(tmp_path / f"{path}.toml", name) for path, name in enumerate(names)]
     ran = jaxhil(*TUNE, *files, "-o", tmp_path / "out", "--json")
     assert ran.code == 2 and "1.toml: name: found" in ran.err
     [entry] = ran.document["mechanisms"]
@@ -162,27 +162,27 @@ def test_gains_of_another_mechanism_of_same_name_are_replaced_with_warning(jaxhi
 def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, command, kind):
     """Avoid waiting for a pipe, and reading a device without end."""
     monkeypatch.chdir(tmp_path)
-    place = tmp_path / "input.csv"
+    path = tmp_path / "input.csv"
     if kind == "pipe":
-        os.mkfifo(place)
+        os.mkfifo(path)
     else:
-        place.symlink_to("/dev/zero")
-    refused(jaxhil(*command, place), "input.csv", "found a")
+        path.symlink_to("/dev/zero")
+    refused(jaxhil(*command, path), "input.csv", "found a")
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
 def test_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
-    place = tmp_path / "plot.png"
+    path = tmp_path / "plot.png"
     if kind == "pipe":
-        os.mkfifo(place)
+        os.mkfifo(path)
     elif kind == "folder":
-        place.mkdir()
+        path.mkdir()
     else:
-        place.symlink_to("/dev/full")
-    before = os.lstat(place).st_ino, os.stat("/dev/full").st_ino
-    ran = jaxhil("simulate", "rig-300kg", "--plot", place)
+        path.symlink_to("/dev/full")
+    before = os.lstat(path).st_ino, os.stat("/dev/full").st_ino
+    ran = jaxhil("simulate", "rig-300kg", "--plot", path)
     refused(ran, f"plot.png: cannot be written: found a {kind}, allowed a plain file")
-    assert (os.lstat(place).st_ino, os.stat("/dev/full").st_ino) == before
+    assert (os.lstat(path).st_ino, os.stat("/dev/full").st_ino) == before
 
 
 def test_named_link_stands_for_its_file(jaxhil, tmp_path):

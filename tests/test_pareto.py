@@ -167,8 +167,8 @@ def test_weights_of_all_mechanisms_share_one_program(made):
 
 
 def test_pareto_points_start_at_the_results_of_their_neighbours():
-    found = [pareto_search._Candidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
-    assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(found)] == [
+    result = [pareto_search._Candidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
+    assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(result)] == [
         [1, 2],
         [2, 1],
         [2, 4],

@@ -99,11 +99,11 @@ def test_passivity_stops_a_contact_from_diverging(damping):
     scenario = spread(parsed, len(delay), force_sensor__delay=delay)
     without = first_contact(parsed, scenario, "none")["restitution"]
     metrics, ticks = run_record(build_loop(parsed, "passivity", scenario), {}, scenario, 400)
-    found = np.asarray(metrics.restitution)[0]
+    result = np.asarray(metrics.restitution)[0]
     force = np.where(ticks.active, ticks.command, 0)
     most = np.sqrt(1 + np.sum((PERIOD * force / MASS) ** 2, axis=0) / VELOCITY**2)
-    print(without, found, most)
-    assert np.all(without[1:] > 1.02) and np.all(found[1:] > 0.95)
-    assert np.all(found <= most + 1e-9) and np.all(found <= without + 1e-12)
+    print(without, result, most)
+    assert np.all(without[1:] > 1.02) and np.all(result[1:] > 0.95)
+    assert np.all(result <= most + 1e-9) and np.all(result <= without + 1e-12)
     # An arc of the undelayed contact leaves 1 + pi omega T/4, a delayed one is longer and higher.
     assert np.all(most - 1 < 2 * math.pi * math.sqrt(STIFFNESS / MASS) * PERIOD / 4)

@@ -38,5 +38,5 @@ def test_peak_is_not_interpolated_across_a_jump():
     times = np.arange(1.0, 5.0)[:, None] + np.zeros(3)
     jumps = np.zeros_like(curve, bool)
     jumps[2, 0] = True
-    found = largest(curve, times, jumps)
-    assert found[0] == 3.0 and found[1] > 3.1 and found[2] == 3.0
+    result = largest(curve, times, jumps)
+    assert result[0] == 3.0 and result[1] > 3.1 and result[2] == 3.0

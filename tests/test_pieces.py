@@ -23,8 +23,8 @@ POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.
 
 
 def test_checkpoint_returns_every_bit():
-    found = decode(encode(NUMBERS), list[float])
-    assert [struct.pack("d", one) for one in found] == [struct.pack("d", one) for one in NUMBERS]
+    result = decode(encode(NUMBERS), list[float])
+    assert [struct.pack("d", one) for one in result] == [struct.pack("d", one) for one in NUMBERS]
     point = decode(encode(POINT), Point)
     assert type(point) is Point and point.curvature.tobytes() == POINT.curvature.tobytes()
     # A table shows its rows in the order in which they were found.
@@ -66,9 +66,9 @@ def test_checkpoint_with_a_flipped_bit_is_not_used(tmp_path):
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
     places = np.random.default_rng(0).integers(0, 8 * len(content), 1000)
-    for place in places:
+    for folder in places:
         flipped = bytearray(content)
-        flipped[place // 8] ^= 1 << place % 8
+        flipped[folder // 8] ^= 1 << folder % 8
         path.write_bytes(flipped)
         assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
     for length in (0, 1, 64, 65, 66, len(content) - 1):
@@ -103,16 +103,16 @@ def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
 
 def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
     (tmp_path / "taken").touch()
-    for place in (tmp_path / "taken", tmp_path / "link"):
-        kept = Pieces(place)
+    for folder in (tmp_path / "taken", tmp_path / "link"):
+        checkpoints = Pieces(folder)
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
-        if place.name == "link":
-            place.symlink_to(tmp_path / "elsewhere")
-        kept.write("one", 1, 2)
-        journal = kept.journal("work", 1)
+        if folder.name == "link":
+            folder.symlink_to(tmp_path / "elsewhere")
+        checkpoints.write("one", 1, 2)
+        journal = checkpoints.journal("work", 1)
         assert journal.step("round", int, lambda: 5) == 5
         journal.finish()
-        assert kept.unwritten and all("\n" not in str(error) for error in kept.unwritten)
+        assert checkpoints.unwritten and all("\n" not in str(error) for error in checkpoints.unwritten)
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

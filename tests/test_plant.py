@@ -39,13 +39,13 @@ def test_plant_agrees_with_the_oracle_in_every_contact(name):
     case = CASES[name]
     mechanism = validated(case.mechanism)
     gains = nominal_gains(mechanism, case.compensator, **case.gains)
-    found, shortfalls = closed_loop(mechanism, case.compensator, gains)
+    result, shortfalls = closed_loop(mechanism, case.compensator, gains)
     expected = oracle_contacts(name)
-    assert len(found) == len(expected) == mechanism.approach.contacts
+    assert len(result) == len(expected) == mechanism.approach.contacts
     # It uses a cubic for the motion near the deepest point.
     case_lags = mechanism.rig.force_sensor.time_constant > 0
     accuracy = LAGGED if case_lags or "elastoplastic" in name else 1e-11
-    for number, (mine, other) in enumerate(zip(found, expected, strict=True)):
+    for number, (mine, other) in enumerate(zip(result, expected, strict=True)):
         assert mine.status == "ok"
         assert mine.restitution == pytest.approx(other["restitution"], abs=accuracy)
         assert mine.approach_velocity == pytest.approx(other["approach_velocity"], rel=1e-7)
@@ -75,9 +75,9 @@ def test_plant_agrees_with_simulation_for_every_builtin(name):
     scenario = join([build_scenarios(mechanism)])
     loop = build_loop(mechanism, "response_error", scenario)
     expected = run_rollout(loop, as_arrays(gains), scenario)
-    found, shortfalls = closed_loop(mechanism, "response_error", gains)
-    assert len(found) == mechanism.approach.contacts
-    for slot, mine in enumerate(found):
+    result, shortfalls = closed_loop(mechanism, "response_error", gains)
+    assert len(result) == mechanism.approach.contacts
+    for slot, mine in enumerate(result):
         assert mine.status == "ok" and expected.status[slot, 0] == OK
         assert mine.restitution == pytest.approx(float(expected.restitution[slot, 0]), abs=1e-9)
         assert mine.duration == pytest.approx(float(expected.duration[slot, 0]), abs=1e-9)
@@ -171,10 +171,10 @@ def test_noisy_contacts_are_as_good_on_average_as_without_noise(name):
     quiet = load(name, ("approach.contacts=1",)).mechanism
     gains = literature_gains(mechanism, "phase_lead")
     (expected,), _ = closed_loop(quiet, "phase_lead", gains)
-    found = [closed_loop(mechanism, "phase_lead", gains, seed)[0][0].restitution for seed in range(8)]
-    spread = np.std(found)
+    result = [closed_loop(mechanism, "phase_lead", gains, seed)[0][0].restitution for seed in range(8)]
+    spread = np.std(result)
     assert 1e-6 < spread < 0.02
-    assert np.mean(found) == pytest.approx(expected.restitution, abs=4 * spread / 8**0.5 + 1e-3)
+    assert np.mean(result) == pytest.approx(expected.restitution, abs=4 * spread / 8**0.5 + 1e-3)
 
 
 def test_runtime_has_every_law_that_the_plant_runs():

@@ -32,11 +32,11 @@ def behind(**simulator):
 @pytest.mark.parametrize("name", [*builtin_names(), *suite_names()])
 def test_builtin_mechanisms_give_no_warning(name):
     mechanism = jaxhil.load(name)
-    found = meaning(mechanism)
-    assert found.warnings == ()
+    result = meaning(mechanism)
+    assert result.warnings == ()
     slow = name == "suite-long"
-    assert found.equivalent_mass == mechanism.bodies.mass and found.control_rate == (500.0 if slow else 1e3)
-    assert all((0.06 if slow else 1.5) < one.frequency < 10 for one in found.contacts)
+    assert result.equivalent_mass == mechanism.bodies.mass and result.control_rate == (500.0 if slow else 1e3)
+    assert all((0.06 if slow else 1.5) < one.frequency < 10 for one in result.contacts)
     check_run(mechanism, drawn=True)
 
 
@@ -60,12 +60,12 @@ def test_summary_line_states_what_the_file_means():
 
 
 def test_summary_lists_different_contacts_once_in_order():
-    found = meaning(
+    result = meaning(
         jaxhil.load("varying", {"contact.stiffness": [2e5, 1e5, 2e5, 3e5], "approach.contacts": 9})
     )
-    assert [one.number for one in found.contacts] == [1, 2, 4]
+    assert [one.number for one in result.contacts] == [1, 2, 4]
     omega = np.sqrt(np.array([2e5, 1e5, 3e5]) / 350.0)
-    np.testing.assert_allclose([one.frequency for one in found.contacts], omega / (2 * np.pi), rtol=1e-12)
+    np.testing.assert_allclose([one.frequency for one in result.contacts], omega / (2 * np.pi), rtol=1e-12)
 
 
 def power_law(stiffness, exponent):
@@ -232,10 +232,10 @@ def refusal(mechanism, **options):
 
 
 def test_runs_of_too_many_ticks_are_refused():
-    said = (
+    message = (
         "found 1e-09 s, allowed at most 1e+07 ticks a contact and 1e+09 a run: contact 1 takes about 0.195 s"
     )
-    assert f"rig.control_period: {said}, 1.9e+08 ticks" in refusal(rig(rig__control_period=1e-9))
+    assert f"rig.control_period: {message}, 1.9e+08 ticks" in refusal(rig(rig__control_period=1e-9))
     check_run(rig(rig__control_period=2e-8))
     assert "contact 1 takes" in refusal(rig(rig__control_period=1.9e-8))
     # A contact that never ends takes 10 s.
@@ -249,9 +249,9 @@ def test_runs_of_too_many_ticks_are_refused():
 def test_flight_without_end_is_refused():
     gap = {"contact.clearance": 40.0, "approach.contacts": 2}
     check_run(rig(gap))
-    said = refusal(rig(gap, contact__clearance=100.0))
-    assert "contact.clearance: found 100 m, allowed at most 1e+07 ticks a contact" in said
-    assert "contact 2 takes about 2e+04 s, 2e+07 ticks" in said
+    message = refusal(rig(gap, contact__clearance=100.0))
+    assert "contact.clearance: found 100 m, allowed at most 1e+07 ticks a contact" in message
+    assert "contact 2 takes about 2e+04 s, 2e+07 ticks" in message
     assert "contact.clearance: found 1e+30 m" in refusal(rig(gap, contact__clearance=1e30))
     # There is no flight after the last contact.
     check_run(rig(contact__clearance=1e30))
@@ -282,8 +282,8 @@ def test_limit_on_ticks_covers_drawn_values():
     ids=str,
 )
 def test_simulators_too_fast_for_the_control_period_are_refused(simulator):
-    said = refusal(behind(**simulator))
-    assert ": rig.simulator: found a pole of " in said and "allowed at most 64 / control_period" in said
+    message = refusal(behind(**simulator))
+    assert ": rig.simulator: found a pole of " in message and "allowed at most 64 / control_period" in message
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
@@ -293,8 +293,8 @@ def test_accepted_poles_are_propagated_exactly(angle):
     matrix = np.array([[0.0, FASTEST_POLE], [-FASTEST_POLE, -damping]])
     whole = np.zeros((4, 4))
     whole[:2, :2], whole[:2, 2], whole[2, 3] = matrix, (3.0, -2.0), 0.7
-    found = exponential(jnp.asarray(whole[:2]), jnp.asarray(0.7))
-    np.testing.assert_allclose(found, expm(whole)[:3], rtol=0, atol=2e-9)
+    result = exponential(jnp.asarray(whole[:2]), jnp.asarray(0.7))
+    np.testing.assert_allclose(result, expm(whole)[:3], rtol=0, atol=2e-9)
 
 
 def test_limit_on_poles_covers_drawn_values():
@@ -307,8 +307,8 @@ def test_limit_on_velocity_covers_drawn_values():
     normal = {"approach.velocity": {"distribution": "normal", "std": 1e-4}}
     narrow = rig({"uncertainty": normal}, rig__simulator__velocity_limit=1.1 * SPEED)
     check_run(narrow)
-    said = "rig.simulator.velocity_limit: found 0.0055, allowed a number >= 0.00559978 m/s"
-    assert said in refusal(narrow, drawn=True)
+    message = "rig.simulator.velocity_limit: found 0.0055, allowed a number >= 0.00559978 m/s"
+    assert message in refusal(narrow, drawn=True)
     check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
 
 
@@ -326,9 +326,9 @@ def test_tune_prints_the_mechanism_summary_on_request(capsys):
     for progress in (False, True):
         with pytest.raises(jaxhil.InputError, match="objective"):
             tuning.tune([sensor, sensor], "phase_lead", objective="mean", progress=progress)
-        said = capsys.readouterr()
-        assert said.out == "" and len(said.err.splitlines()) == 4 * progress
-    line, warning, *_ = said.err.splitlines()
+        message = capsys.readouterr()
+        assert message.out == "" and len(message.err.splitlines()) == 4 * progress
+    line, warning, *_ = message.err.splitlines()
     assert line == meaning(sensor).line("rig-300kg")
     assert warning == f"warning: rig-300kg: {meaning(sensor).warnings[0]}"
 
@@ -343,10 +343,10 @@ def test_simulate_begins_with_the_summary_line(jaxhil):
         "warning: rig-300kg: rig.force_sensor.range: found 10 N, expected beyond the 28.3 N of contact 1 in "
         "space\n"
     )
-    found = jaxhil("simulate", "rig-300kg", "--json", "--set", "rig.force_sensor.range=1e9").document[
+    result = jaxhil("simulate", "rig-300kg", "--json", "--set", "rig.force_sensor.range=1e9").document[
         "meaning"
     ]
-    assert found["contacts"] == [
+    assert result["contacts"] == [
         {
             "number": 1,
             "frequency": pytest.approx(3.0, rel=1e-5),
@@ -354,7 +354,7 @@ def test_simulate_begins_with_the_summary_line(jaxhil):
             "peak_force": pytest.approx(28.27, rel=1e-3),
         }
     ]
-    assert found["force_range"] == 1e9 and found["warnings"] == []
+    assert result["force_range"] == 1e9 and result["warnings"] == []
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])

@@ -128,8 +128,8 @@ def runs(draw):
     gains = {name: entry["value"] for name, entry in GAINS[law].items()}
     clearance = draw(st.sampled_from([math.inf, math.inf, 0.0, 1e-4, 0.01]))
     limits = dict(LIMITED)
-    some = ("velocity_limit", "deceleration", "retreat_velocity", "free_distance", "start_distance")
-    for name in (*some, "command_lowest", "command_highest", "measured_lowest", "measured_highest"):
+    guards = ("velocity_limit", "deceleration", "retreat_velocity", "free_distance", "start_distance")
+    for name in (*guards, "command_lowest", "command_highest", "measured_lowest", "measured_highest"):
         if draw(st.booleans()):
             low, high = max(LIMITS[name].lowest, -0.1), min(LIMITS[name].highest, 0.1)
             limits[name] = draw(st.floats(low, high))

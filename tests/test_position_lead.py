@@ -56,8 +56,8 @@ def restitutions():
     delay = np.where(case == 2, DELAY, 0.0)
     scenario = spread(parsed, len(case), phase=phase, control_period=period, force_sensor__delay=delay)
     gains = {name: np.where(case == 1, 0.0, value) for name, value in gains.items()}
-    found = first_contact(parsed, scenario, "position_lead", gains)["restitution"]
-    return found.reshape(3, len(PERIODS), -1).mean(axis=-1)
+    result = first_contact(parsed, scenario, "position_lead", gains)["restitution"]
+    return result.reshape(3, len(PERIODS), -1).mean(axis=-1)
 
 
 def test_exact_inverse_leaves_an_error_of_first_order_in_the_period():
@@ -71,10 +71,10 @@ def test_exact_inverse_leaves_an_error_of_first_order_in_the_period():
 
 
 def test_position_lead_leaves_the_force_delay():
-    found = restitutions()[2]
+    result = restitutions()[2]
     expected = delayed_restitution(OMEGA * DELAY)
     assert expected > 1.15
-    assert 2 * found[-1] - found[-2] == pytest.approx(expected, abs=2e-4)
+    assert 2 * result[-1] - result[-2] == pytest.approx(expected, abs=2e-4)
 
 
 def test_simulator_follows_the_model_under_position_lead():
@@ -113,10 +113,14 @@ def test_position_lead_nominal_gains_are_within_bounds():
             inverse = simulator_inverse(made)
             for gain, expected in zip(COMPENSATORS["position_lead"].gains, inverse, strict=True):
                 assert gain.lower(made) <= gain.nominal(made) == expected <= gain.upper(made)
-    held = validated(mechanism({}, {**IDEAL, "delay": 1e-4}, command_hold="zoh"))
-    assert simulator_inverse(held)[0] < 0
+    mechanism_with_hold = validated(mechanism({}, {**IDEAL, "delay": 1e-4}, command_hold="zoh"))
+    assert simulator_inverse(mechanism_with_hold)[0] < 0
     for gain in COMPENSATORS["position_lead"].gains:
-        assert gain.lower(held) <= gain.nominal(held) <= gain.upper(held)
+        assert (
+            gain.lower(mechanism_with_hold)
+            <= gain.nominal(mechanism_with_hold)
+            <= gain.upper(mechanism_with_hold)
+        )
 
 
 # Runtime on the rig
@@ -169,7 +173,7 @@ def test_verification_detects_a_wrong_position_command(monkeypatch):
 
 def test_stroke_and_velocity_limits_apply_to_the_sent_command():
     loaded = loaded_gains()
-    found = calibrate(loaded, scenarios=8, limit=1.0)
+    result = calibrate(loaded, scenarios=8, limit=1.0)
     [chunk] = recorded_chunks(loaded, Scenarios("random", 0, 8))
     sent, position = (np.where(chunk.signals.live, leaf, np.nan) for leaf in chunk.signals[5:0:-4])
     assert np.nanmax(sent) > np.nanmax(position)
@@ -177,6 +181,6 @@ def test_stroke_and_velocity_limits_apply_to_the_sent_command():
     sent, begins = sent[:, ::4], chunk.signals.begins[1:, ::4]
     speed = np.abs(np.diff(sent, axis=0))[~begins]
     spare = 0.5 * (np.nanmax(sent) - np.nanmin(sent))
-    assert found.limits["command_highest"] == pytest.approx(np.nanmax(sent) + spare, rel=1e-12)
-    assert found.limits["velocity_limit"] == pytest.approx(1.5 * np.nanmax(speed) / 1e-3, rel=1e-12)
-    assert found.rates["false_alarms"]["alarms"] == 0
+    assert result.limits["command_highest"] == pytest.approx(np.nanmax(sent) + spare, rel=1e-12)
+    assert result.limits["velocity_limit"] == pytest.approx(1.5 * np.nanmax(speed) / 1e-3, rel=1e-12)
+    assert result.rates["false_alarms"]["alarms"] == 0

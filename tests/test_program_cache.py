@@ -35,8 +35,8 @@ def sums(static, arguments) -> Sums:
         return factor * values
 
     mesh = jax.make_mesh((2,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:2])
-    own = PartitionSpec("device")
-    parts = jax.shard_map(one_device, mesh=mesh, in_specs=own, out_specs=own)(arguments["values"])
+    sharding = PartitionSpec("device")
+    parts = jax.shard_map(one_device, mesh=mesh, in_specs=sharding, out_specs=sharding)(arguments["values"])
     return Sums(jnp.sum(parts) + static[1], parts)
 
 

@@ -78,9 +78,9 @@ def test_progress_is_printed_with_elapsed_time_after_silence(monkeypatch, capsys
     with terminal.progress(10, "scenarios") as bar:
         bar.tell("compiling", 1)
         time.sleep(0.5)
-    found = lines(capsys)
-    assert len(found) >= 3 and all(line.endswith("compiling") for line in found)
-    assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in found)
+    result = lines(capsys)
+    assert len(result) >= 3 and all(line.endswith("compiling") for line in result)
+    assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in result)
 
 
 def test_progress_shows_elapsed_time_before_anything_is_known(clock, capsys):

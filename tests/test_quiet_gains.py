@@ -53,16 +53,16 @@ MECHANISMS = [noisy(*rig) for rig in RIGS]
 
 
 def tuned(settings, **options):
-    found = dict(tune_all(MECHANISMS, LAW, settings, **options))
-    return [found[index] for index in range(len(MECHANISMS))]
+    result = dict(tune_all(MECHANISMS, LAW, settings, **options))
+    return [result[index] for index in range(len(MECHANISMS))]
 
 
 @pytest.fixture(scope="module")
 def quiet():
     """Return the quietest gains, and the number of solver programs they took."""
     program_cache._program.cache_clear()
-    found = tuned(SETTINGS)
-    return found, program_cache._program.cache_info().misses
+    result = tuned(SETTINGS)
+    return result, program_cache._program.cache_info().misses
 
 
 def noise_of(result, gains):
@@ -142,8 +142,8 @@ def test_mechanisms_without_noise_are_tuned_as_if_quiet_was_not_requested():
 def test_cached_quiet_gains_are_the_same(quiet, tmp_path):
     made = tuned(SETTINGS, pieces=Pieces(tmp_path))
     again = tuned(SETTINGS, pieces=Pieces(tmp_path, resume=True))
-    for one, other, known in zip(made, again, quiet[0], strict=True):
-        assert one.gains == other.gains == known.gains
+    for one, other, reference in zip(made, again, quiet[0], strict=True):
+        assert one.gains == other.gains == reference.gains
         assert one.quiet == other.quiet and one.without_noise == other.without_noise
 
 

@@ -68,18 +68,18 @@ def integrated(name, values, tolerance=TOLERANCE, **options):
     parameters = contact(**values)
     if options:
         run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
-        found = run(parameters, mass, velocity)
+        result = run(parameters, mass, velocity)
     else:
-        found = within(law, parameters, mass, velocity, np.asarray(tolerance, float))
-    return found, closed_form(law, parameters, mass, velocity)
+        result = within(law, parameters, mass, velocity, np.asarray(tolerance, float))
+    return result, closed_form(law, parameters, mass, velocity)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_integrated_contact_agrees_with_closed_forms(case):
-    found, expected = integrated(*CASES[case])
-    np.testing.assert_allclose(found.restitution, expected.restitution, rtol=0, atol=2e-8)
-    np.testing.assert_allclose(found.peak_force, expected.peak_force, rtol=2e-8)
-    np.testing.assert_allclose(found.duration, expected.duration, rtol=2e-8)
+    result, expected = integrated(*CASES[case])
+    np.testing.assert_allclose(result.restitution, expected.restitution, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(result.peak_force, expected.peak_force, rtol=2e-8)
+    np.testing.assert_allclose(result.duration, expected.duration, rtol=2e-8)
 
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "piecewise_linear"])
@@ -92,16 +92,16 @@ def test_error_falls_with_the_tolerance(case):
     tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
     errors = []
     for tolerance in tolerances:
-        found, expected = integrated(*CASES[case], tolerance=float(tolerance))
-        errors.append(np.sqrt(np.mean((found.restitution - expected.restitution) ** 2)))
+        result, expected = integrated(*CASES[case], tolerance=float(tolerance))
+        errors.append(np.sqrt(np.mean((result.restitution - expected.restitution) ** 2)))
     assert np.polyfit(np.log(tolerances), np.log(errors), 1)[0] > 0.75
     assert errors[-1] < 1e-9
 
 
 def test_sticking_bodies_never_separate():
-    found, _ = integrated("kelvin_voigt", {"damping": 3 * CRITICAL, "tension": True})
-    assert np.all(np.isinf(found.duration))
-    assert np.all(found.restitution < 1e-6)
+    result, _ = integrated("kelvin_voigt", {"damping": 3 * CRITICAL, "tension": True})
+    assert np.all(np.isinf(result.duration))
+    assert np.all(result.restitution < 1e-6)
 
 
 def pulse(start, length, height):
@@ -120,7 +120,7 @@ def test_pushed_contact_agrees_with_scipy():
     damping = 0.05 * CRITICAL
     push = pulse(jnp.asarray(starts), length, height)
     times = np.linspace(-0.01, 0.3, 63)[:, None] + np.linspace(0, 1e-3, LANES)
-    found, _ = integrated(
+    result, _ = integrated(
         "kelvin_voigt",
         {"damping": damping},
         push=push,
@@ -146,33 +146,33 @@ def test_pushed_contact_agrees_with_scipy():
             max_step=5e-4,
             dense_output=True,
         )
-        assert found.restitution[lane] == pytest.approx(-exact.y[1, -1] / VELOCITY, abs=2e-7)
+        assert result.restitution[lane] == pytest.approx(-exact.y[1, -1] / VELOCITY, abs=2e-7)
         position, speed = np.array(
             [exact.sol(t) if t > 0 else (VELOCITY * t, VELOCITY) for t in times[:, lane]]
         ).T
-        np.testing.assert_allclose(found.position[:, lane], position, rtol=0, atol=2e-7 * VELOCITY / OMEGA)
-        np.testing.assert_allclose(found.velocity[:, lane], speed, rtol=0, atol=1e-6 * VELOCITY)
+        np.testing.assert_allclose(result.position[:, lane], position, rtol=0, atol=2e-7 * VELOCITY / OMEGA)
+        np.testing.assert_allclose(result.velocity[:, lane], speed, rtol=0, atol=1e-6 * VELOCITY)
 
 
 def test_push_after_the_contact_adds_its_impulse():
     push = pulse(0.25, 0.02, 6.0)
-    found, alone = integrated("kelvin_voigt", {}, push=push, push_duration=0.27)
+    result, alone = integrated("kelvin_voigt", {}, push=push, push_duration=0.27)
     impulse = 6.0 * 0.02 * 2 / np.pi
-    np.testing.assert_allclose(found.restitution, 1 + impulse / (MASS * VELOCITY), rtol=1e-8)
-    np.testing.assert_allclose(found.duration, alone.duration, rtol=1e-9)
+    np.testing.assert_allclose(result.restitution, 1 + impulse / (MASS * VELOCITY), rtol=1e-8)
+    np.testing.assert_allclose(result.duration, alone.duration, rtol=1e-9)
 
 
 def test_trajectory_of_linear_contact_is_the_closed_form():
     """Use x = v sin(omega t) / omega, then uniform motion; times in any order."""
     times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
     times = times[:, None] * np.ones(LANES)
-    found, _ = integrated("linear", {}, times=jnp.asarray(times))
+    result, _ = integrated("linear", {}, times=jnp.asarray(times))
     end = np.pi / OMEGA
     inside = (times > 0) & (times < end)
     position = np.where(inside, np.sin(OMEGA * times) / OMEGA, np.where(times > 0, end - times, times))
     speed = np.where(inside, np.cos(OMEGA * times), np.where(times > 0, -1.0, 1.0))
-    np.testing.assert_allclose(found.position / VELOCITY, position, rtol=0, atol=1e-8 / OMEGA)
-    np.testing.assert_allclose(found.velocity / VELOCITY, speed, rtol=0, atol=2e-7)
+    np.testing.assert_allclose(result.position / VELOCITY, position, rtol=0, atol=1e-8 / OMEGA)
+    np.testing.assert_allclose(result.velocity / VELOCITY, speed, rtol=0, atol=2e-7)
 
 
 # Without damping the derivative by it is one-sided.
@@ -196,10 +196,10 @@ def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance)
 
         return jax.jit(jax.jacfwd(function), compiler_options=QUICK)(np.zeros(4), parameters)
 
-    found = derivatives(lambda c, m, v: integrate_contact(law, c, m, v))
+    result = derivatives(lambda c, m, v: integrate_contact(law, c, m, v))
     expected = derivatives(law.reference)
     size = closed_form(law, parameters._replace(damping=parameters.damping + 10), mass, velocity)
-    np.testing.assert_array_less(np.abs(found - expected) / np.stack(size)[..., None], tolerance)
+    np.testing.assert_array_less(np.abs(result - expected) / np.stack(size)[..., None], tolerance)
 
 
 def test_integrated_contact_in_single_precision_and_under_vmap():
@@ -210,7 +210,7 @@ def test_integrated_contact_in_single_precision_and_under_vmap():
         scalar = jax.tree.map(lambda leaf: leaf[..., 0], parameters)
         return integrate_contact(law, scalar._replace(damping=damping), mass, velocity)
 
-    found = jax.jit(jax.vmap(run), compiler_options=QUICK)(parameters.damping, mass, velocity)
-    assert found.restitution.dtype == np.float32
+    result = jax.jit(jax.vmap(run), compiler_options=QUICK)(parameters.damping, mass, velocity)
+    assert result.restitution.dtype == np.float32
     expected = closed_form(law, parameters, mass, velocity)
-    np.testing.assert_allclose(found.restitution, expected.restitution, atol=1e-4)
+    np.testing.assert_allclose(result.restitution, expected.restitution, atol=1e-4)

@@ -71,9 +71,9 @@ def test_incomplete_contact_law_is_refused(registered):
         (lambda: Plant(mechanism), "in_floats"),
         (lambda: known.contact_law(mechanism.contact), "regression"),
     ):
-        said = refusal(needs)
-        assert said.startswith("contact.law: found 'squared_spring', expected a law ")
-        assert said.endswith(f"(ContactLaw.{method})")
+        message = refusal(needs)
+        assert message.startswith("contact.law: found 'squared_spring', expected a law ")
+        assert message.endswith(f"(ContactLaw.{method})")
     assert "contact.law: found 'none', expected one of linear, " in refusal(laws.contact_law, "none")
 
 
@@ -109,7 +109,7 @@ def test_unusable_law_is_not_registered(registered):
         name = "holding"
         table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
 
-    for law, said in (
+    for law, message in (
         (ScaledLead, "found the class ScaledLead, allowed an instance of"),
         (3, "found 3, allowed an instance of"),
         (Unnamed(), "Unnamed.name: found"),
@@ -120,7 +120,7 @@ def test_unusable_law_is_not_registered(registered):
         (Holding(), "a law holds no arrays"),
         (OfItsOwnKey(), "keys: found toy_depth, allowed keys that files have: tension, exponent, "),
     ):
-        assert said in refusal(jaxhil.register, law)
+        assert message in refusal(jaxhil.register, law)
     assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")
     assert "a contact law runs in the simulation alone" in refusal(
         jaxhil.register, SquaredSpring(), runtime=ScaledLeadOnTheRig

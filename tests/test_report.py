@@ -132,7 +132,7 @@ def test_third_party_results_are_refused_in_one_line(jaxhil, put, tmp_path, docu
 
 def test_report_arguments_are_checked(jaxhil, put, tmp_path):
     one = put(identified())
-    for arguments, said in (
+    for arguments, message in (
         ([], "found nothing"),
         ([one, one], "one of each kind"),
         ([tmp_path / "none"], "cannot be read"),
@@ -140,23 +140,23 @@ def test_report_arguments_are_checked(jaxhil, put, tmp_path):
         ([one, "-o", tmp_path / "page.png"], "ends in .html"),
     ):
         ended = jaxhil("report", *arguments)
-        assert ended.code == 2 and said in ended.err, arguments
+        assert ended.code == 2 and message in ended.err, arguments
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """Results of a complete workflow under a third-party name: tuned, swept, compared, mapped, exported."""
-    place = tmp_path_factory.mktemp("results")
+    folder = tmp_path_factory.mktemp("results")
     mechanism = jaxhil.load("varying", {"name": HOSTILE, "rig.force_sensor.noise_std": 0.5})
     tuned = tuning.tune(mechanism, "phase_lead", scenarios=16, starts=1)
-    tuned.save(place / "gains.json")
+    tuned.save(folder / "gains.json")
     study = tuning.sweep(
-        place / "gains.json", scenarios=1500, folder=place / "sweep", drivers=64, rare=0.9, limit=0.5
+        folder / "gains.json", scenarios=1500, folder=folder / "sweep", drivers=64, rare=0.9, limit=0.5
     )
-    tuning.export(tuned, place / "bundle", sweep=study, false_alarms=1.0, missed=1.0)
+    tuning.export(tuned, folder / "bundle", sweep=study, false_alarms=1.0, missed=1.0)
     axes = "contact.stiffness", "rig.force_sensor.delay"
-    tuning.map(mechanism, *axes, "phase_lead", tuned.gains, points=12, folder=place / "map")
-    return [place / name for name in ("gains.json", "sweep", "bundle", "map")]
+    tuning.map(mechanism, *axes, "phase_lead", tuned.gains, points=12, folder=folder / "map")
+    return [folder / name for name in ("gains.json", "sweep", "bundle", "map")]
 
 
 @pytest.fixture(scope="module")
@@ -170,9 +170,9 @@ def whole(results, tmp_path_factory):
 @pytest.mark.slow
 def test_report_holds_all_that_is_known(whole):
     text = whole.read_text(encoding="utf-8")
-    for place in ("requirements", "assumptions", "gains", "runs", "errors", "drivers", "watchdog", "map",
+    for folder in ("requirements", "assumptions", "gains", "runs", "errors", "drivers", "watchdog", "map",
                   "reproduction", "sign-off"):  # fmt: skip
-        assert f'<section id="{place}">' in text
+        assert f'<section id="{folder}">' in text
     assert text.count('class="trace"') > 10 and "jaxhil replay" in text and "jaxhil sweep" in text
 
 
@@ -224,8 +224,8 @@ def test_report_page_is_accessible(whole, browser):
         browser.evaluate(f"{axe}; 0")
         script = """axe.run({ exclude: ['.picture svg > g'] }, { resultTypes: ['violations'] })
             .then(told => told.violations.map(one => [one.impact, one.id, one.nodes[0].target.join(' ')]))"""
-        found = browser.evaluate(script)
-        assert [one for one in found if one[0] in ("serious", "critical")] == []
+        result = browser.evaluate(script)
+        assert [one for one in result if one[0] in ("serious", "critical")] == []
 
 
 @pytest.mark.slow

@@ -104,8 +104,8 @@ def test_resumed_run_ends_as_without_interruption(jaxhil, files, whole, tmp_path
     # Rounds of the search, the search, and one result each.
     assert every >= 2 + FILES
     for stop in (2, every):
-        found, made = interrupted_and_resumed(jaxhil, files, tmp_path / str(stop), stop, after=stop > 2)
-        assert found == expected
+        result, made = interrupted_and_resumed(jaxhil, files, tmp_path / str(stop), stop, after=stop > 2)
+        assert result == expected
         # Saved results are not computed again.
         assert made == (every - 1 if stop == 2 else 0)
     # Steps are removed, results stay.
@@ -118,16 +118,16 @@ def test_run_resumes_after_interruption_at_any_checkpoint(jaxhil, files, whole, 
     for stop in range(1, every + 1):
         for after in (False, True):
             folder = tmp_path / f"{stop} {after}"
-            found, _ = interrupted_and_resumed(jaxhil, files, folder, stop, after)
-            assert found == expected, (stop, after)
+            result, _ = interrupted_and_resumed(jaxhil, files, folder, stop, after)
+            assert result == expected, (stop, after)
 
 
 @pytest.mark.slow
 def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_path):
     out = tmp_path / "out"
     jaxhil("tune", files, "-o", out, *TINY)
-    some = [files / f"m{number}.toml" for number in range(FILES - 1)]
-    for change in ([files, "--seed", "1"], some):
+    paths = [files / f"m{number}.toml" for number in range(FILES - 1)]
+    for change in ([files, "--seed", "1"], paths):
         ran = jaxhil("tune", *change, "-o", out, *TINY, "--resume")
         assert ran.code == 0 and "kept by other files, options or code" in ran.err
         fresh = jaxhil("tune", *change, "-o", tmp_path / "fresh", *TINY)
@@ -205,16 +205,16 @@ def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
 
     def run(*laws, resume=True, **settings):
         judged.clear()
-        kept = Pieces(tmp_path, resume)
-        found = list(compare(mechanisms, laws, CompareSettings(**settings), 0, pieces=kept))
-        return sorted(map(repr, found)), [law for law, _ in judged]
+        checkpoints = Pieces(tmp_path, resume)
+        result = list(compare(mechanisms, laws, CompareSettings(**settings), 0, pieces=checkpoints))
+        return sorted(map(repr, result)), [law for law, _ in judged]
 
     with pytest.raises(KeyboardInterrupt):
         run("none", "smith", resume=False)
     assert run("none", "passivity")[1] == ["none"] * (len(groups) - 1) + ["passivity"] * len(groups)
-    found, computed = run("passivity", "none")
-    assert len(found) == 2 * len(names) and computed == []
-    assert run("none", "passivity", resume=False) == (found, ["none", "passivity"] * len(groups))
+    result, computed = run("passivity", "none")
+    assert len(result) == 2 * len(names) and computed == []
+    assert run("none", "passivity", resume=False) == (result, ["none", "passivity"] * len(groups))
     assert len(run("none", seed=1)[1]) == len(groups)
 
 

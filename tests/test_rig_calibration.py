@@ -64,11 +64,11 @@ def calibrated():
 def watch(limits, signals, rules, lane):
     """Return (restitution, expected, imbalance, fault) of a lane's contacts by the runtime's watchdog."""
     watchdog = Watchdog(complete(limits), rules.period, rules.clearance)
-    found, given = [], 0.0
+    result, given = [], 0.0
 
     def note(fault):
-        if watchdog.contacts > len(found):
-            found.append((watchdog.restitution, watchdog.expected, watchdog.balance, fault))
+        if watchdog.contacts > len(result):
+            result.append((watchdog.restitution, watchdog.expected, watchdog.balance, fault))
 
     for tick in range(int(np.sum(signals.live[:, lane]))):
         force, position, velocity, measured, command = (float(leaf[tick, lane]) for leaf in signals[:5])
@@ -78,7 +78,7 @@ def watch(limits, signals, rules, lane):
         note(watchdog.tick(given, UNSTATED, force, position, velocity, measured))
         given = command
     note(watchdog.conclude(given, UNSTATED))
-    return found
+    return result
 
 
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
@@ -96,7 +96,7 @@ def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
         "reference_velocity": 0.004,
         **{f"{name}_lowest": -0.5 for name in ("softness", "speed", "loss")},
         **{f"{name}_highest": 0.5 for name in ("softness", "speed", "loss")},
-        **{f"expected_{term}": 0.9 / 3**place for place, term in enumerate(TERMS)},
+        **{f"expected_{term}": 0.9 / 3**index for index, term in enumerate(TERMS)},
     }
     expectation = Expectation(
         {term: limits[f"expected_{term}"] for term in TERMS}, 1e5, 0.004, *[(-0.5, 0.5)] * 3
@@ -171,22 +171,22 @@ def test_contacts_without_force_end_though_the_law_output_hardly_decays(calibrat
 
     def faults(output):
         watchdog = Watchdog(complete(limits), 1e-3, math.inf)
-        found, rate = set(), 2 * math.pi / 0.15
+        result, rate = set(), 2 * math.pi / 0.15
         for tick in range(2000):
             phase, given = rate * 1e-3 * tick, output * 0.99999**tick
             position, velocity = 1e-4 * (math.sin(phase) - 0.5), 1e-4 * rate * math.cos(phase)
-            found.add(watchdog.tick(given, UNSTATED, 0.0, position, velocity, position))
-        return found
+            result.add(watchdog.tick(given, UNSTATED, 0.0, position, velocity, position))
+        return result
 
     assert CONTACT_TOO_LONG in faults(1e-3) and CONTACT_TOO_LONG not in faults(1e-9)
 
 
 def test_rig_specific_limits_are_preserved_and_count():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
-    found = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
-    assert {name: found.limits[name] for name in small} == small
+    result = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
+    assert {name: result.limits[name] for name in small} == small
     # A limit that no run satisfies stops the good ones too.
-    rate = found.rates["false_alarms"]
+    rate = result.rates["false_alarms"]
     assert rate["alarms"] == rate["runs"] > 0
 
 
@@ -330,7 +330,7 @@ def test_extent_of_a_run_has_its_largest_and_smallest_values():
         command=[0.0, 1.0, -1.0, 2.0, 0.0, 0.0],
         sent=[-3.0, -2.5, 2.0, 7.0, 6.0, 5.5],
     )
-    found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    result = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
     expected = {
         "reading": 9.0,
         "measured_lowest": -4.0,
@@ -348,7 +348,7 @@ def test_extent_of_a_run_has_its_largest_and_smallest_values():
         "flight_force": 0.5,
         "flight_spread": 0.0,
     }
-    assert {name: float(values[0]) for name, values in found._asdict().items()} == expected
+    assert {name: float(values[0]) for name, values in result._asdict().items()} == expected
 
 
 @pytest.mark.parametrize(("force", "travel"), [(0.0, 1.5 + 0.5), (5.0, 1.5 + 0.5 + 0.5 + 0.3 + 0.5)])
@@ -356,8 +356,8 @@ def test_extent_counts_missing_force_only_on_the_way_into_a_contact(force, trave
     """Count as the runtime's guard does: a damped mechanism leaves the contact without a force."""
     flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
     made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
-    found = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
-    assert float(found.force_stuck[0]) == pytest.approx(travel)
+    result = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    assert float(result.force_stuck[0]) == pytest.approx(travel)
 
 
 def test_margins_are_set_by_good_runs_alone(calibrated):

@@ -73,8 +73,8 @@ def start(masses, speeds, begin):
     gap = speeds * -begin
     places = [zero.copy(), OFFSETS[0][:, None] + gap - OFFSETS[1][:, None]]
     moving = [zero.copy(), speeds.copy()]
-    for place, speed in zip(places, moving, strict=True):
-        place[:, ELSEWHERE] = TURNED.apply(place[:, ELSEWHERE])
+    for position, speed in zip(places, moving, strict=True):
+        position[:, ELSEWHERE] = TURNED.apply(position[:, ELSEWHERE])
         speed[:, ELSEWHERE] = TURNED.apply(speed[:, ELSEWHERE]) + BOOST
     turns = np.tile([[1.0], [0.0], [0.0], [0.0]], LANES)
     turns[:, ELSEWHERE] = np.roll(TURNED.as_quat(), 1)
@@ -95,8 +95,8 @@ def simulate(loop, given, points, delays, friction):
         for mass, inertia, offset in zip(masses, inertias, offsets, strict=True)
     ))  # fmt: skip
     states = States(*(
-        build_state(body, vector(place), vector(speed), attitude, still)
-        for body, place, speed in zip(pair, places, speeds, strict=True)
+        build_state(body, vector(position), vector(speed), attitude, still)
+        for body, position, speed in zip(pair, places, speeds, strict=True)
     ))  # fmt: skip
     one = jnp.ones((1, LANES))
     none = 0 * one
@@ -133,9 +133,9 @@ def simulate(loop, given, points, delays, friction):
 def simulated(*loop):
     """Return the program's results, each part (lanes, ticks, components)."""
     masses, points, speeds, delays, friction = cases()
-    given = start(masses, speeds, 0.02 + PERIOD / 3)
-    found = simulate(Loop(*loop), *jax.tree.map(jnp.asarray, (given, points, delays, friction)))
-    return {key: np.moveaxis(np.asarray(part), 0, -1).swapaxes(0, 1) for key, part in found.items()}
+    states = start(masses, speeds, 0.02 + PERIOD / 3)
+    result = simulate(Loop(*loop), *jax.tree.map(jnp.asarray, (states, points, delays, friction)))
+    return {key: np.moveaxis(np.asarray(part), 0, -1).swapaxes(0, 1) for key, part in result.items()}
 
 
 @pytest.fixture(scope="module")
@@ -158,9 +158,9 @@ def energy_error(seen, lane, mass, speed):
 def test_central_contact_is_that_of_one_axis(integrator, hold, latency):
     changes = {"rig.integrator": integrator, "rig.command_hold": hold, "rig.command_latency": latency}
     expected = package.simulate(package.load("claw-350kg", changes), "none").contacts[0].restitution
-    found = simulated(integrator, hold, latency, 16)
-    np.testing.assert_allclose(found["speed"][CENTRAL, -1, 2] / 0.005, expected, rtol=1e-9)
-    np.testing.assert_allclose(energy_error(found, CENTRAL, 350, 0.005), expected**2 - 1, rtol=1e-9)
+    result = simulated(integrator, hold, latency, 16)
+    np.testing.assert_allclose(result["speed"][CENTRAL, -1, 2] / 0.005, expected, rtol=1e-9)
+    np.testing.assert_allclose(energy_error(result, CENTRAL, 350, 0.005), expected**2 - 1, rtol=1e-9)
 
 
 def test_contact_off_the_line_is_that_of_the_effective_mass(seen):

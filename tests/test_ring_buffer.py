@@ -26,11 +26,11 @@ def test_ring_buffer_returns_its_last_samples(extra, ticks):
 def test_ring_buffer_returns_default_for_unknown_samples(newest, ticks, last):
     """Cover lanes that all look back alike, and one that does not."""
     ring = jnp.asarray(np.random.default_rng(newest).normal(size=(SAMPLES, LANES)))
-    ticks, known = np.array([ticks, ticks, last], np.int32), np.array([True, False, True])
+    ticks, is_known = np.array([ticks, ticks, last], np.int32), np.array([True, False, True])
     otherwise = np.arange(LANES, dtype=float)
-    read = look_back(ring, jnp.array(newest, jnp.int32), jnp.asarray(ticks), jnp.asarray(known), otherwise)
+    read = look_back(ring, jnp.array(newest, jnp.int32), jnp.asarray(ticks), jnp.asarray(is_known), otherwise)
     samples = np.asarray(ring)[(newest - ticks) % SAMPLES, np.arange(LANES)]
-    np.testing.assert_array_equal(read, np.where(known, samples, otherwise))
+    np.testing.assert_array_equal(read, np.where(is_known, samples, otherwise))
 
 
 def test_ring_buffer_written_in_turn_or_at_once_is_the_same():

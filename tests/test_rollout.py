@@ -70,25 +70,25 @@ def both(name):
 @every_case
 def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
     accuracy = ACCURACY.get(name, 1e-11)
-    for found, expected in both(name):
-        assert found["status"] == OK and expected["status"] == "over"
-        assert found["restitution"] == pytest.approx(expected["restitution"], rel=0, abs=accuracy)
-        assert found["approach_velocity"] == pytest.approx(
+    for result, expected in both(name):
+        assert result["status"] == OK and expected["status"] == "over"
+        assert result["restitution"] == pytest.approx(expected["restitution"], rel=0, abs=accuracy)
+        assert result["approach_velocity"] == pytest.approx(
             expected["approach_velocity"], rel=min(accuracy, 1e-7)
         )
-        assert found["peak_command"] == pytest.approx(expected["peak_command"], rel=accuracy)
+        assert result["peak_command"] == pytest.approx(expected["peak_command"], rel=accuracy)
         # It is 0, to the bit, if no limit binds.
         shortfall = expected["position_shortfall"]
-        assert found["position_shortfall"] == pytest.approx(shortfall, rel=1e-8, abs=0)
+        assert result["position_shortfall"] == pytest.approx(shortfall, rel=1e-8, abs=0)
         assert shortfall == 0 or "velocity_limit" in CASES[name].mechanism["rig"]["simulator"]
-        assert found["excess_variation"] == pytest.approx(
+        assert result["excess_variation"] == pytest.approx(
             expected["excess_variation"], rel=accuracy, abs=accuracy * expected["peak_command"]
         )
 
 
 def test_shortfall_is_zero_once_the_drives_have_caught_up():
     rattling, always = (
-        [found["position_shortfall"] for found in cases.loop_contacts(name)]
+        [result["position_shortfall"] for result in cases.loop_contacts(name)]
         for name in ("rattling, faster than the drives at first", "velocity limit")
     )
     assert rattling[0] > 1e-6 and rattling[1:] == [0, 0] and min(always) > 1e-6
@@ -98,18 +98,18 @@ def test_shortfall_is_zero_once_the_drives_have_caught_up():
 def test_rollout_peak_force_agrees_with_oracle(name):
     # Dry friction changes sign at the deepest point, which lies between samples.
     accuracy = 1e-3 if "preload" in name else 1e-4
-    for found, expected in both(name):
-        assert found["peak_force"] == pytest.approx(expected["peak_force"], rel=accuracy)
+    for result, expected in both(name):
+        assert result["peak_force"] == pytest.approx(expected["peak_force"], rel=accuracy)
 
 
 @every_case
 def test_rollout_work_agrees_with_oracle(name):
-    for found, expected in both(name):
+    for result, expected in both(name):
         accuracy = expected["work_in"] * WORK_ACCURACY.get(name, 3e-5)
         if CASES[name].mechanism["rig"]["simulator"]["model"] == "ideal" and name not in WORK_ACCURACY:
             accuracy = 1e-12 * expected["work_in"]
-        assert found["work_in"] == pytest.approx(expected["work_in"], rel=0, abs=accuracy)
-        assert found["work_out"] == pytest.approx(expected["work_out"], rel=0, abs=accuracy)
+        assert result["work_in"] == pytest.approx(expected["work_in"], rel=0, abs=accuracy)
+        assert result["work_out"] == pytest.approx(expected["work_out"], rel=0, abs=accuracy)
 
 
 @pytest.mark.parametrize(
@@ -136,8 +136,8 @@ def test_rollout_with_sensor_lag_agrees_at_every_control_period():
         for ratio in (0.0, 0.3)
         for period in periods
     }
-    found = cases.build_batch(lagged).run().restitution[0]
-    for (_, period), case, restitution in zip(lagged, lagged.values(), found, strict=True):
+    result = cases.build_batch(lagged).run().restitution[0]
+    for (_, period), case, restitution in zip(lagged, lagged.values(), result, strict=True):
         (expected,) = cases.run_oracle(case)
         assert expected["status"] == "over"
         accuracy = 1e-7 if period <= 1e-3 else 3e-5
@@ -163,14 +163,14 @@ def test_rollout_agrees_with_oracle_at_every_tick_of_the_first_contact(recorded,
     expected = cases.run_oracle(CASES[name], contacts=1, record=True)[0]["signals"]
     count = int(np.sum(ticks.active[:, lane] & (ticks.contact[:, lane] == 0)))
     assert count >= 90
-    for found, key, scale in (
+    for result, key, scale in (
         (ticks.signals.position_desired, "x_desired", 1e-4),
         (ticks.signals.velocity_desired, "v_desired", 1e-2),
         (ticks.signals.position_measured, "x_measured", 1e-4),
         (ticks.signals.force_measured, "force_measured", 50.0),
         (ticks.command, "force_command", 50.0),
     ):
-        np.testing.assert_allclose(found[:count, lane], expected[key][:count], rtol=0, atol=1e-11 * scale)
+        np.testing.assert_allclose(result[:count, lane], expected[key][:count], rtol=0, atol=1e-11 * scale)
 
 
 def test_recorded_run_agrees_with_its_metrics(recorded):
@@ -179,22 +179,28 @@ def test_recorded_run_agrees_with_its_metrics(recorded):
     # The recording ends before the later contacts do.
     reached = metrics.status == OK
     assert reached[0].all() and reached[1].any()
-    for name, found in metrics._asdict().items():
+    for name, result in metrics._asdict().items():
         # The remainder of an excess is rounded like the excess.
         rounding = 1e-12 * np.max(metrics.peak_command[reached]) if name == "excess_variation" else 0
         np.testing.assert_allclose(
-            found[reached], getattr(rolled, name)[reached], rtol=1e-12, atol=rounding, err_msg=name
+            result[reached], getattr(rolled, name)[reached], rtol=1e-12, atol=rounding, err_msg=name
         )
     for slot, lane in np.argwhere(reached):
-        own = np.flatnonzero(ticks.active[:, lane] & (ticks.contact[:, lane] == slot))
+        ticks_of_slot = np.flatnonzero(ticks.active[:, lane] & (ticks.contact[:, lane] == slot))
         # `active` ends with the tick at which the contact ends; that tick still belongs to it.
-        own = np.append(own, own[-1] + 1)
-        velocity = ticks.signals.velocity_desired[own, lane]
-        force, works = ticks.plant_signals.force[own, lane], [w[own, lane] for w in ticks.plant_signals.works]
-        assert np.array_equal(own, np.arange(own[0], own[-1] + 1))
-        assert ticks.signals.age[own[0], lane] == 0 and velocity[0] == metrics.approach_velocity[slot, lane]
+        ticks_of_slot = np.append(ticks_of_slot, ticks_of_slot[-1] + 1)
+        velocity = ticks.signals.velocity_desired[ticks_of_slot, lane]
+        force, works = (
+            ticks.plant_signals.force[ticks_of_slot, lane],
+            [w[ticks_of_slot, lane] for w in ticks.plant_signals.works],
+        )
+        assert np.array_equal(ticks_of_slot, np.arange(ticks_of_slot[0], ticks_of_slot[-1] + 1))
+        assert (
+            ticks.signals.age[ticks_of_slot[0], lane] == 0
+            and velocity[0] == metrics.approach_velocity[slot, lane]
+        )
         assert abs(velocity[-1]) / velocity[0] == pytest.approx(metrics.restitution[slot, lane], rel=1e-12)
-        assert np.abs(ticks.command[own, lane]).max() == metrics.peak_command[slot, lane]
+        assert np.abs(ticks.command[ticks_of_slot, lane]).max() == metrics.peak_command[slot, lane]
         # The vertex between samples is barely higher than the highest sample.
         peak = metrics.peak_force[slot, lane]
         assert np.abs(force).max() <= peak <= 1.002 * np.abs(force).max()
@@ -283,8 +289,8 @@ def test_padding_lanes_are_inert(mixed):
     assert np.all(np.asarray(run(batch.loop, batch.gains, idle).status) == NOT_REACHED)
     # The first lane is the same, bit for bit, when all others are padding.
     alone = batch.scenario._replace(contacts=jnp.array([1, 0, 0, 0, 0], jnp.int32))
-    for found, expected in zip(run(batch.loop, batch.gains, alone), metrics, strict=True):
-        np.testing.assert_array_equal(np.asarray(found)[:, 0], expected[:, 0])
+    for result, expected in zip(run(batch.loop, batch.gains, alone), metrics, strict=True):
+        np.testing.assert_array_equal(np.asarray(result)[:, 0], expected[:, 0])
 
 
 def test_rollout_of_another_mechanism_uses_the_same_program(mixed):
@@ -349,8 +355,8 @@ def test_noise_belongs_to_the_lane_not_to_the_batch(noisy_run):
     together = noisy_run
     assert len(set(together.restitution[0])) == 6 and np.all(together.status[0] == OK)
     shifted = jax.tree.map(np.asarray, run_rollout(*noisy_batch(6, first=3)))
-    for found, expected in zip(shifted, together, strict=True):
-        np.testing.assert_array_equal(found[:, :3], expected[:, 3:])
+    for result, expected in zip(shifted, together, strict=True):
+        np.testing.assert_array_equal(result[:, :3], expected[:, 3:])
     again = jax.tree.map(np.asarray, run_rollout(*noisy_batch(6)))
     np.testing.assert_array_equal(again.restitution, together.restitution)
     other = jax.tree.map(np.asarray, run_rollout(*noisy_batch(6, seed=6)))

@@ -49,12 +49,12 @@ def test_controller_reset_forgets_and_next_contact_keeps_identification():
 
     controller.next_contact()
     assert controller.identified == (stiffness, damping)
-    carried = run(controller, ticks)
+    continued = run(controller, ticks)
     # Only the identified parameters persist, as if they had been the initial ones.
-    known = gain_document()
-    known["gains"]["initial_stiffness"]["value"] = stiffness
-    known["gains"]["initial_damping"].update(value=damping, lower=-1e6)
-    assert carried == run(Controller.from_dict(sign(known)), ticks)
+    document = gain_document()
+    document["gains"]["initial_stiffness"]["value"] = stiffness
+    document["gains"]["initial_damping"].update(value=damping, lower=-1e6)
+    assert continued == run(Controller.from_dict(sign(document)), ticks)
 
     controller.reset()
     assert controller.identified == (8e4, 50.0)

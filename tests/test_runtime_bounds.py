@@ -18,13 +18,13 @@ from jaxhil.rig.limits import LIMITS
 
 def beyond(mechanism: Mechanism) -> list[tuple]:
     """Return the bounds and nominal values of gains that are not admitted."""
-    found = []
+    result = []
     for name, law in COMPENSATORS.items():
         for gain in law.gains:
             admits = ON_THE_RIG[name].gains[gain.name].admits
             values = [bound(mechanism) for bound in (gain.lower, gain.nominal, gain.upper)]
-            found += [(name, gain.name, value) for value in values if not admits(value)]
-    return found
+            result += [(name, gain.name, value) for value in values if not admits(value)]
+    return result
 
 
 @pytest.mark.parametrize("mechanism", [*builtin_names(), *suite_names()])

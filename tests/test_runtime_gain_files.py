@@ -25,11 +25,11 @@ def refused(document: Any, *words: str) -> str:
 
 def paths(node: Any, path: tuple = ()) -> list[tuple]:
     """Yield the paths of every entry, at any depth."""
-    found = [path] if path else []
+    result = [path] if path else []
     entries = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, value in entries:
-        found += paths(value, (*path, key))
-    return found
+        result += paths(value, (*path, key))
+    return result
 
 
 def at(document: Any, path: tuple) -> Any:

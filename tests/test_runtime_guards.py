@@ -239,12 +239,12 @@ def test_reset_after_a_trip_makes_no_bump():
     controller = limited()
     fly(controller, 20)
     controller.emergency_stop(True)
-    held = [controller.position_command(-0.01, 0.0, 0.0) for _ in range(100)][-1]
+    command = [controller.position_command(-0.01, 0.0, 0.0) for _ in range(100)][-1]
     assert controller.at_rest and not controller.reset()
     controller.emergency_stop(False)
     assert controller.tripped and controller.cause == EMERGENCY_STOP
     assert controller.reset() and controller.status == "ok"
-    position, before = -0.0195, held
+    position, before = -0.0195, command
     for n in range(2000):
         controller.step(0.0, position, 5e-3, position + 1e-9 * n)
         position += 5e-6

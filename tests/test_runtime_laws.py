@@ -58,10 +58,10 @@ def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndar
     history = np.empty((count, 2))
     for n in range(count):
         phi = np.array([depth[n], aligned_velocity[n]])
-        kept = 1.0 - weight[n] * (1.0 - gain["forgetting"])
-        column = weight[n] * covariance @ phi / (kept + weight[n] * phi @ covariance @ phi)
+        retained = 1.0 - weight[n] * (1.0 - gain["forgetting"])
+        column = weight[n] * covariance @ phi / (retained + weight[n] * phi @ covariance @ phi)
         theta = theta + column * (force[n] - phi @ theta)
-        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / kept, initial)
+        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / retained, initial)
         history[n] = theta
     response = gain["response_error"] * history[:, 0] * (desired - measured)
     response += gain["response_error_damping"] * history[:, 1] * (velocity - measured_velocity)
@@ -232,13 +232,13 @@ def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])
     for weight in rng.choice([0.0, 0.3, 1.0], 40):
         phi, force = rng.normal(size=2), rng.normal()
-        kept = 1.0 - weight * (1.0 - forgetting)
-        column = weight * covariance @ phi / (kept + weight * phi @ covariance @ phi)
+        retained = 1.0 - weight * (1.0 - forgetting)
+        column = weight * covariance @ phi / (retained + weight * phi @ covariance @ phi)
         theta = theta + column * (force - phi @ theta)
-        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / kept, (5.0, 0.5))
+        covariance = bounded((covariance - np.outer(column, phi @ covariance)) / retained, (5.0, 0.5))
         identification.update(force, phi[0], phi[1], weight)
-    found = [identification.stiffness, identification.damping]
-    np.testing.assert_allclose(found, theta, rtol=1e-8, atol=1e-10)
+    result = [identification.stiffness, identification.damping]
+    np.testing.assert_allclose(result, theta, rtol=1e-8, atol=1e-10)
     expected = [covariance[0, 0], covariance[0, 1], covariance[1, 1]]
     scale = np.abs(covariance).max()
     np.testing.assert_allclose(covariance_of(identification), expected, rtol=0, atol=1e-9 * scale)

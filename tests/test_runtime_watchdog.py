@@ -163,11 +163,11 @@ def test_expectation_is_its_polynomial_within_its_ranges():
     limits |= {"reference_stiffness": 9e4, "reference_velocity": 4e-3}
     for feature in ("softness", "speed", "loss"):
         limits |= {f"{feature}_lowest": -0.5, f"{feature}_highest": 0.75}
-    found = Expectation(limits).restitution(1e5, 400.0, 5e-3, 300.0)
+    result = Expectation(limits).restitution(1e5, 400.0, 5e-3, 300.0)
     p, w = math.sqrt(9e4 / 1e5) - 1, 5e-3 / 4e-3 - 1
     z = 400.0 / (2 * math.sqrt(1e5 * 300.0))
     values = [1, p, p**2, p**3, w, w**2, p * w, z, z**2, p * z, w * z]
-    assert found == pytest.approx(sum(0.01 * (n + 1) * value for n, value in enumerate(values)), rel=1e-12)
+    assert result == pytest.approx(sum(0.01 * (n + 1) * value for n, value in enumerate(values)), rel=1e-12)
     # Beyond the ranges, and for an impossible stiffness, the ends of the ranges are used.
     p, w, z = 0.75, 0.75, -0.5
     values = [1, p, p**2, p**3, w, w**2, p * w, z, z**2, p * z, w * z]

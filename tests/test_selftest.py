@@ -28,11 +28,11 @@ def files():
 @pytest.fixture
 def folder(files, tmp_path):
     """A copy of the small bundle, to be damaged."""
-    place = tmp_path / "bundle"
+    index = tmp_path / "bundle"
     for name, content in files.items():
-        (place / name).parent.mkdir(parents=True, exist_ok=True)
-        (place / name).write_bytes(content)
-    return place
+        (index / name).parent.mkdir(parents=True, exist_ok=True)
+        (index / name).write_bytes(content)
+    return index
 
 
 def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
@@ -65,11 +65,11 @@ def test_selftest_uses_nothing_that_a_rig_lacks(folder):
 
 def mutated(source, content):
     """Change or drop one character; return the text and the line of the change."""
-    place = source.randrange(len(content))
-    old = chr(content[place])
+    index = source.randrange(len(content))
+    old = chr(content[index])
     choices = string.digits if old.isdigit() else string.printable
     new = source.choice([one for one in choices if one != old] + ([""] if not old.isdigit() else []))
-    return content[:place] + new.encode() + content[place + 1 :], content.count(b"\n", 0, place) + 1
+    return content[:index] + new.encode() + content[index + 1 :], content.count(b"\n", 0, index) + 1
 
 
 def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
@@ -81,14 +81,16 @@ def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
             content, line = mutated(source, files[name])
             (folder / name).write_bytes(content)
             _, problems = selftest.differences(folder)
-            said = [text for other, text in problems if other == name]
-            assert len(problems) == len(said) > 0, (name, line)
+            messages = [text for other, text in problems if other == name]
+            assert len(problems) == len(messages) > 0, (name, line)
             if name != "manifest.json":
-                assert re.search(rf"line ({line}|{line + 1}): differs", said[0]) or "endings" in said[0], said
+                assert (
+                    re.search(rf"line ({line}|{line + 1}): differs", messages[0]) or "endings" in messages[0]
+                ), messages
             if turn < 2:
                 good, out = run_selftest(folder)
                 assert not good and out.splitlines()[-1].startswith("FAILED"), (name, line)
-                assert f"FAIL  {name}: {said[0]}" in out
+                assert f"FAIL  {name}: {messages[0]}" in out
         (folder / name).write_bytes(files[name])
     assert run_selftest(folder)[0]
 
@@ -143,17 +145,17 @@ def test_selftest_counts_every_digit_of_every_gain(files, folder):
     values["limits.force_limit.value"] = 900.0
     for key, value in values.items():
         shown = json.dumps(value)
-        digits = [place for place, one in enumerate(shown) if one.isdigit()]
+        digits = [index for index, one in enumerate(shown) if one.isdigit()]
         section = text.index(f'"{key.split(".")[1]}"', text.index(f'"{key.split(".")[0]}"'))
         at = text.index(f'"value": {shown}', section) + len('"value": ')
-        for place in digits:
-            digit = int(shown[place])
-            new = shown[:place] + str(digit - 1 if digit == 9 else digit + 1) + shown[place + 1 :]
+        for index in digits:
+            digit = int(shown[index])
+            new = shown[:index] + str(digit - 1 if digit == 9 else digit + 1) + shown[index + 1 :]
             (folder / "gains.json").write_text(text[:at] + new + text[at + len(shown) :])
             good, out = run_selftest(folder)
-            found = json.dumps(json.loads(new))
+            result = json.dumps(json.loads(new))
             assert not good
-            assert f"FAIL  gains.json: {key}: found {found}, expected {shown}" in out, out
+            assert f"FAIL  gains.json: {key}: found {result}, expected {shown}" in out, out
             assert f"line {text.count(chr(10), 0, at) + 1}: differs" in out
 
 
@@ -201,8 +203,8 @@ def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, 
     text = "\n".join([selftest.COLUMNS, *(",".join(row) for row in rows), ""])
     for name, content in signed({**files, "vectors.csv": text.encode()}, document).items():
         (folder / name).write_bytes(content)
-    found, out = run_selftest(folder)
-    assert found is good, out
+    result, out = run_selftest(folder)
+    assert result is good, out
     assert good or f"FAIL  vectors.csv: line {tick + 2}: run 0: force" in out
 
 

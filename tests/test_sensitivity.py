@@ -15,19 +15,19 @@ def quadratic():
 
 def test_gains_may_move_as_far_as_the_loss_allows():
     jacobian, loss = np.array([[50.0, 0.0], [0.0, 20.0]]), 0.5
-    found = sensitivity(jacobian, loss)
+    result = sensitivity(jacobian, loss)
     # d^2 J^2 / 2 = rise * loss, in a box of one.
     allowed = np.sqrt(2 * RISE * loss) / np.array([50.0, 20.0])
-    np.testing.assert_allclose(found.alone, 1 / np.hypot(1 / allowed, 1), rtol=1e-12)
-    np.testing.assert_allclose(found.together, found.alone, rtol=1e-12)
+    np.testing.assert_allclose(result.alone, 1 / np.hypot(1 / allowed, 1), rtol=1e-12)
+    np.testing.assert_allclose(result.together, result.alone, rtol=1e-12)
 
 
 def test_gains_that_compensate_each_other_are_free_together():
-    found = sensitivity(quadratic(), 0.5)
-    assert found.alone[0] == pytest.approx(found.alone[1], rel=1e-4)
-    assert found.alone[0] < 1e-3
-    assert found.together[0] > 30 * found.alone[0]
-    assert found.together[2] == found.alone[2] == 1
+    result = sensitivity(quadratic(), 0.5)
+    assert result.alone[0] == pytest.approx(result.alone[1], rel=1e-4)
+    assert result.alone[0] < 1e-3
+    assert result.together[0] > 30 * result.alone[0]
+    assert result.together[2] == result.alone[2] == 1
 
 
 def test_loss_rises_as_stated_at_the_tolerance_of_gains():
@@ -36,12 +36,12 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
     # At the optimum of a linear least-squares problem, the residuals are orthogonal to J.
     residuals -= jacobian @ np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
     loss = np.sum(residuals**2) / 2
-    found = sensitivity(jacobian, loss)
+    result = sensitivity(jacobian, loss)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     for gain in range(4):
-        alone = found.alone[gain] * np.eye(4)[gain]
+        alone = result.alone[gain] * np.eye(4)[gain]
         # With the other gains at their best: along the gain's column of the covariance.
-        together = found.together[gain] * covariance[gain] / covariance[gain, gain]
+        together = result.together[gain] * covariance[gain] / covariance[gain, gain]
         for step in (alone, together):
             assert np.max(np.abs(step)) < STIFF_ENOUGH
             moved = np.sum((residuals + jacobian @ step) ** 2) / 2
@@ -49,5 +49,5 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
 
 
 def test_fewer_residuals_than_gains_leave_the_rest_free():
-    found = sensitivity(np.array([[3.0, 0.0, 4.0]]), 0.5)
-    assert found.together[1] == pytest.approx(1)
+    result = sensitivity(np.array([[3.0, 0.0, 4.0]]), 0.5)
+    assert result.together[1] == pytest.approx(1)

@@ -28,9 +28,9 @@ def test_random_generator_agrees_with_published_vectors(key, counter, result):
 
 def test_random_bits_are_those_of_jax():
     words = np.random.default_rng(0).integers(0, 1 << 32, (4, 8), dtype=np.uint32)
-    found = np.stack(ours(*map(jnp.asarray, words)))
+    result = np.stack(ours(*map(jnp.asarray, words)))
     theirs = np.stack([threefry_2x32(*(jnp.asarray(w) for w in np.split(lane, 2))) for lane in words.T])
-    np.testing.assert_array_equal(found, theirs.T)
+    np.testing.assert_array_equal(result, theirs.T)
 
 
 @pytest.mark.parametrize("dtype, largest", [("float32", 5.3), ("float64", 6.4)])

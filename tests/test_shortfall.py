@@ -81,12 +81,12 @@ def shortfalls_found(request, batch):
     scenario = batch.scenario if request.param == "float64" else single(batch.scenario)
     metrics = batch._replace(scenario=scenario).run()
     assert metrics.position_shortfall.dtype == request.param
-    found = {}
+    result = {}
     for lane, name in enumerate(batch.names):
         contacts = scenario.contacts[lane]
         assert np.all(metrics.status[:contacts, lane] == OK)
-        found[name] = metrics.position_shortfall[:contacts, lane]
-    return found
+        result[name] = metrics.position_shortfall[:contacts, lane]
+    return result
 
 
 def test_limit_that_does_not_bind_gives_no_shortfall_to_the_bit(shortfalls_found):
@@ -117,8 +117,8 @@ def test_shortfall_broadcasts_over_trailing_axes(batch):
         return wide.reshape(*leaf.shape[:-1], 2, 4)
 
     scenario = jax.tree.map(fold, batch.scenario)
-    found = np.asarray(run_rollout(batch.loop, {}, scenario).position_shortfall)[:2].reshape(2, 8)
-    np.testing.assert_allclose(found[:, :6], batch.run().position_shortfall[:2], rtol=1e-12)
+    result = np.asarray(run_rollout(batch.loop, {}, scenario).position_shortfall)[:2].reshape(2, 8)
+    np.testing.assert_allclose(result[:, :6], batch.run().position_shortfall[:2], rtol=1e-12)
 
 
 def test_shortfall_of_a_leading_law_is_that_of_its_command():
@@ -141,5 +141,5 @@ def test_loop_without_limits_keeps_no_shortfall_state(batch):
     for one in (batch, free):
         rig = jax.eval_shape(functools.partial(build_rig_constants, one.loop), one.scenario)
         run = jax.eval_shape(functools.partial(start, one.loop), rig, one.gains)
-        kept = run.watch.shortfall, run.state.plant.wanted
-        assert [leaf is not None for leaf in kept] == [one.loop.has_limits] * 2
+        state = run.watch.shortfall, run.state.plant.wanted
+        assert [leaf is not None for leaf in state] == [one.loop.has_limits] * 2

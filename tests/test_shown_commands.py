@@ -63,8 +63,8 @@ def test_shown_commands_print_what_is_shown(tmp_path):
                 )  # fmt: skip
                 assert ran.returncode == ("Bad:" in lines), ran.stderr
                 printed[command] = [line.rstrip() for line in ran.stdout.splitlines()]
-            found = {words(line) for line in printed[command]}
-            missing = [line for line in lines.splitlines() if words(line) not in found]
+            result = {words(line) for line in printed[command]}
+            missing = [line for line in lines.splitlines() if words(line) not in result]
             assert not missing, f"{page.name}: {command}: {missing}\n" + "\n".join(printed[command])
             for line in set(lines.splitlines()) - set(printed[command]):
                 print(f"\n{page.name}: {line}", end="")
@@ -85,9 +85,9 @@ def test_logs_commands_print_what_is_shown(tmp_path):
                 env=environment, capture_output=True, text=True, check=False,
             )  # fmt: skip
             assert ran.returncode == 0, ran.stderr
-            found = ran.stdout.splitlines()
-            assert {words(line) for line in lines.splitlines()} <= {words(line) for line in found}
-            print("\n" + "\n".join(line.rstrip() for line in found), end="")
+            result = ran.stdout.splitlines()
+            assert {words(line) for line in lines.splitlines()} <= {words(line) for line in result}
+            print("\n" + "\n".join(line.rstrip() for line in result), end="")
         if "--guess" in command:
             # Values that only the rig's owner knows.
             draft = (tmp_path / "logs.toml").read_text().replace("# [bodies]", "[bodies]")

@@ -171,13 +171,13 @@ def test_thousand_flipped_bits_load_no_other_content(tmp_path):
     expected = load(path)
     rng = random.Random(int(hashlib.sha256(whole).hexdigest(), 16))
     loaded = 0
-    for place in rng.sample(range(8 * len(whole)), 1000):
+    for bit in rng.sample(range(8 * len(whole)), 1000):
         flipped = bytearray(whole)
-        flipped[place // 8] ^= 1 << place % 8
+        flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)
-        found = load(path)
-        if found is not None:
+        result = load(path)
+        if result is not None:
             loaded += 1
-            assert found == expected and digest(read_gain_document(path)) == document["sha256"]
+            assert result == expected and digest(read_gain_document(path)) == document["sha256"]
     # The digest does not cover date and timings, nor blanks.
     assert loaded < 200

@@ -79,9 +79,9 @@ def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
     by_key = verifier(key[1])
     assert check_bundle(folder, by_key).signature == "by the key given"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
-    found = tuning.verify(folder, key=tmp_path / "other.pem")
+    result = tuning.verify(folder, key=tmp_path / "other.pem")
     expected = "manifest.sig: found another, allowed the manifest's by the key given"
-    assert not found.good and found.reasons == [expected] and found.document["self_test"] == []
+    assert not result.good and result.reasons == [expected] and result.document["self_test"] == []
     # Reseal after a change, as anybody without the key could: all but the signature fits.
     files = small_files()
     shorter = files["vectors.csv"].rpartition(b"\n1,")[0] + b"\n"
@@ -130,7 +130,7 @@ def test_openssl_makes_the_keys_and_verifies_the_signature(tmp_path):
 def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
     pair = Ed25519PrivateKey.generate()
     other = generate_private_key(65537, 2048)
-    kept = tmp_path / "kept.pem"
+    copy = tmp_path / "kept.pem"
     for text, private, public in [
         (as_private(pair, BestAvailableEncryption(b"secret")), "an encrypted key", "no such key"),
         (as_private(other), "another kind of key", "no such key"),
@@ -141,15 +141,15 @@ def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
         (b"-----BEGIN PRIVATE KEY-----\nMC4CAQ==\n-----END PRIVATE KEY-----\n", "no such key", "no such key"),
         (b"x" * 100_000, "a larger file", "a larger file"),
     ]:
-        kept.write_bytes(text)
-        for read, found, allowed in [(signer, private, "private"), (verifier, public, "public")]:
-            if found is None:
-                read(kept)
+        copy.write_bytes(text)
+        for read, result, allowed in [(signer, private, "private"), (verifier, public, "public")]:
+            if result is None:
+                read(copy)
                 continue
             with pytest.raises(InputError) as caught:
-                read(kept)
+                read(copy)
             line = str(caught.value)
-            assert f"kept.pem: found {found}, allowed an Ed25519 {allowed} key" in line and "\n" not in line
+            assert f"kept.pem: found {result}, allowed an Ed25519 {allowed} key" in line and "\n" not in line
     ran = jaxhil("verify", folder, "--key", tmp_path / "none.pem")
     assert (ran.code, ran.out) == (2, "") and "none.pem: cannot be read: No such file" in ran.err
     gains = tmp_path / "gains.json"

@@ -28,7 +28,7 @@ def test_runs_of_a_large_law_are_compiled_apart(monkeypatch):
     parsed = validated(next(iter(CASES.values())).mechanism)
     scenarios = jax.tree.map(jnp.asarray, spread(parsed, 4))
     plain = build_loop(parsed, "none", scenarios)
-    found, loops_left = [], []
+    result, loops_left = [], []
     for name in ("none", "large"):
         loop = ONE_AXIS.with_compensator(plain, name)
 
@@ -37,10 +37,10 @@ def test_runs_of_a_large_law_are_compiled_apart(monkeypatch):
             return jax.lax.map(lambda one: ONE_AXIS.outcome(loop, {}, ONE_AXIS.prepared(loop, one)), tiled)
 
         program = jax.jit(tiles).lower(scenarios).compile()
-        found.append(program(scenarios))
+        result.append(program(scenarios))
         text = program.as_text() or ""
         loops_left.append(len(re.findall(r" while\(", text[text.index("\nENTRY") :])))
     # The compiler makes a loop of small laws a function, with all that is in it.
     assert loops_left == [0, 1]
-    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, result), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -27,8 +27,8 @@ def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[
     for lane, one in enumerate(drawn):
         expected = oracle_figures(one) if np.asarray(metrics.status)[0, lane] == OK else None
         if expected is not None:
-            found = {name: float(np.asarray(getattr(metrics, name))[0, lane]) for name in FIGURES}
-            compared.append((one, differences(found, expected)))
+            result = {name: float(np.asarray(getattr(metrics, name))[0, lane]) for name in FIGURES}
+            compared.append((one, differences(result, expected)))
     return compared
 
 

@@ -121,8 +121,8 @@ def test_site_messages_are_those_that_users_see(jaxhil, reference):
         ["simulate", "--plot=x.doc"],
         ["tune", "--set", "rig.noise=1"],
     ):
-        said = jaxhil(*arguments).err.strip().removeprefix("jaxhil: ")
-        assert any(pattern.match(said) for pattern in patterns), said
+        message = jaxhil(*arguments).err.strip().removeprefix("jaxhil: ")
+        assert any(pattern.match(message) for pattern in patterns), message
 
 
 def test_site_navigation_has_every_page_and_notebook():
@@ -210,8 +210,8 @@ def test_browser_finds_faults_of_a_page(browser, tmp_path):
     pages, cut = browser.printed(400, 1017)
     assert pages > 1 and [fault.split('" ')[1][:10] for fault in cut] == ["ends at 50", "is 2000 px"]
     browser.open(path, 375)
-    found = browser.evaluate(LAYOUT)["faults"]
-    assert [" ".join(fault.split()[:2]) for fault in found] == ["500 px", "no picture", '"lies on']
+    result = browser.evaluate(LAYOUT)["faults"]
+    assert [" ".join(fault.split()[:2]) for fault in result] == ["500 px", "no picture", '"lies on']
 
 
 @pytest.mark.slow
@@ -242,16 +242,16 @@ def test_site_pages_are_accessible(site, browser):
     for path in sorted({*site.rglob("*.html"), notebooks[0]} - {*notebooks[1:]}):
         browser.open(path, min(WIDTHS))
         browser.evaluate(f"{axe}; 0")
-        found = browser.evaluate("axe.run({ resultTypes: ['violations'] }).then(told => told.violations.map("
+        result = browser.evaluate("axe.run({ resultTypes: ['violations'] }).then(told => told.violations.map("
                                  "one => [one.impact, one.id, one.nodes[0].target.join(' ')]))")  # fmt: skip
-        grave = [one for one in found if one[0] in ("serious", "critical")]
+        grave = [one for one in result if one[0] in ("serious", "critical")]
         assert not grave, f"{path.relative_to(site)}: {grave}"
 
 
 @pytest.mark.slow
 def test_site_search_finds_a_key_offline(site, browser):
     browser.open(site / "index.html", 1440)
-    found = """new Promise(done => {
+    result = """new Promise(done => {
       const field = document.querySelector("[data-md-component=search-query]");
       field.focus();
       field.value = "unloading_ratio";
@@ -263,4 +263,4 @@ def test_site_search_finds_a_key_offline(site, browser):
       };
       look(100);
     })"""
-    assert any(link.endswith("reference/mechanism_file.html") for link in browser.evaluate(found))
+    assert any(link.endswith("reference/mechanism_file.html") for link in browser.evaluate(result))

@@ -117,10 +117,10 @@ def test_six_axis_errors_have_derivatives():
     loop = build_loop(scenario(ones, start), **static)
 
     def errors(scales, start):
-        found = jax.tree.map(lambda figure: figure[0], evaluate(loop, {}, scenario(scales, start)).metrics)
-        touched = jnp.round(found.duration / PERIOD).astype(found.touches.dtype)
-        counts = jnp.stack([found.touches, touched, found.reference_touches, found.status])
-        return jnp.stack([found.energy_error, found.twist_error]), counts
+        result = jax.tree.map(lambda figure: figure[0], evaluate(loop, {}, scenario(scales, start)).metrics)
+        touched = jnp.round(result.duration / PERIOD).astype(result.touches.dtype)
+        counts = jnp.stack([result.touches, touched, result.reference_touches, result.status])
+        return jnp.stack([result.energy_error, result.twist_error]), counts
 
     forward = jax.jit(errors, compiler_options=QUICK)
     values, counts = map(np.asarray, forward(ones, start))

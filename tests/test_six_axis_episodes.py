@@ -72,10 +72,10 @@ def judged():
 
 def test_central_episode_is_that_of_one_axis(judged):
     expected = package.simulate("claw-350kg", "none").contacts[0]
-    found = judged.metrics
+    result = judged.metrics
 
     def of(name):
-        return getattr(found, name)[..., 0, CENTRAL]
+        return getattr(result, name)[..., 0, CENTRAL]
 
     e, reference = expected.restitution, expected.reference_restitution
     np.testing.assert_allclose(of("restitution"), e, rtol=1e-9)
@@ -92,10 +92,10 @@ def test_central_episode_is_that_of_one_axis(judged):
 
 
 def test_oblique_episode_has_all_three_error_parts(judged):
-    found = judged.metrics
+    result = judged.metrics
 
     def of(name):
-        return getattr(found, name)[..., 0, ASIDE]
+        return getattr(result, name)[..., 0, ASIDE]
 
     parts = [of(f"{name}_part") for name in ("normal", "lateral", "rotational")]
     np.testing.assert_allclose(np.linalg.norm(parts), of("twist_error"), rtol=1e-9)
@@ -137,7 +137,7 @@ def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(judged):
 
 
 def test_episode_without_contact_is_a_miss(judged):
-    found = judged.metrics
-    assert STATUS_NAMES[found.status[0, AWAY]] == "miss"
-    assert np.isnan(found.energy_error[0, AWAY]) and found.touches[0, AWAY] == 0
+    result = judged.metrics
+    assert STATUS_NAMES[result.status[0, AWAY]] == "miss"
+    assert np.isnan(result.energy_error[0, AWAY]) and result.touches[0, AWAY] == 0
     np.testing.assert_allclose(judged.final_time[AWAY], 0.6)

@@ -81,8 +81,8 @@ def test_contact_is_invariant_to_frames_and_names_of_the_bodies():
     assert float(lost[0]) > 0.01
     swapped = Pair(pair.chaser, pair.target)
     contact = ContactGroup(TargetSpheres(points, 0.02 * ONE, drogue), LAWS["hunt_crossley"], LAW, RUBBING)
-    found, other = after(swapped, States(before.chaser, before.target), contact)
-    close(found[::-1], expected, before)
+    result, other = after(swapped, States(before.chaser, before.target), contact)
+    close(result[::-1], expected, before)
     np.testing.assert_allclose(other, lost, rtol=1e-8)
     close(*elsewhere(pair, before), before)
 

@@ -35,9 +35,9 @@ ENDS = [
 @pytest.mark.parametrize("tethers", [0, 1, 3])
 def test_twists_agree_with_mujoco(tethers):
     duration = DURATION if tethers else 5.0
-    found, expected = ours(tethers, duration), mujocos(tethers, duration)
+    result, expected = ours(tethers, duration), mujocos(tethers, duration)
     assert (expected[5] < 0.03) == (tethers > 0)  # the chaser's velocity along z, 0.05 m/s without tethers
-    np.testing.assert_allclose(found, expected, atol=1e-7 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(result, expected, atol=1e-7 * np.max(np.abs(expected)))
 
 
 def ours(tethers, duration):
@@ -66,8 +66,8 @@ def ours(tethers, duration):
 
     end = flown()
     turning = [angular_velocity(*one) for one in zip(bodies, end, strict=True)]
-    found = [*(state.velocity for state in end), *turning]
-    return np.concatenate([np.asarray(components(one))[:, 0] for one in found])
+    result = [*(state.velocity for state in end), *turning]
+    return np.concatenate([np.asarray(components(one))[:, 0] for one in result])
 
 
 def mujocos(tethers, duration):

@@ -119,12 +119,12 @@ def close(states, expected, tolerance):
 @pytest.mark.parametrize("name", CASES)
 def test_six_axis_rig_agrees_with_independent_implementation(name):
     case = started(CASES[name])
-    given = as_scenario(case)
+    case_scenario = as_scenario(case)
     loop = build_loop(
-        given, integrator="semi_implicit_euler", hold="linear", latency=0,
+        case_scenario, integrator="semi_implicit_euler", hold="linear", latency=0,
         side="fixed" if case["tool"] is None else "moving",
     )  # fmt: skip
-    end, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, given, TICKS)
+    end, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, case_scenario, TICKS)
     assert np.max(np.abs(components(seen.contact.force))) > 20
     expected = on_the_rig(case, TICKS)
     close(end.states, expected, 1e-10)
@@ -137,11 +137,11 @@ def test_six_axis_rig_agrees_with_independent_implementation(name):
 @pytest.mark.parametrize("name", ["probe", "ring"])
 def test_six_axis_ideal_contact_agrees_with_independent_implementation(name):
     case = started(CASES[name])
-    given = as_scenario(case)
+    case_scenario = as_scenario(case)
     time = lanes(TICKS * PERIOD, BATCH)
-    found = jax.jit(reference_final)(given, time)
+    result = jax.jit(reference_final)(case_scenario, time)
     before = case["start"][1][1]
     expected = in_space(case, TICKS * PERIOD)
     assert np.linalg.norm(expected[1][1] - before) > 0.01
-    close(found, expected, 1e-9)
+    close(result, expected, 1e-9)
     assert np.all(np.isfinite(command(case, expected)[0])) and relative(case, expected)[0][2] > 0

@@ -118,12 +118,12 @@ def test_central_contact_is_that_of_one_axis(name):
     one, raw = central(name)
     quiet = {"approach.contacts": 1, "rig.force_sensor.noise_std": 0.0, "rig.contact_plane": 0.0}
     expected = package.simulate(package.load(name, quiet), "none").contacts[0]
-    [found] = simulate_six_axes(any_from_builtins(raw, name)).episodes
-    np.testing.assert_allclose(found.restitution, expected.restitution, rtol=1e-9)
-    np.testing.assert_allclose(found.reference_restitution, expected.reference_restitution, rtol=1e-6)
-    np.testing.assert_allclose(found.effective_mass, one.bodies.mass, rtol=1e-12)
+    [result] = simulate_six_axes(any_from_builtins(raw, name)).episodes
+    np.testing.assert_allclose(result.restitution, expected.restitution, rtol=1e-9)
+    np.testing.assert_allclose(result.reference_restitution, expected.reference_restitution, rtol=1e-6)
+    np.testing.assert_allclose(result.effective_mass, one.bodies.mass, rtol=1e-12)
     error = expected.restitution**2 - expected.reference_restitution**2
-    np.testing.assert_allclose(found.energy_error, error, rtol=1e-5)
+    np.testing.assert_allclose(result.energy_error, error, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -241,8 +241,8 @@ def test_simulate_runs_a_flight_without_contact(jaxhil, tmp_path):
     """Start from states of both bodies; the chaser turns about a principal axis."""
     state = "{{position=[0,0,{}], attitude=[1,0,0,0], velocity=[0,0,0], angular_velocity=[0,{},0]}}"
     start = f"start={{duration=0.2, target={state.format(0, 0)}, chaser={state.format(3, 0.5)}}}"
-    given = [start, "contact={}", "latch={}", "uncertainty={}"]
-    changes = ["--unset", "approach", *(part for one in given for part in ("--set", one))]
+    overrides = [start, "contact={}", "latch={}", "uncertainty={}"]
+    changes = ["--unset", "approach", *(part for one in overrides for part in ("--set", one))]
     files = {option: tmp_path / f"run.{ending}" for option, ending in
              (("--plot", "png"), ("--log", "csv"), ("--animate", "gif"))}  # fmt: skip
     written = [part for pair in files.items() for part in pair]
@@ -255,9 +255,9 @@ def test_simulate_runs_a_flight_without_contact(jaxhil, tmp_path):
         "episodes": [],
     }
     assert document["status"] == "miss" and document["final"]["time"] == 0.2
-    place = np.array([-0.05, 0.02, 1.8]) + turned.apply([0.01, 0.04, -1.0])
+    position = np.array([-0.05, 0.02, 1.8]) + turned.apply([0.01, 0.04, -1.0])
     for final in ("final", "reference_final"):
-        np.testing.assert_allclose(document[final]["pose"], [*place, 0, 0.1, 0], atol=1e-9)
+        np.testing.assert_allclose(document[final]["pose"], [*position, 0, 0.1, 0], atol=1e-9)
     ticks = np.genfromtxt(files["--log"], delimiter=",", names=True)
     assert len(ticks) == 200 and not any(name.startswith("depth") for name in ticks.dtype.names)
     np.testing.assert_allclose(ticks["desired_ry"], 0.5 * ticks["time"], atol=1e-12)
@@ -300,8 +300,8 @@ def test_bodies_at_rest_do_not_diverge():
     """Move them by noise alone, by more than the energy of the start, which is zero."""
     rest = {"attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     bodies = {"target": {"position": [0, 0, 0], **rest}, "chaser": {"position": [0, 0, 3], **rest}}
-    given = {"approach": None, "start": {"duration": 0.2, **bodies}, "uncertainty": {}}
-    run = package.simulate(package.load("probe-drogue", given))
+    overrides = {"approach": None, "start": {"duration": 0.2, **bodies}, "uncertainty": {}}
+    run = package.simulate(package.load("probe-drogue", overrides))
     assert run.status == "miss" and run.final.time == pytest.approx(0.2)
 
 

@@ -107,10 +107,10 @@ def test_wrong_tool_parameters_leave_part_of_gravity():
     still = Twist(triple([0.0] * 3), triple([0.0] * 3))
     level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
     down = triple([0.0, 0.0, -9.80665])
-    carried = tool()._replace(mass=jnp.asarray(12.0))
-    load = tool_load(carried, level, still, still, down)
+    tool_carried = tool()._replace(mass=jnp.asarray(12.0))
+    load = tool_load(tool_carried, level, still, still, down)
     reading = read_moving(wrench(), load, level)
-    lighter = tool_load(carried._replace(mass=0.98 * carried.mass), level, still, still, down)
+    lighter = tool_load(tool_carried._replace(mass=0.98 * tool_carried.mass), level, still, still, down)
     left = undo_moving(reading, lighter, level).force - wrench().force
     np.testing.assert_allclose(components(left), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
     # The contact's own force rotates with the measured attitude, too.
@@ -126,7 +126,7 @@ def test_sensor_sample_is_mixed_then_biased_then_rounded():
     zero = np.zeros(6)
     quantum, dead_zone, limit = zero.copy(), zero.copy(), np.full(6, np.inf)
     quantum[1], dead_zone[5], limit[2] = 4.0, 0.5, 100.0
-    given = SampleErrors(*(jnp.asarray(part) for part in (mixing, zero + 0.25, quantum, dead_zone, limit)))
-    found = sample(wrench(), given, jnp.asarray(zero + 0.125))
+    errors = SampleErrors(*(jnp.asarray(part) for part in (mixing, zero + 0.25, quantum, dead_zone, limit)))
+    result = sample(wrench(), errors, jnp.asarray(zero + 0.125))
     expected = [40 + 1.2 + 0.375, -16.0, 100.0, 3.375, 8 + 0.3 + 0.375, -2 + 0.375 + 0.5]
-    close(found, expected, rtol=1e-12)
+    close(result, expected, rtol=1e-12)

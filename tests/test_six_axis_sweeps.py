@@ -27,8 +27,8 @@ ASKED = {"scenarios": 32, "chunk": 4, "limit": 1.2}
 def gains(tmp_path_factory):
     """The literature's gains."""
     mechanism, path = load_any(NAME).mechanism, tmp_path_factory.mktemp("gains") / "gains.json"
-    found = literature_gains(mechanism, LAW)
-    write_gain_file(path, build_document(LAW, found, mechanism, "0" * 64, {}, {}, 0, {}))
+    result = literature_gains(mechanism, LAW)
+    write_gain_file(path, build_document(LAW, result, mechanism, "0" * 64, {}, {}, 0, {}))
     return path
 
 
@@ -80,6 +80,6 @@ def test_six_axis_cluster_gives_the_same_gains_though_a_worker_is_killed(tmp_pat
         killed_meanwhile(monkeypatch, tune_all, cluster, first)
         there = tuning.tune(mechanisms, LAW, scheduler=cluster.address, **few)
         assert first.poll() is not None
-    for own, other in zip(here, there, strict=True):
-        assert other.gains == own.gains and other.figures == own.figures and other.parts == own.parts
-        assert other.found.starts[0].history == own.found.starts[0].history
+    for local, other in zip(here, there, strict=True):
+        assert other.gains == local.gains and other.figures == local.figures and other.parts == local.parts
+        assert other.found.starts[0].history == local.found.starts[0].history

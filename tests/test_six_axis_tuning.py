@@ -83,22 +83,22 @@ def test_lead_for_each_axis_is_tuned_like_any_law():
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory):
-    found = tuning.tune("probe-drogue", "phase_lead", **SMALL)
+    result = tuning.tune("probe-drogue", "phase_lead", **SMALL)
     path = tmp_path_factory.mktemp("six") / "gains.json"
-    found.save(path)
-    return found, path
+    result.save(path)
+    return result, path
 
 
 @pytest.mark.slow
 def test_six_axis_tuning_lowers_both_errors(tuned):
-    found, path = tuned
+    result, path = tuned
     for error in ("energy_error", "twist_error"):
-        figures = found.parts[error]
+        figures = result.parts[error]
         assert figures["tuned"].rms < figures["literature"].rms / 4 < figures["before"].rms / 4
         assert figures["tuned"].failed == 0
-    assert 0.02 < found.gains["phase_lead"] < 0.03
+    assert 0.02 < result.gains["phase_lead"] < 0.03
     loaded = load_gain_file(path, any_axes=True)
-    assert loaded.document["axes"] == 6 and loaded.gains == found.gains
+    assert loaded.document["axes"] == 6 and loaded.gains == result.gains
     assert loaded.mechanism == load_any("probe-drogue").mechanism
     [episode] = package.simulate("probe-drogue", "none", path).episodes
     [literature] = package.simulate("probe-drogue", "phase_lead").episodes
@@ -173,9 +173,9 @@ def test_six_axis_derivatives_pass_through_the_loop():
 
         at = np.array([0.015, 0.001])
         slopes = jax.jit(jax.jacfwd(found))(at)
-        for place, step in enumerate((1e-6, 1e-7)):
-            either = [found(at + sign * step * np.eye(2)[place]) for sign in (1, -1)]
+        for index, step in enumerate((1e-6, 1e-7)):
+            either = [found(at + sign * step * np.eye(2)[index]) for sign in (1, -1)]
             expected = (either[0] - either[1]) / (2 * step)
             np.testing.assert_allclose(
-                slopes[:, place], expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()
+                slopes[:, index], expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()
             )

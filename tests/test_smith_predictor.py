@@ -43,10 +43,10 @@ def test_smith_predictor_restitution_is_that_of_the_guide():
 def test_smith_predictor_loop_grows_as_its_root(name):
     lag, delay = LAGS.T
     gains = {"phase_lead": delay, "simulator_lag": lag}
-    found = without_period(name, 2.5, gains, simulator__delay=lag, force_sensor__delay=delay)
+    result = without_period(name, 2.5, gains, simulator__delay=lag, force_sensor__delay=delay)
     expected = [expected_decay(SMITH[name], *one) for one in LAGS]
     # Errors of second order in T and of a discrete predictor remain: 1e-4 at these periods.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-4)
     assert np.ptp(expected) > 0.005
 
 
@@ -58,11 +58,11 @@ def test_smith_predictor_restitution_of_a_single_contact_is_near_its_root(name):
     leaves = {"simulator__delay": lag, "force_sensor__delay": delay, "control_period": period}
     scenario = spread(parsed, len(phase), phase=phase, **leaves)
     gains = {"phase_lead": delay, "simulator_lag": lag, "lead_filter": period / 2}
-    found = first_contact(parsed, scenario, name, gains)["restitution"].reshape(2, -1).mean(axis=1)
-    print(name, 2 * found[1] - found[0], np.exp(expected_decay(SMITH[name], lag, delay)))
+    result = first_contact(parsed, scenario, name, gains)["restitution"].reshape(2, -1).mean(axis=1)
+    print(name, 2 * result[1] - result[0], np.exp(expected_decay(SMITH[name], lag, delay)))
     # Onset and end of the contact are no oscillation.
     expected = np.exp(expected_decay(SMITH[name], lag, delay))
-    assert 2 * found[1] - found[0] == pytest.approx(expected, abs=0.2 * (OMEGA * (lag + delay)) ** 3)
+    assert 2 * result[1] - result[0] == pytest.approx(expected, abs=0.2 * (OMEGA * (lag + delay)) ** 3)
 
 
 @pytest.mark.parametrize("name", SMITH)

@@ -94,8 +94,8 @@ def test_flags_are_tried_by_another_process():
 
 def test_flags_of_a_file_are_those_in_it(tmp_path):
     (tmp_path / "flags").write_text("--xla_cpu_ftz=true\n--xla_backend_optimization_level=3\n")
-    given = "--xla_cpu_ftz=true --xla_backend_optimization_level=3"
-    assert environment.flags(str(tmp_path / "flags")) == environment.flags(given)
+    flags = "--xla_cpu_ftz=true --xla_backend_optimization_level=3"
+    assert environment.flags(str(tmp_path / "flags")) == environment.flags(flags)
 
 
 def test_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):

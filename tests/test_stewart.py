@@ -45,8 +45,8 @@ def test_hexapod_pose_survives_inverse_and_forward_kinematics():
 
     now = jnp.asarray(0.0)
     legs = Motion(along(now), slope(along)(now), slope(slope(along))(now))
-    found = jax.jit(lambda *given: rig.coordinates(*given))(legs, at + 2e-3)
-    for part, expected in zip(found, (at, rate, bend), strict=True):
+    result = jax.jit(lambda *given: rig.coordinates(*given))(legs, at + 2e-3)
+    for part, expected in zip(result, (at, rate, bend), strict=True):
         np.testing.assert_allclose(part, expected, atol=1e-10)
     assert np.all(np.asarray(condition(rig, at)) < 100)
 
@@ -61,10 +61,10 @@ def test_hexapod_pose_derivatives_agree_with_differences():
         return changed.coordinates(Motion(legs, 0 * legs, None), at).position
 
     one = jnp.asarray(1.0)
-    _, found = jax.jvp(pose, (one,), (one,))
+    _, result = jax.jvp(pose, (one,), (one,))
     expected = (pose(one + 1e-6) - pose(one - 1e-6)) / 2e-6
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
-    assert np.max(np.abs(found)) > 0.1
+    np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-8)
+    assert np.max(np.abs(result)) > 0.1
 
 
 def moved(kinematics, axes, amplitude):
@@ -104,6 +104,6 @@ def test_two_equal_robots_are_one():
     np.testing.assert_allclose(two(TwoRobots(share), 12.0, 0.01), expected, atol=1e-14)
     # A slow robot of the target shows whether it has a share.
     slow = jnp.concatenate([lanes([12.0] * 6, BATCH), lanes([3.0] * 6, BATCH)])
-    found = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
-    apart = np.max(np.abs(found - expected), axis=(0, 2))
+    result = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
+    apart = np.max(np.abs(result - expected), axis=(0, 2))
     assert apart[2] < 1e-14 and np.all(apart[[0, 1, 3, 4, 5]] > 1e-5)

@@ -180,9 +180,9 @@ def test_bundle_reports_that_its_limits_stop_the_run_it_was_made_from(loaded):
 
 def test_export_names_the_limit_and_the_value_to_set(loaded, tmp_path):
     path = tmp_path / "gains.json"
-    found = export(_saved(path, loaded), tmp_path / "bundle", limits={"force_limit": 5.0})
-    assert found.verdict == "bad" and found.document["stop"]["limit"] == "force_limit"
-    (reason,) = [one for one in found.reasons if one.startswith("the nominal run is stopped at ")]
+    result = export(_saved(path, loaded), tmp_path / "bundle", limits={"force_limit": 5.0})
+    assert result.verdict == "bad" and result.document["stop"]["limit"] == "force_limit"
+    (reason,) = [one for one in result.reasons if one.startswith("the nominal run is stopped at ")]
     assert "force_limit 5 N" in reason and "--set force_limit=" in reason
 
 

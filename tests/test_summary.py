@@ -35,7 +35,7 @@ RATES = {
 
 def full_document():
     made = copy.deepcopy(document("varying", "response_error"))
-    one = {name: {**FIGURES, "rms": 0.5 / 10**place} for place, name in enumerate(COLOURS)}
+    one = {name: {**FIGURES, "rms": 0.5 / 10**index} for index, name in enumerate(COLOURS)}
     made["figures"] = {"nominal": one, "robust": one, "tuned_intervals": {}}
     made["envelope"] = {
         "contact_frequency": {"low": 1.625, "high": 6.5, "unit": "Hz"},
@@ -44,7 +44,7 @@ def full_document():
         "force": {"low": 15.0, "high": 83.0, "unit": "N"},
     }
     # Values that stand for themselves, and some missing limits.
-    limits = {name: None if place % 7 == 3 else 1.5 + place for place, name in enumerate(LIMITS)}
+    limits = {name: None if index % 7 == 3 else 1.5 + index for index, name in enumerate(LIMITS)}
     return with_limits(made, limits, RATES)
 
 

@@ -66,7 +66,7 @@ def test_failed_runs_are_rows():
     uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
     sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
     rows = run_chunk(sweep, 0, 32)
-    names = {OUTCOMES[place] for place in rows["outcome"]}
+    names = {OUTCOMES[index] for index in rows["outcome"]}
     assert {"timeout", "saturated", "good"} <= names
     assert np.isnan(rows["restitution_1"][rows["outcome"] == OUTCOMES.index("timeout")]).all()
 

@@ -59,32 +59,32 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ide
 
 
 def outcomes(found):
-    return [OUTCOMES[place] for place in found["outcome"]]
+    return [OUTCOMES[index] for index in found["outcome"]]
 
 
 def test_error_of_largest_magnitude_decides_the_outcome():
-    found = rows([[0.005, 0.002, -0.03], [-0.009, 0.02, 0.02]], [[OK] * 3, [OK] * 3])
-    np.testing.assert_array_equal(found["worst_error"], [-0.009, 0.02, -0.03])
-    assert outcomes(found) == ["good", "error beyond limit", "error beyond limit"]
-    np.testing.assert_array_equal(found["failed"], [False, True, True])
-    np.testing.assert_array_equal(found["index"], [7, 8, 9])
+    result = rows([[0.005, 0.002, -0.03], [-0.009, 0.02, 0.02]], [[OK] * 3, [OK] * 3])
+    np.testing.assert_array_equal(result["worst_error"], [-0.009, 0.02, -0.03])
+    assert outcomes(result) == ["good", "error beyond limit", "error beyond limit"]
+    np.testing.assert_array_equal(result["failed"], [False, True, True])
+    np.testing.assert_array_equal(result["index"], [7, 8, 9])
 
 
 def test_failed_run_is_a_row_with_a_cause():
     errors = [[NAN, 0.5, 0.0, 0.0], [0.0, 0.0, NAN, 0.0]]
     status = [[NON_FINITE, DIVERGED, OK, OK], [NOT_REACHED, NOT_REACHED, TIMEOUT, NOT_REACHED]]
-    found = rows(errors, status)
-    assert outcomes(found) == ["non-finite", "diverged", "timeout", "not reached"]
-    assert found["failed"].all()
-    np.testing.assert_array_equal(found["worst_error"], [NAN, NAN, 0.0, 0.0])
-    assert [STATUSES[place] for place in found["status_2"]] == ["not reached"] * 2 + [
+    result = rows(errors, status)
+    assert outcomes(result) == ["non-finite", "diverged", "timeout", "not reached"]
+    assert result["failed"].all()
+    np.testing.assert_array_equal(result["worst_error"], [NAN, NAN, 0.0, 0.0])
+    assert [STATUSES[index] for index in result["status_2"]] == ["not reached"] * 2 + [
         "timeout",
         "not reached",
     ]
     # Known values of a contact that did not end stay; those that only its end gives are missing.
-    np.testing.assert_array_equal(np.isnan(found["restitution_1"]), [True, True, False, False])
-    assert np.isfinite(found["peak_force_1"]).all()
-    np.testing.assert_array_equal(np.isnan(found["peak_force_2"]), [True, True, False, True])
+    np.testing.assert_array_equal(np.isnan(result["restitution_1"]), [True, True, False, False])
+    assert np.isfinite(result["peak_force_1"]).all()
+    np.testing.assert_array_equal(np.isnan(result["peak_force_2"]), [True, True, False, True])
 
 
 def test_force_beyond_the_sensors_range_is_saturation():
@@ -94,10 +94,10 @@ def test_force_beyond_the_sensors_range_is_saturation():
 
 def test_binding_limit_of_the_motion_simulator_is_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
-    found = rows(errors, status, shortfall=1e-9)
+    result = rows(errors, status, shortfall=1e-9)
     # It ranks above an error and below a contact that does not end; it is known for that one, too.
-    assert outcomes(found) == ["saturated", "saturated", "timeout"] and found["failed"].all()
-    np.testing.assert_array_equal(found["position_shortfall_2"], 1e-9)
+    assert outcomes(result) == ["saturated", "saturated", "timeout"] and result["failed"].all()
+    np.testing.assert_array_equal(result["position_shortfall_2"], 1e-9)
     assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]
 
 
@@ -115,10 +115,10 @@ def test_binding_limit_of_the_motion_simulator_is_saturation():
     ],
 )
 def test_real_contact_unlike_the_ideal_one_is_a_failure(ideal, outcome):
-    found = rows([[0.0], [0.0]], [[OK], [OK]], ideal=ideal)
-    assert outcomes(found) == [outcome] and found["failed"][0] == (outcome != "good")
-    np.testing.assert_array_equal(found["reference_peak_force_2"], ideal[0])
-    np.testing.assert_array_equal(found["reference_duration_1"], ideal[1])
+    result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=ideal)
+    assert outcomes(result) == [outcome] and result["failed"][0] == (outcome != "good")
+    np.testing.assert_array_equal(result["reference_peak_force_2"], ideal[0])
+    np.testing.assert_array_equal(result["reference_duration_1"], ideal[1])
 
 
 def test_unlike_contact_ranks_above_an_error_and_below_saturation():
@@ -130,22 +130,22 @@ def test_unlike_contact_ranks_above_an_error_and_below_saturation():
 
 
 def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
-    found = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
-    old = {name: values for name, values in found.items() if not name.startswith("reference_")}
+    result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
+    old = {name: values for name, values in result.items() if not name.startswith("reference_")}
     judged = judge(old, error_slots(("error",), 2), np.array(np.inf), np.array(2e-3), LIMIT)
-    assert outcomes(found) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
+    assert outcomes(result) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
 
 
 def test_energies_are_kinetic_energies_of_the_numerical_model():
-    found = rows([[0.1], [0.0]], [[OK], [OK]])
-    np.testing.assert_allclose(found["energy_in_1"], 350 / 2 * 2**2, rtol=1e-15)
-    np.testing.assert_allclose(found["energy_out_1"], 350 / 2 * 2**2 * (0.9 + 0.1) ** 2, rtol=1e-15)
+    result = rows([[0.1], [0.0]], [[OK], [OK]])
+    np.testing.assert_allclose(result["energy_in_1"], 350 / 2 * 2**2, rtol=1e-15)
+    np.testing.assert_allclose(result["energy_out_1"], 350 / 2 * 2**2 * (0.9 + 0.1) ** 2, rtol=1e-15)
 
 
 def test_columns_and_rows_have_the_same_names():
-    found = rows([[0.0], [0.0]], [[OK], [OK]])
+    result = rows([[0.0], [0.0]], [[OK], [OK]])
     parsed = check_document(case(2, uncertainty={})).mechanism
-    assert [column.name for column in sweep_columns(parsed, False)] == list(found)
+    assert [column.name for column in sweep_columns(parsed, False)] == list(result)
 
 
 @pytest.mark.parametrize(

@@ -55,14 +55,14 @@ def document(ran):
 
 def test_sweep_prints_its_findings_as_json(jaxhil, gains, store):
     ran = jaxhil("sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume", "--json")
-    found = document(ran)
-    assert ran[0] == 1 and found["verdict"] == "bad"
-    probability = found["failure_probability"]
-    assert probability["low"] < found["failed"] / 100 == probability["value"] < probability["high"]
-    assert sum(found["outcomes"].values()) == found["scenarios"] == 100
-    errors = [abs(one["worst_error"]) for one in found["worst"]]
+    result = document(ran)
+    assert ran[0] == 1 and result["verdict"] == "bad"
+    probability = result["failure_probability"]
+    assert probability["low"] < result["failed"] / 100 == probability["value"] < probability["high"]
+    assert sum(result["outcomes"].values()) == result["scenarios"] == 100
+    errors = [abs(one["worst_error"]) for one in result["worst"]]
     assert len(errors) == 10 and errors == sorted(errors, reverse=True) and errors[0] > 1.5
-    assert found["worst"][0]["inputs"].keys() == {
+    assert result["worst"][0]["inputs"].keys() == {
         *("contact.stiffness_1", "rig.force_sensor.delay", "approach.phase_1"),
     }
 
@@ -87,9 +87,9 @@ def test_sweep_without_failures_is_good(jaxhil, gains, tmp_path):
 def test_sobol_sweep_leaves_its_last_scenarios_out_of_replicates(jaxhil, gains, tmp_path):
     sobol = ["sweep", gains, *TINY, "--sampling", "sobol", "--limit", "1.5", "-o", tmp_path / "new"]
     ran = jaxhil(*sobol, "--json")
-    found = document(ran)
-    assert sum(found["outcomes"].values()) == 100 and found["left_out_of_replicates"] == 4
-    probability = found["failure_probability"]
+    result = document(ran)
+    assert sum(result["outcomes"].values()) == 100 and result["left_out_of_replicates"] == 4
+    probability = result["failure_probability"]
     assert 0 < probability["low"] < probability["value"] < probability["high"] < 1
     assert (probability["value"] * 96).is_integer()
     code, out, _ = jaxhil(*sobol, "--resume")
@@ -106,12 +106,12 @@ def test_sweep_stops_at_a_width(jaxhil, gains, tmp_path):
     wide = ["sweep", gains, "--scenarios", "1000", "--chunk", "64", "--limit", "1.5", "-o", tmp_path / "n"]
     wide += ["--until-width", "0.3"]
     ran = jaxhil(*wide, "--json")
-    found = document(ran)
-    assert ran[0] == 1 and found["scenarios"] < found["most_scenarios"] == 1000
-    probability = found["failure_probability"]
+    result = document(ran)
+    assert ran[0] == 1 and result["scenarios"] < result["most_scenarios"] == 1000
+    probability = result["failure_probability"]
     assert probability["high"] - probability["low"] <= 0.3 and "repeated looks" in probability["method"]
     code, out, _ = jaxhil(*wide, "--resume")
-    assert code == 1 and f"Stopped after {found['scenarios']} of at most 1000" in out
+    assert code == 1 and f"Stopped after {result['scenarios']} of at most 1000" in out
     assert "valid under repeated" in out
     assert jaxhil("replay", tmp_path / "n", 0)[0] == 0
     refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep stopped")
@@ -119,22 +119,22 @@ def test_sweep_stops_at_a_width(jaxhil, gains, tmp_path):
 
 def test_sweep_reports_quantiles(jaxhil, gains, store):
     again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
-    found = document(jaxhil(*again, "--json"))["error_quantiles"]
-    assert [one["order"] for one in found] == [0.5, 0.95, 0.99, 0.999]
-    assert found[0]["low"] < found[0]["value"] < found[0]["high"] < found[1]["value"]
+    result = document(jaxhil(*again, "--json"))["error_quantiles"]
+    assert [one["order"] for one in result] == [0.5, 0.95, 0.99, 0.999]
+    assert result[0]["low"] < result[0]["value"] < result[0]["high"] < result[1]["value"]
     out = jaxhil(*again)[1]
     assert "99.9 %" in out and "no bound" in out
 
 
 def test_sweep_reports_studies(jaxhil, own):
     again = [*own[1], "--drivers", "16", "--rare"]
-    found = document(jaxhil(*again, "--json"))
-    drivers, rare = found["drivers"], found["rare"]
+    result = document(jaxhil(*again, "--json"))
+    drivers, rare = result["drivers"], result["rare"]
     assert drivers["evaluations"] == 16 * 5 and drivers["cap"] == 15
     names = [one["input"] for one in drivers["inputs"]]
     assert sorted(names) == ["approach.phase", "contact.stiffness", "rig.force_sensor.delay"]
     assert rare["limit"] == 1.5 and rare["low"] < rare["probability"] < rare["high"]
-    brute = found["failure_probability"]
+    brute = result["failure_probability"]
     assert brute["low"] < rare["probability"] < brute["high"]
     out = jaxhil(*again)[1]
     assert "Subset simulation" in out and "first order" in out and names[0] in out
@@ -162,10 +162,10 @@ def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own):
     assert (folder / "verdict.json").read_text() == ran[1]
     (folder / "verdict.json").unlink()
     assert jaxhil(*again, "--acceptable", "1")[0] == 0
-    found = json.loads((folder / "verdict.json").read_text())
-    assert found["sha256"] == digest(found) and document(ran)["sha256"] == digest(document(ran))
-    changed = {"acceptable": 1.0, "verdict": "good", "sha256": found["sha256"]}
-    assert found == {**document(ran), **changed}
+    result = json.loads((folder / "verdict.json").read_text())
+    assert result["sha256"] == digest(result) and document(ran)["sha256"] == digest(document(ran))
+    changed = {"acceptable": 1.0, "verdict": "good", "sha256": result["sha256"]}
+    assert result == {**document(ran), **changed}
     assert jaxhil("replay", folder, 5)[0] == 0
 
 
@@ -213,8 +213,8 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick
     assert so_far["verdict"] == "bad" and so_far["drivers"]["evaluations"] == 80 and "rare" not in so_far
     assert [(folder / one).exists() for one in KEPT] == [True, False]
     no_study(monkeypatch, "error_indices")
-    found = document(jaxhil(*again, *STUDIES, "--json"))
-    assert found["drivers"] == so_far["drivers"] and found["rare"]["limit"] == 1.6
+    result = document(jaxhil(*again, *STUDIES, "--json"))
+    assert result["drivers"] == so_far["drivers"] and result["rare"]["limit"] == 1.6
 
 
 def test_damaged_study_is_run_again(jaxhil, own, quick):
@@ -239,13 +239,15 @@ def unwritable(ran, name):
 def test_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
     folder, again = own
     (folder / "studies").touch()
-    found = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
+    result = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
     assert (
-        found["verdict"] == "bad" and found["drivers"]["evaluations"] == 80 and found["rare"]["limit"] == 1.6
+        result["verdict"] == "bad"
+        and result["drivers"]["evaluations"] == 80
+        and result["rare"]["limit"] == 1.6
     )
-    assert json.loads((folder / "verdict.json").read_text()) == found
+    assert json.loads((folder / "verdict.json").read_text()) == result
     (folder / "studies").unlink()
-    assert document(jaxhil(*again, *STUDIES, "--json")) == found
+    assert document(jaxhil(*again, *STUDIES, "--json")) == result
 
 
 def test_full_disk_costs_no_verdict(jaxhil, own, quick):
@@ -257,18 +259,20 @@ def test_full_disk_costs_no_verdict(jaxhil, own, quick):
         ran = jaxhil(*again, *STUDIES, "--json")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    found = unwritable(ran, "verdict.json")
+    result = unwritable(ran, "verdict.json")
     assert (
-        found["verdict"] == "bad" and found["drivers"]["evaluations"] == 80 and found["rare"]["limit"] == 1.6
+        result["verdict"] == "bad"
+        and result["drivers"]["evaluations"] == 80
+        and result["rare"]["limit"] == 1.6
     )
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
     ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "pictures" / "77.png")
-    found = document(ran)
-    assert ran[0] == 0 and found["verdict"] == "good" and found["different"] == []
-    assert found["index"] == 77 and len(found["contacts"]) == 1
+    result = document(ran)
+    assert ran[0] == 0 and result["verdict"] == "good" and result["different"] == []
+    assert result["index"] == 77 and len(result["contacts"]) == 1
     assert (tmp_path / "pictures" / "77.png").stat().st_size > 10_000
     code, out, _ = jaxhil("replay", store, 0)
     assert code == 0 and "to the bit" in out

@@ -55,19 +55,19 @@ def check(found: list[Probability], truth: float, name: str, capsys) -> None:
 @pytest.mark.parametrize("sampling", ["random", "sobol"])
 def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
     replicates = 16 if sampling == "sobol" else 1
-    found = [
+    result = [
         failure_probability(add_rows(empty_tally(replicates, NUMBER), rows))
         for rows in repeated(truth, sampling)
     ]
     # The pooled sweeps agree with the closed form itself.
-    pooled = np.mean([one.value for one in found])
+    pooled = np.mean([one.value for one in result])
     assert pooled == pytest.approx(truth, abs=4 * math.sqrt(truth * (1 - truth) / (SWEEPS * NUMBER)))
-    check(found, truth, sampling, capsys)
+    check(result, truth, sampling, capsys)
 
 
 @pytest.mark.parametrize("truth", TRUTHS)
 def test_intervals_of_sweeps_stopped_at_a_width_cover_the_truth(truth, capsys):
-    found = []
+    result = []
     for rows in repeated(truth, "random"):
         tally = empty_tally(1, NUMBER, looked_at=True)
         for first in range(0, NUMBER, LOOK):
@@ -75,5 +75,5 @@ def test_intervals_of_sweeps_stopped_at_a_width_cover_the_truth(truth, capsys):
             assert tally.looks is not None
             if enough(tally.looks, 0.3 if truth > 0.1 else 0.12):
                 break
-        found.append(failure_probability(tally))
-    check(found, truth, "sequential", capsys)
+        result.append(failure_probability(tally))
+    check(result, truth, "sequential", capsys)

@@ -26,9 +26,9 @@ def leaves(found, part=slice(None)):
 @settings(max_examples=25)
 def test_drawn_chunk_is_a_part_of_the_whole(sampling, first, number):
     number = min(number, 3000 - first)
-    found = leaves(drawn_scenarios(MECHANISM, sampling, 3, first, number))
+    result = leaves(drawn_scenarios(MECHANISM, sampling, 3, first, number))
     expected = leaves(WHOLE[sampling], slice(first, first + number))
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    jax.tree.map(np.testing.assert_array_equal, result, expected)
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)

@@ -59,12 +59,12 @@ def test_manifest_with_another_value_is_refused_or_taken_as_signed(key, value, s
     if signed:
         changed["sha256"] = digest(changed)
     try:
-        found = decode(json.dumps(changed).encode(), "store/manifest.json")
+        result = decode(json.dumps(changed).encode(), "store/manifest.json")
     except InputError as error:
         assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
     else:
         # Nothing is read as something else than what was written.
-        assert msgspec.to_builtins(found) == changed
+        assert msgspec.to_builtins(result) == changed
         assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
 
 
@@ -100,11 +100,11 @@ def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
         harmed = bytearray(content)
         harmed[bit // 8] ^= 1 << int(bit % 8)
         try:
-            found = decode(bytes(harmed), "store/manifest.json")
+            result = decode(bytes(harmed), "store/manifest.json")
         except InputError as error:
             assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
         else:
-            assert msgspec.structs.replace(found, created=GOOD.created) == GOOD
+            assert msgspec.structs.replace(result, created=GOOD.created) == GOOD
 
 
 def test_manifest_differs_for_other_gains_and_other_code():

@@ -60,10 +60,10 @@ def few_points(monkeypatch):
 
 
 def accumulated(plan, rows, cuts):
-    found = empty_regions(plan)
+    result = empty_regions(plan)
     for first, until in cuts:
-        found = add_rows(plan, found, {name: values[first:until] for name, values in rows.items()})
-    return found
+        result = add_rows(plan, result, {name: values[first:until] for name, values in rows.items()})
+    return result
 
 
 def flat(found):
@@ -127,24 +127,24 @@ def test_plotted_quantile_is_that_of_the_values():
 def test_contact_without_end_counts_as_infinite_and_later_ones_are_left_out(lost):
     made, mechanism, rows = lost
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
+    result = accumulated(plan, rows, [(0, NUMBER)])
     ended = [rows[f"status_{number}"] == STATUSES.index("ok") for number in (1, 2)]
     first, second = np.sum(~ended[0]), np.sum(ended[0] & ~ended[1])
     assert first > 10
-    assert found.sizes[..., -1].sum() == first + second
-    assert found.sizes.sum() == NUMBER + ended[0].sum()
+    assert result.sizes[..., -1].sum() == first + second
+    assert result.sizes.sum() == NUMBER + ended[0].sum()
     bad = rows["outcome"] > OUTCOMES.index("saturated")
-    np.testing.assert_array_equal(np.isinf(found.points.size), bad)
+    np.testing.assert_array_equal(np.isinf(result.points.size), bad)
 
 
 def test_failures_are_counted_up_to_each_look(swept):
     made, mechanism, rows = swept
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
-    assert (found.scenarios, found.failed) == (NUMBER, rows["failed"].sum())
+    result = accumulated(plan, rows, [(0, NUMBER)])
+    assert (result.scenarios, result.failed) == (NUMBER, rows["failed"].sum())
     assert plan.looks[-1] == NUMBER // plan.replicates * plan.replicates
     assert not np.any(plan.looks % plan.replicates)
-    counted = np.cumsum(found.failures, axis=0)
+    counted = np.cumsum(result.failures, axis=0)
     for look, each in zip(plan.looks, counted, strict=False):
         direct = [rows["failed"][:look][k :: plan.replicates].sum() for k in range(plan.replicates)]
         np.testing.assert_array_equal(each, direct)
@@ -152,20 +152,20 @@ def test_failures_are_counted_up_to_each_look(swept):
 
 def test_plotted_points_are_the_first_and_the_first_failures(usual, few_points):
     made, mechanism, rows = usual
-    found = accumulated(make_plan(made, mechanism, rows), rows, [(0, NUMBER)])
+    result = accumulated(make_plan(made, mechanism, rows), rows, [(0, NUMBER)])
     failed = np.flatnonzero(rows["failed"])[:20]
     wanted = np.union1d(np.arange(10), failed)
     assert len(wanted) > 20
-    np.testing.assert_array_equal(found.points.index, wanted)
-    np.testing.assert_array_equal(found.points.size, np.abs(rows["worst_error"])[wanted])
-    np.testing.assert_array_equal(found.points.inputs[1], 1e3 * rows["rig.force_sensor.delay"][wanted])
+    np.testing.assert_array_equal(result.points.index, wanted)
+    np.testing.assert_array_equal(result.points.size, np.abs(rows["worst_error"])[wanted])
+    np.testing.assert_array_equal(result.points.inputs[1], 1e3 * rows["rig.force_sensor.delay"][wanted])
 
 
 def test_convergence_plot_ends_at_the_verdict(swept):
     made, mechanism, rows = swept
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
-    figure = pictures.convergence(plan, found, made, "name")
+    result = accumulated(plan, rows, [(0, NUMBER)])
+    figure = pictures.convergence(plan, result, made, "name")
     axes = figure.axes[0]
     drawn = {line.get_label(): line.get_data() for line in axes.lines}
     (number,), (share,) = [
@@ -189,8 +189,8 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     made, mechanism, rows = usual
     rows = {**rows, "failed": np.zeros(NUMBER, bool)}
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
-    axes = pictures.convergence(plan, found, made, "name", acceptable).axes[0]
+    result = accumulated(plan, rows, [(0, NUMBER)])
+    axes = pictures.convergence(plan, result, made, "name", acceptable).axes[0]
     last = float(binomial_interval(0, NUMBER).high)
     low, high = axes.get_ylim()
     assert low < 0.9 * last and last < 0.9 * high
@@ -201,11 +201,11 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
 def test_sweep_plots_ignore_the_callers_settings(usual, tmp_path):
     made, mechanism, rows = usual
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
+    result = accumulated(plan, rows, [(0, NUMBER)])
 
     def drawn(name):
-        figures = [draw(plan, found, made, "n") for draw in (pictures.error_map, pictures.failure_region)]
-        paths = [tmp_path / f"{name}-{place}.png" for place in range(2)]
+        figures = [draw(plan, result, made, "n") for draw in (pictures.error_map, pictures.failure_region)]
+        paths = [tmp_path / f"{name}-{index}.png" for index in range(2)]
         for figure, path in zip(figures, paths, strict=True):
             save(figure, path)
         return [path.read_bytes() for path in paths]
@@ -238,9 +238,9 @@ def test_every_axis_is_labelled_with_its_unit(request, name, limit):
     made = msgspec.structs.replace(made, limit=limit)
     plan = make_plan(made, mechanism, rows)
     assert len(plan.per_contact) == (1 if name == "phases" else 2)
-    found = accumulated(plan, rows, [(0, NUMBER)])
-    drawn = [draw(plan, found, made, name) for draw in (pictures.error_map, pictures.failure_region)]
-    for figure in (*drawn, pictures.convergence(plan, found, made, name, 0.1)):
+    result = accumulated(plan, rows, [(0, NUMBER)])
+    drawn = [draw(plan, result, made, name) for draw in (pictures.error_map, pictures.failure_region)]
+    for figure in (*drawn, pictures.convergence(plan, result, made, name, 0.1)):
         FigureCanvasAgg(figure).draw()
         named = [axes for axes in figure.axes if axes.axison]
         assert named
@@ -268,11 +268,11 @@ def test_colour_scale_is_labelled_at_both_ends(usual, limit):
 def test_legend_counts_failures_by_kind(lost, few_points):
     made, mechanism, rows = lost
     plan = make_plan(made, mechanism, rows)
-    found = accumulated(plan, rows, [(0, NUMBER)])
-    endless = int(np.sum(found.points.failed & np.isinf(found.points.size)))
-    failed, of = int(np.sum(found.points.failed)), int(np.sum(rows["failed"]))
+    result = accumulated(plan, rows, [(0, NUMBER)])
+    endless = int(np.sum(result.points.failed & np.isinf(result.points.size)))
+    failed, of = int(np.sum(result.points.failed)), int(np.sum(rows["failed"]))
     assert 0 < endless < failed < of
-    (legend,) = pictures.failure_region(plan, found, made, "lost").legends
+    (legend,) = pictures.failure_region(plan, result, made, "lost").legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert f"failed, every contact ended ({failed - endless} of the first {failed} of {of})" in labels
     assert f"{pictures.UNENDED} ({endless} of the first {failed} of {of})" in labels
@@ -283,12 +283,12 @@ def test_sweep_command_writes_plots_and_resumes_over_them(tmp_path, capsys):
     write_gain_file(gains, case())
     command = ["sweep", str(gains), "--scenarios", "70", "--chunk", "64", "-o", str(store), "--json"]
     main(command)
-    found = json.loads(capsys.readouterr().out)
-    assert found["plots"] == [str(store / name) for name in PICTURES]
+    result = json.loads(capsys.readouterr().out)
+    assert result["plots"] == [str(store / name) for name in PICTURES]
     before = [path.read_bytes() for path in map(store.joinpath, PICTURES)]
     (store / PICTURES[0]).unlink()
     (store / "parts" / "part-000001.parquet").unlink()
     main([*command, "--resume"])
-    assert json.loads(capsys.readouterr().out)["failed"] == found["failed"]
+    assert json.loads(capsys.readouterr().out)["failed"] == result["failed"]
     assert [path.read_bytes() for path in map(store.joinpath, PICTURES)] == before
     assert main(command) == 2 and "--resume" in capsys.readouterr().err

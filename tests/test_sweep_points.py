@@ -25,7 +25,7 @@ def asked():
 def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
     monkeypatch.setattr(points, "FEWEST", 8)
     *what, rows = asked
-    ran, found = [], []
+    ran, result = [], []
 
     def interrupted(sweep, pieces):
         # As on a cluster: in any order, and none twice.
@@ -34,12 +34,12 @@ def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             yield one
 
-    running = Running(ran.append, found.append, Pieces(tmp_path / "kept"), interrupted, several=10)
+    running = Running(ran.append, result.append, Pieces(tmp_path / "kept"), interrupted, several=10)
     with pytest.raises(KeyboardInterrupt):
         run_points(*what, running)
     again = running._replace(kept=Pieces(tmp_path / "kept", resume=True), computer=run_here)
     assert same_rows(run_points(*what, again), rows) == []
-    assert len(found) == 3 and sum(ran) == NUMBER and sum(found) == sum(ran[:3])
+    assert len(result) == 3 and sum(ran) == NUMBER and sum(result) == sum(ran[:3])
     assert again.kept.other == []
 
 

@@ -124,9 +124,9 @@ def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
 def test_any_row_replays_to_the_bit(whole):
     store, rows, _, _ = whole
     for index in np.random.default_rng(0).integers(0, 300, 6):
-        found = replay(read_store(store.folder), int(index))
-        assert found.different == []
-        np.testing.assert_array_equal(found.again["error_1"], rows["error_1"][index])
+        result = replay(read_store(store.folder), int(index))
+        assert result.different == []
+        np.testing.assert_array_equal(result.again["error_1"], rows["error_1"][index])
 
 
 def test_replay_detects_a_changed_row(whole, tmp_path):
@@ -149,10 +149,10 @@ def test_replayed_motion_is_that_of_the_scenario(whole):
 
 def test_precisions_are_compared_on_the_same_scenarios(whole):
     _, rows, sweep, _ = whole
-    found = compare_precisions(sweep, 64)
-    assert found.scenarios == 32 and found.failed_float64 == np.sum(rows["failed"][:32])
-    assert found.largest_difference is not None and 0 < found.largest_difference < 1e-4
-    assert found.changed_outcomes == abs(found.failed_float64 - found.failed_float32)
+    result = compare_precisions(sweep, 64)
+    assert result.scenarios == 32 and result.failed_float64 == np.sum(rows["failed"][:32])
+    assert result.largest_difference is not None and 0 < result.largest_difference < 1e-4
+    assert result.changed_outcomes == abs(result.failed_float64 - result.failed_float32)
 
 
 WIDE = 0.25  # a width that 300 scenarios reach, and 64 do not

@@ -71,9 +71,9 @@ def refused(*words):
 
 def test_store_is_read_as_it_was_written(store):
     for part in range(MANIFEST.parts):
-        found = read_part(store, part)
-        assert found is not None and list(found) == [column.name for column in MANIFEST.columns]
-        assert same_rows(found, made_up(part)) == []
+        result = read_part(store, part)
+        assert result is not None and list(result) == [column.name for column in MANIFEST.columns]
+        assert same_rows(result, made_up(part)) == []
     assert same_rows(read_row(store, 99), {k: v[3:4] for k, v in made_up(3).items()}) == []
 
 
@@ -189,13 +189,13 @@ def test_store_refuses_a_missing_column_by_name(tmp_path):
 
 def test_store_removes_unfinished_files_on_resuming(store):
     (store.folder / "studies").mkdir()
-    left = [store.folder / place / UNFINISHED for place in ("", "parts", "studies")]
-    kept = ["verdict.json", "studies/drivers-2.json", ".thesis.docx.tmp", "parts/.thesis.docx.1.tmp"]
-    kept = [store.folder / name for name in kept]
-    for path in (*left, *kept):
+    left = [store.folder / folder / UNFINISHED for folder in ("", "parts", "studies")]
+    remaining = ["verdict.json", "studies/drivers-2.json", ".thesis.docx.tmp", "parts/.thesis.docx.1.tmp"]
+    remaining = [store.folder / name for name in remaining]
+    for path in (*left, *remaining):
         path.write_text("{}")
     assert open_store(store.folder, MANIFEST, resume=True).manifest == MANIFEST
-    assert [path.exists() for path in (*left, *kept)] == [False] * 3 + [True] * 4
+    assert [path.exists() for path in (*left, *remaining)] == [False] * 3 + [True] * 4
 
 
 def test_new_store_takes_over_no_study_and_no_verdict(store):
@@ -267,23 +267,23 @@ def test_store_touches_no_file_of_the_user(tmp_path):
 @pytest.mark.parametrize("name", [".lock", "manifest.json", "parts", "verdict.json", "studies"])
 @pytest.mark.parametrize("kind", ["link", "pipe", "folder link"])
 def test_store_follows_no_link_and_waits_for_no_pipe(store, tmp_path, name, kind):
-    place = store.folder / name
-    if place.is_dir():
-        place.rename(tmp_path / "away")
-    place.unlink(missing_ok=True)
+    folder = store.folder / name
+    if folder.is_dir():
+        folder.rename(tmp_path / "away")
+    folder.unlink(missing_ok=True)
     (tmp_path / "precious").write_text("years")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / UNFINISHED).write_text("years")
     if kind == "pipe":
-        os.mkfifo(place)
+        os.mkfifo(folder)
     else:
-        place.symlink_to(tmp_path / ("precious" if kind == "link" else "elsewhere"))
-    before = os.lstat(place).st_ino
+        folder.symlink_to(tmp_path / ("precious" if kind == "link" else "elsewhere"))
+    before = os.lstat(folder).st_ino
     with refused(name, "found a (link|pipe), allowed a (plain file|folder)"), locked(store.folder):
         opened = open_store(store.folder, MANIFEST, resume=True)
         write_verdict(opened, {"verdict": "good"})
         write_study(opened, IndicesRequest(2), ErrorIndices((), 1.0, 4, 0))
-    assert os.lstat(place).st_ino == before
+    assert os.lstat(folder).st_ino == before
     assert (tmp_path / "precious").read_text() == "years"
     assert os.listdir(tmp_path / "elsewhere") == [UNFINISHED]
 

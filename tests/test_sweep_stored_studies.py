@@ -110,11 +110,11 @@ def test_study_of_arbitrary_bytes_is_ignored(request, content):
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=400)
 def test_study_with_any_flipped_bit_is_ignored(study, data):
-    request, found = study
-    content = bytearray(encode(MANIFEST, request, found))
+    request, result = study
+    content = bytearray(encode(MANIFEST, request, result))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     read = decode(MANIFEST, request, bytes(content))
-    assert read is None or same(read, found)
+    assert read is None or same(read, result)
 
 
 JSON = st.recursive(
@@ -128,8 +128,8 @@ JSON = st.recursive(
 @settings(max_examples=300)
 def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
     """Include other types or shapes, which are no result and must not crash."""
-    request, found = study
-    document = json.loads(encode(MANIFEST, request, found))
+    request, result = study
+    document = json.loads(encode(MANIFEST, request, result))
     place = data.draw(st.sampled_from([document, document["result"]]))
     place[data.draw(st.sampled_from([*place, "more"]))] = data.draw(JSON)
     document["sha256"] = digest(document)
@@ -211,10 +211,10 @@ def test_study_of_another_sweep_is_ignored(store, other):
 
 def test_study_states_its_subject(store):
     write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
-    found = json.loads(study_path(store, RareRequest(1.5, 1000, 2)).read_bytes())
-    del found["result"]
-    assert found.pop("sha256") != MANIFEST.sha256
-    assert found == {
+    result = json.loads(study_path(store, RareRequest(1.5, 1000, 2)).read_bytes())
+    del result["result"]
+    assert result.pop("sha256") != MANIFEST.sha256
+    assert result == {
         **{"schema": "jaxhil/study/1", "study": "rare", "sweep_sha256": MANIFEST.sha256},
         **{"seed": 0, "versions": MANIFEST.versions, "limit": 1.5, "samples": 1000, "replicates": 2},
     }

@@ -38,14 +38,14 @@ def whole():
 def test_input_without_effect_has_no_sensitivity(whole):
     sweep, _ = whole
     ran = []
-    found = error_indices(sweep, 128, Running(ran.append))
-    assert found.evaluations == sum(ran) == evaluations(4, 128) == 768
-    assert {one.input for one in found.inputs} == set(dimensions(sweep.mechanism))
-    totals = [one.total for one in found.inputs]
+    result = error_indices(sweep, 128, Running(ran.append))
+    assert result.evaluations == sum(ran) == evaluations(4, 128) == 768
+    assert {one.input for one in result.inputs} == set(dimensions(sweep.mechanism))
+    totals = [one.total for one in result.inputs]
     assert totals == sorted(totals, reverse=True)
-    idle = next(one for one in found.inputs if one.input == "approach.velocity")
+    idle = next(one for one in result.inputs if one.input == "approach.velocity")
     assert idle.total_low <= 1e-9 and idle.total_high < 1e-6 and abs(idle.first_order) < 1e-3
-    first, *_ = found.inputs
+    first, *_ = result.inputs
     assert first.input == "contact.stiffness" and first.total_low > 0.5
     assert first.first_order_low <= first.first_order <= first.first_order_high
 
@@ -53,13 +53,13 @@ def test_input_without_effect_has_no_sensitivity(whole):
 def test_variance_of_a_single_input_is_all_its_own():
     # One input beside the phase: the law of total variance by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
-    found = {one.input: one for one in error_indices(sweep, 256).inputs}
+    result = {one.input: one for one in error_indices(sweep, 256).inputs}
     cells = (np.arange(64) + 0.5) / 64
     grid = np.stack([axis.ravel() for axis in np.meshgrid(cells, cells, indexing="ij")], axis=1)
     sizes = error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
     assert np.max(sizes) < 10  # which is the cap
     share = np.var(np.mean(sizes, axis=1)) / np.var(sizes)
-    stiffness, phase = found["contact.stiffness"], found["approach.phase"]
+    stiffness, phase = result["contact.stiffness"], result["approach.phase"]
     assert stiffness.first_order_low < share < stiffness.first_order_high
     assert phase.total_low < 1 - share < phase.total_high
 
@@ -83,14 +83,14 @@ def test_correlated_inputs_count_as_one():
 
 def test_noise_is_an_input_of_the_study():
     document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
-    found = error_indices(sweep_of(document), 64)
-    shares = {one.input: one for one in found.inputs}
-    assert found.evaluations == 64 * 5 and shares.keys() == {
+    result = error_indices(sweep_of(document), 64)
+    shares = {one.input: one for one in result.inputs}
+    assert result.evaluations == 64 * 5 and shares.keys() == {
         "bodies.equivalent_mass",
         "approach.phase",
         NOISE,
     }
-    assert shares[NOISE].total_low > 0.1 and found.inputs[0].input != "bodies.equivalent_mass"
+    assert shares[NOISE].total_low > 0.1 and result.inputs[0].input != "bodies.equivalent_mass"
     assert shares["bodies.equivalent_mass"].total_high < 1e-3
     # Without noise its index is zero.
     quiet = error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
@@ -104,9 +104,9 @@ def test_errors_beyond_the_cap_count_as_the_cap(whole):
     _, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
-    found = error_indices(limited, 128)
-    assert found.cap == 10 * limit
-    assert 0.4 < found.capped / found.evaluations < 0.6
+    result = error_indices(limited, 128)
+    assert result.cap == 10 * limit
+    assert 0.4 < result.capped / result.evaluations < 0.6
 
 
 @pytest.mark.parametrize("share", [0.2, 0.05])
@@ -116,12 +116,12 @@ def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
     rows = {**rows, "outcome": (np.abs(rows["worst_error"]) > limit).astype(np.int8)}
     counted = add_rows(empty_tally(1), {**rows, "failed": rows["outcome"] > 0})
     brute = failure_probability(counted)
-    found = rare_failure(sweep, limit, samples=200, replicates=6)
+    result = rare_failure(sweep, limit, samples=200, replicates=6)
     assert brute.value == pytest.approx(share, abs=1e-3)
-    assert found.low < brute.high and brute.low < found.high
-    assert found.low < found.probability < found.high
-    assert not spread_beyond_formula(found)
-    assert spread_beyond_formula(found._replace(coefficient_of_variation=0.9))
+    assert result.low < brute.high and brute.low < result.high
+    assert result.low < result.probability < result.high
+    assert not spread_beyond_formula(result)
+    assert spread_beyond_formula(result._replace(coefficient_of_variation=0.9))
 
 
 def test_rare_failures_are_reproducible(whole):

@@ -61,18 +61,18 @@ def test_tally_lists_the_worst_first():
 
 def test_tally_interval_without_failures_is_the_closed_form():
     rows = made_up(500, share=0.0)
-    found = failure_probability(add_rows(empty_tally(1), rows))
-    assert OUTCOMES[0] == GOOD and found.value == 0 and found.low == 0
-    assert found.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
+    result = failure_probability(add_rows(empty_tally(1), rows))
+    assert OUTCOMES[0] == GOOD and result.value == 0 and result.low == 0
+    assert result.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
 def test_tally_interval_of_replicates_is_students():
     rows = made_up(16 * 64)
-    found = failure_probability(add_rows(empty_tally(16), rows))
+    result = failure_probability(add_rows(empty_tally(16), rows))
     means = rows["failed"].reshape(64, 16).mean(axis=0)
     half = 2.131449545559323 * np.std(means, ddof=1) / 4
-    assert found.value == pytest.approx(np.mean(means))
-    assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half))
+    assert result.value == pytest.approx(np.mean(means))
+    assert (result.low, result.high) == pytest.approx((result.value - half, result.value + half))
 
 
 def test_tally_remainder_is_in_no_replicate():
@@ -81,16 +81,16 @@ def test_tally_remainder_is_in_no_replicate():
     assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
     whole = piece(rows, slice(16 * 64))
     expected = replicate_interval(whole["failed"].reshape(64, 16).sum(axis=0), 64)
-    found = failure_probability(tally)
-    assert (found.value, found.low, found.high) == pytest.approx(tuple(map(float, expected)))
-    assert found == failure_probability(add_rows(empty_tally(16, 16 * 64), whole))
+    result = failure_probability(tally)
+    assert (result.value, result.low, result.high) == pytest.approx(tuple(map(float, expected)))
+    assert result == failure_probability(add_rows(empty_tally(16, 16 * 64), whole))
     assert error_quantiles(tally) == error_quantiles(add_rows(empty_tally(16, 16 * 64), whole))
 
 
 def test_tally_has_no_interval_for_replicates_of_unequal_size():
     tally = add_rows(empty_tally(16, 1600), made_up(100))
-    found = failure_probability(tally)
-    assert (found.low, found.high) == (0, 1) and 0 < found.value < 1 and "yet" in found.method
+    result = failure_probability(tally)
+    assert (result.low, result.high) == (0, 1) and 0 < result.value < 1 and "yet" in result.method
     assert all((one.low, one.high) == (0, np.inf) for one in error_quantiles(tally))
     assert failure_probability(add_rows(empty_tally(16, 10), made_up(10))).high == 1
 
@@ -102,11 +102,11 @@ def test_tally_looks_are_the_confidence_sequences():
         tally = add_rows(tally, piece(rows, part))
         running = updated(running, int(np.sum(rows["failed"][part])), 100)
     assert tally.looks == running
-    found, (_, low, high) = failure_probability(tally), confidence_sequence(tally.failed, 1000)
-    assert low <= found.low < found.value < found.high <= high
-    assert "repeated looks" in found.method
+    result, (_, low, high) = failure_probability(tally), confidence_sequence(tally.failed, 1000)
+    assert low <= result.low < result.value < result.high <= high
+    assert "repeated looks" in result.method
     fixed = add_rows(empty_tally(1), rows)
-    assert found.high - found.low > failure_probability(fixed).high - failure_probability(fixed).low
+    assert result.high - result.low > failure_probability(fixed).high - failure_probability(fixed).low
     for one, other in zip(error_quantiles(tally), error_quantiles(fixed), strict=True):
         assert one.low <= other.low and other.high <= one.high
     assert error_quantiles(tally)[0] != error_quantiles(fixed)[0]
@@ -119,13 +119,13 @@ def test_tally_quantiles_are_those_of_the_errors(replicates):
     assert np.array_equal(np.isinf(sizes), rows["outcome"] > OUTCOMES.index(SATURATED)) and np.any(
         np.isinf(sizes)
     )
-    found = error_quantiles(add_rows(empty_tally(replicates, 1600), rows))
-    assert [one.order for one in found] == list(ORDERS)
-    for one in found[:3]:
+    result = error_quantiles(add_rows(empty_tally(replicates, 1600), rows))
+    assert [one.order for one in result] == list(ORDERS)
+    for one in result[:3]:
         exact = quantile(sizes, one.order)
         assert one.value == pytest.approx(float(exact.value), rel=0.01)
         assert one.low == pytest.approx(float(exact.low), rel=0.05)
         assert one.high == pytest.approx(float(exact.high), rel=0.2)
         assert one.low < one.value < one.high
     # Six runs in a thousand have no result.
-    assert found[3].value == found[3].high == np.inf
+    assert result[3].value == result[3].high == np.inf

@@ -24,8 +24,8 @@ def test_timings_record_events_of_jax(capsys):
     with timings.measured(True):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 9.5)
         jax.monitoring.record_event_duration_secs("/jax/compilation_cache/cache_retrieval_time_sec", 4.24)
-    said = capsys.readouterr().err
-    assert "compiling 5." in said and "reading kept programs 4.24 s" in said
+    output = capsys.readouterr().err
+    assert "compiling 5." in output and "reading kept programs 4.24 s" in output
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])

@@ -58,9 +58,9 @@ def test_distance_has_unit_slope_along_its_normal(name):
     @jax.jit
     def seen(points):
         slopes = jax.grad(lambda points: distance(points).sum())(points)
-        found = shape.surface(vector(points))
-        normal = components(found.normal)
-        return found.distance, normal, slopes, distance(points - found.distance[None] * normal)
+        result = shape.surface(vector(points))
+        normal = components(result.normal)
+        return result.distance, normal, slopes, distance(points - result.distance[None] * normal)
 
     distances, normals, slopes, landed = seen(jnp.asarray(POINTS))
     # There is no gradient midway between two nearest points of a surface; no test point is there.
@@ -86,12 +86,12 @@ def test_singular_points_have_no_nan():
     for name, point in singular.items():
         at = jnp.asarray(point)[:, None]
         shape = SHAPES[name]
-        found = jax.jacfwd(lambda at, shape=shape: shape.surface(vector(at)))(at)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found)), name
+        result = jax.jacfwd(lambda at, shape=shape: shape.surface(vector(at)))(at)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result)), name
     on_axis = jnp.asarray([[0.0], [0.0], [0.5]])
     for name in ("drogue", "rim"):
-        found = jax.jacfwd(lambda at, name=name: SHAPES[name].surface(vector(at)).distance)(on_axis)
-        assert np.isfinite(found).all(), name
+        result = jax.jacfwd(lambda at, name=name: SHAPES[name].surface(vector(at)).distance)(on_axis)
+        assert np.isfinite(result).all(), name
 
 
 def pose_and_twist():
@@ -152,13 +152,13 @@ def test_nearest_points_of_segments_agree_with_least_squares():
         chaser = Capsule(place(*ends[0]), place(*ends[1]), radii[0])
         target = Capsule(place(*ends[2]), place(*ends[3]), radii[1])
         still = Pose(place(0.0, 0.0, 0.0), identity(jnp.zeros(1)))
-        found = Capsules(chaser, target).touch(still)
+        result = Capsules(chaser, target).touch(still)
 
         along = np.stack([ends[1] - ends[0], ends[2] - ends[3]], axis=1)
         best = lsq_linear(along, ends[2] - ends[0], (0, 1), method="bvls", tol=1e-14)
-        np.testing.assert_allclose(0.3 - found.depth, np.linalg.norm(best.fun), rtol=1e-8)
+        np.testing.assert_allclose(0.3 - result.depth, np.linalg.norm(best.fun), rtol=1e-8)
     chaser = Capsule(place(-1.0, 0, 1), place(1.0, 0, 1), numbers(0.1)[0])
     target = Capsule(place(-1.0, 0, 0), place(1.0, 0, 0), numbers(0.2)[0])
-    found = Capsules(chaser, target).touch(still)
-    np.testing.assert_allclose(components(found.point)[:, 0], [0, 0, 0.2], atol=1e-6)
-    np.testing.assert_allclose(found.depth, -0.7, rtol=1e-12)
+    result = Capsules(chaser, target).touch(still)
+    np.testing.assert_allclose(components(result.point)[:, 0], [0, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(result.depth, -0.7, rtol=1e-12)

@@ -101,9 +101,9 @@ def test_damping_of_every_law_is_that_of_its_restitution():
 
 def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
     stiff, soft = claw("contact.stiffness=[3e5]"), claw("contact.stiffness=[6e4]")
-    known = [Tuned(stiff, {}, "stiff"), Tuned(soft, {}, "soft"), Tuned(soft, {}, "again")]
-    assert nearest(claw("contact.stiffness=[2e5]"), known).source == "stiff"
-    assert nearest(claw("contact.stiffness=[8e4]"), known).source == "soft"
+    sources = [Tuned(stiff, {}, "stiff"), Tuned(soft, {}, "soft"), Tuned(soft, {}, "again")]
+    assert nearest(claw("contact.stiffness=[2e5]"), sources).source == "stiff"
+    assert nearest(claw("contact.stiffness=[8e4]"), sources).source == "soft"
 
 
 # Transfer
@@ -120,30 +120,30 @@ def test_transferred_gains_on_the_same_mechanism_are_unchanged(compensator, name
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
 def test_transferred_literature_gains_are_the_literatures(compensator):
     source, target = claw(), load("varying", ["rig.control_period=0.002"]).mechanism
-    carried = carry_over(compensator, literature_gains(source, compensator), source, target)
+    transferred = carry_over(compensator, literature_gains(source, compensator), source, target)
     for name, value in literature_gains(target, compensator).items():
-        assert carried[name] == pytest.approx(value, rel=1e-12)
+        assert transferred[name] == pytest.approx(value, rel=1e-12)
 
 
 def test_transferred_gains_move_with_the_literature_and_the_range():
     source = claw()
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
-    carried = carry_over("response_error", {**gains, "phase_lead": 0.0054}, source, target)
+    transferred = carry_over("response_error", {**gains, "phase_lead": 0.0054}, source, target)
     # A range of 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
-    assert carried["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
-    assert carried["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
+    assert transferred["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
+    assert transferred["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
     # The literature's one period times one and a half, logarithmically.
-    assert carried["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
+    assert transferred["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
 
 
 def test_transferred_gains_are_within_the_bounds():
     names = builtin_names()
     for seed, name in enumerate(names):
         source, target = load(name).mechanism, load(names[seed - 1], ["rig.control_period=0.003"]).mechanism
-        carried = carry_over("response_error", anywhere(source, "response_error", seed), source, target)
+        transferred = carry_over("response_error", anywhere(source, "response_error", seed), source, target)
         for gain in COMPENSATORS["response_error"].gains:
-            assert gain.lower(target) <= carried[gain.name] <= gain.upper(target)
+            assert gain.lower(target) <= transferred[gain.name] <= gain.upper(target)
 
 
 # Starts of the solver
@@ -166,14 +166,14 @@ def solved(task, validation):
 
 
 def test_prior_starts_replace_the_last_starts(task, validation):
-    given = {"phase_lead": 0.011, "lead_filter": 0.0007}
+    gains = {"phase_lead": 0.011, "lead_filter": 0.0007}
     (usual,) = choose_starts(validation, 3, 0)
-    (points,) = choose_starts(validation, 3, 0, first=[[given]])
+    (points,) = choose_starts(validation, 3, 0, first=[[gains]])
     np.testing.assert_array_equal(points[:2], usual[:2])
-    assert validation.gains(0, points[2]) == pytest.approx(given, rel=1e-12)
+    assert validation.gains(0, points[2]) == pytest.approx(gains, rel=1e-12)
     # It begins at exactly these gains: its first value is theirs.
     (starts,) = solve_tasks([task], [points], 6)
-    errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, given, task.scenarios).error[0], 0)
+    errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, gains, task.scenarios).error[0], 0)
     assert starts[2].history[0] == pytest.approx(objective_value(RMS, errors), rel=1e-9)
 
 

@@ -22,8 +22,8 @@ def test_tuning_without_a_scheduler_is_one_line():
 
 @pytest.mark.slow
 def test_tuning_on_a_cluster_gives_the_same_gains_and_fronts(tmp_path, monkeypatch):
-    for place in ("tune_all", "pareto"):
-        monkeypatch.setattr(f"tuning.gains.{place}.BLOCK", 2)
+    for name in ("tune_all", "pareto"):
+        monkeypatch.setattr(f"tuning.gains.{name}.BLOCK", 2)
     changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]
     mechanisms = [jaxhil.load("varying", {**one, "name": f"mass {i}"}) for i, one in enumerate(changes)]
     mechanisms.append(jaxhil.load("suite-rattling"))
@@ -32,9 +32,9 @@ def test_tuning_on_a_cluster_gives_the_same_gains_and_fronts(tmp_path, monkeypat
         cluster.worker()
         cluster.worker()
         there = tuning.tune(mechanisms, pareto=2, scheduler=cluster.address, **FEW)
-    for own, other in zip(here, there, strict=True):
-        assert other.gains == own.gains and other.figures == own.figures
-        assert other.found.starts[0].history == own.found.starts[0].history
-        assert [one.point for one in other.pareto] == [one.point for one in own.pareto]
-        for key, outcome in own.found.outcomes.items():
+    for local, other in zip(here, there, strict=True):
+        assert other.gains == local.gains and other.figures == local.figures
+        assert other.found.starts[0].history == local.found.starts[0].history
+        assert [one.point for one in other.pareto] == [one.point for one in local.pareto]
+        for key, outcome in local.found.outcomes.items():
             np.testing.assert_array_equal(other.found.outcomes[key].error, outcome.error)

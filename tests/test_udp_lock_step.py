@@ -40,9 +40,9 @@ def test_first_contacts_are_those_of_the_closed_loop(name):
     contacts, _ = closed_loop(mechanism, "response_error", gains)
     wanted = contacts if name == "rattling" else contacts[:1]
     rig, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
-    found = rig.contacts[: len(wanted)]
-    assert [one.restitution for one in found] == [one.restitution for one in wanted]
-    assert [one.begun for one in found] == [one.begun for one in wanted]
+    result = rig.contacts[: len(wanted)]
+    assert [one.restitution for one in result] == [one.restitution for one in wanted]
+    assert [one.begun for one in result] == [one.begun for one in wanted]
     # Run after run, cycle through the lists of the mechanism at the nominal speed.
     numbers = [one.number for one in rig.contacts]
     assert len(numbers) > len(wanted)
@@ -77,9 +77,9 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
     assert (task.stale > 0) == (ticks > 0)
     assert all(math.isfinite(answer.position_command) for answer in answers)
     assert len(rig.contacts) >= 5
-    for found, expected in zip(rig.contacts, whole.contacts, strict=False):
-        assert found.status == "ok"
-        assert found.restitution == pytest.approx(expected.restitution, abs=0.006)
+    for result, expected in zip(rig.contacts, whole.contacts, strict=False):
+        assert result.status == "ok"
+        assert result.restitution == pytest.approx(expected.restitution, abs=0.006)
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
 
 
@@ -103,8 +103,8 @@ def test_missing_tick_is_interpolated_linearly(varying):
     for tick, force in enumerate((0.0, 10.0, 20.0, 30.0, 40.0)):
         expected = whole.answer(a_reading(tick, force=force))
     for tick in (0, 1, 4):
-        found = gappy.answer(a_reading(tick, force=10.0 * tick))
-    assert found == expected._replace(faults=MISSED_TICK)
+        result = gappy.answer(a_reading(tick, force=10.0 * tick))
+    assert result == expected._replace(faults=MISSED_TICK)
     assert gappy.made_up == 2 and gappy.stale == 0
 
 

@@ -66,19 +66,19 @@ def test_injected_network_faults_have_the_stated_rates():
     assert np.mean(lost) == pytest.approx(1 - 0.9**2, abs=0.04)
     assert sorted(arrived) == sorted(set(np.flatnonzero(~lost)))
     assert arrived != sorted(arrived)
-    held = 1e-9 * np.array(network.held_back)[~lost]
-    assert np.min(held) >= 0.002 and np.max(held) <= 0.006 + 1e-9
-    assert np.mean(held) == pytest.approx(0.004, rel=0.05)
+    held_back = 1e-9 * np.array(network.held_back)[~lost]
+    assert np.min(held_back) >= 0.002 and np.max(held_back) <= 0.006 + 1e-9
+    assert np.mean(held_back) == pytest.approx(0.004, rel=0.05)
 
 
 def test_missed_tick_is_attributed_to_its_cause():
-    met = np.array([1, 0, 0, 0, 0, 1, 0, 0, 0], bool)
+    received = np.array([1, 0, 0, 0, 0, 1, 0, 0, 0], bool)
     overspent = np.array([1, 0, 0, 1, 0, 0, 0, 0, 0], bool)
     round_trip = np.array([1, 5, 0, 9, 9, 1, 3, 0, 6], float)
-    held = np.array([0, 0, 0, 0, 0, 0, 2.5, 1, 2], float)
+    held_back = np.array([0, 0, 0, 0, 0, 0, 2.5, 1, 2], float)
     lost = np.array([0, 0, 1, 0, 0, 0, 0, 0, 0], bool)
     expected = [MET, MACHINE, INJECTED, CONTROLLER, CONTROLLER, MET, INJECTED, INJECTED, MACHINE]
-    assert list(attribute(met, overspent, round_trip, held, lost, 1.0)) == expected
+    assert list(attribute(received, overspent, round_trip, held_back, lost, 1.0)) == expected
 
 
 def test_quantiles_of_no_values_are_nan():
@@ -107,12 +107,12 @@ def test_ideal_restitutions_are_those_of_the_mechanisms_lists():
 
     for name, speed in (("varying", 0.005), ("layered", 0.01)):
         mechanism = load(name).mechanism
-        found = reference_restitutions(mechanism, [over(i, speed) for i in (2, 0, 1, 0)])
-        assert found[1] == found[3]
+        result = reference_restitutions(mechanism, [over(i, speed) for i in (2, 0, 1, 0)])
+        assert result[1] == result[3]
         if name == "layered":
-            assert found == pytest.approx([1.0] * 4, abs=1e-9)
+            assert result == pytest.approx([1.0] * 4, abs=1e-9)
         else:
-            assert found == pytest.approx([0.91641, 0.93984, 0.96463, 0.93984], abs=1e-5)
+            assert result == pytest.approx([0.91641, 0.93984, 0.96463, 0.93984], abs=1e-5)
     assert reference_restitutions(mechanism, []) == []
 
 

@@ -55,8 +55,8 @@ ANSWER = encode_answer(Answer(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
 
 def mutated(packet):
     """Return any bytes: none like a packet, cut, lengthened, or with a few bytes changed."""
-    place = st.integers(0, len(packet) - 1)
-    change = st.lists(st.tuples(place, st.integers(0, 255)), max_size=4)
+    index = st.integers(0, len(packet) - 1)
+    change = st.lists(st.tuples(index, st.integers(0, 255)), max_size=4)
 
     def changed(changes):
         made = bytearray(packet)

@@ -62,21 +62,21 @@ def test_rig_reports_a_short_run(jaxhil, tmp_path):
     path = gain_file(tmp_path)
     # One contact of this gain file's takes most of a second.
     ran = jaxhil("rig", path, "--duration", 2, "--limit", "inf", "--json", "--plot", tmp_path / "rig.png")
-    found = ran.document
-    assert found["empty_loop"]["ticks"] == 400 and found["run"]["ticks"] == 2000
+    result = ran.document
+    assert result["empty_loop"]["ticks"] == 400 and result["run"]["ticks"] == 2000
     assert (tmp_path / "rig.png").stat().st_size > 10_000
-    for loop in (found["empty_loop"], found["run"]):
+    for loop in (result["empty_loop"], result["run"]):
         missed = [loop[f"missed_by_{cause}"] for cause in ("controller", "injection", "machine")]
         assert sum(missed) == loop["missed"] and missed[1] == 0
         assert loop["controller"]["ended"] == "stopped" and loop["controller"]["jax"] is False
         for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
             assert 0 < loop[name]["median"] <= loop[name]["p999"] <= loop[name]["maximum"]
-    assert found["contacts"] and not found["tripped"] and not found["interrupted"]
-    assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
-    for contact in found["contacts"]:
+    assert result["contacts"] and not result["tripped"] and not result["interrupted"]
+    assert result["commanded"]["not_finite"] == result["commanded"]["beyond_limits"] == 0
+    for contact in result["contacts"]:
         assert contact["reference_restitution"] == pytest.approx(1.0, abs=1e-9)
         assert contact["error"] == contact["restitution"] - contact["reference_restitution"]
-    assert ran.code == (0 if found["verdict"] == "good" else 1)
+    assert ran.code == (0 if result["verdict"] == "good" else 1)
 
 
 def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
@@ -87,11 +87,11 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
     ran = jaxhil("rig", path, "--duration", 0.3, "--drops", 0.01, "--jitter", 0.002, "--limit", "inf")
     assert "injected" in ran.out and "missed" in ran.out
     ran = jaxhil("rig", path, "--duration", 1, "--drops", 0.2, "--delay", 0.003, "--limit", "inf", "--json")
-    found = ran.document
-    assert found["run"]["missed_by_injection"] > 100
-    assert found["stroke"] == [-0.01, 0.01]
-    assert -0.01 <= found["commanded"]["lowest"] <= found["commanded"]["highest"] <= 0.01
-    assert found["commanded"]["not_finite"] == found["commanded"]["beyond_limits"] == 0
+    result = ran.document
+    assert result["run"]["missed_by_injection"] > 100
+    assert result["stroke"] == [-0.01, 0.01]
+    assert -0.01 <= result["commanded"]["lowest"] <= result["commanded"]["highest"] <= 0.01
+    assert result["commanded"]["not_finite"] == result["commanded"]["beyond_limits"] == 0
 
 
 def test_rig_that_trips_without_injection_is_bad(jaxhil, tmp_path):
@@ -124,9 +124,9 @@ def test_interrupted_rig_reports_what_it_measured(tmp_path):
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 130, (seen, error)
-    found = json.loads(out)
-    assert found["interrupted"] and found["run"] is None
-    assert 0 < found["empty_loop"]["ticks"] < 12_000
+    result = json.loads(out)
+    assert result["interrupted"] and result["run"] is None
+    assert 0 < result["empty_loop"]["ticks"] < 12_000
     assert "Traceback" not in error
 
 

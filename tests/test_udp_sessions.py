@@ -127,10 +127,10 @@ def test_controller_process_answers_its_rig_and_nobody_else(process):
         assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
     assert stranger.hears_nothing() and guesser.hears_nothing()
     rig.tell(a_reading(0, 99, event=STOP))
-    code, found = served.ended()
-    assert code == 0 and found["ended"] == "stopped" and found["jax"] is False
-    assert found["made_up"] == found["stale"] == 0 and found["ignored"] == 5
-    ticks = found["ticks"]
+    code, result = served.ended()
+    assert code == 0 and result["ended"] == "stopped" and result["jax"] is False
+    assert result["made_up"] == result["stale"] == 0 and result["ignored"] == 5
+    ticks = result["ticks"]
     assert ticks["sequence"] == [10, 11, 12, 13, 14]
     assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
@@ -146,8 +146,8 @@ def test_packet_from_the_rigs_address_without_session_number_is_ignored(process)
     rig.session = own
     assert rig.ask(a_reading(0)).tick == 0
     rig.tell(a_reading(0, 99, event=STOP))
-    code, found = served.ended()
-    assert code == 0 and found["ignored"] == 2 and found["stale"] == 0
+    code, result = served.ended()
+    assert code == 0 and result["ignored"] == 2 and result["stale"] == 0
 
 
 def test_packet_with_wild_number_does_not_block_the_controller(process):
@@ -161,8 +161,8 @@ def test_packet_with_wild_number_does_not_block_the_controller(process):
     rig.tell(a_reading(3, 5000))
     assert rig.ask(a_reading(4, 5001)).tick == 4
     rig.tell(a_reading(0, 99, event=STOP))
-    code, found = served.ended()
-    assert code == 0 and found["stale"] == 6
+    code, result = served.ended()
+    assert code == 0 and result["stale"] == 6
 
 
 def test_replayed_packet_is_dropped(process):
@@ -179,8 +179,8 @@ def test_replayed_packet_is_dropped(process):
     with flood((rig, encode_reading(a_reading(4), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:
             once()
-    code, found = served.ended()
-    assert code == 1 and found["ended"] == "silent" and found["stale"] > 10
+    code, result = served.ended()
+    assert code == 1 and result["ended"] == "silent" and result["stale"] > 10
 
 
 def test_packets_of_strangers_do_not_keep_a_session_alive(process):
@@ -192,8 +192,8 @@ def test_packets_of_strangers_do_not_keep_a_session_alive(process):
     with flood(*garbage, (stranger, encode_reading(a_reading(1), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:
             once()
-    code, found = served.ended()
-    assert code == 1 and found["ended"] == "silent" and found["ignored"] > 40
+    code, result = served.ended()
+    assert code == 1 and result["ended"] == "silent" and result["ignored"] > 40
 
 
 @pytest.mark.parametrize("opened", [False, True])
@@ -204,8 +204,8 @@ def test_controller_process_without_session_ends_whoever_asks_for_one(process, o
     while time.monotonic() < begun + 0.6:
         rig.send(ask_for_session(3) if opened else b"garbage")
         time.sleep(0.02)
-    code, found = served.ended()
-    assert code == 1 and found["ended"] == "silent"
+    code, result = served.ended()
+    assert code == 1 and result["ended"] == "silent"
 
 
 def test_silent_rig_ends_an_empty_loop(process):
@@ -213,8 +213,8 @@ def test_silent_rig_ends_an_empty_loop(process):
     rig = served.rig()
     rig.open()
     assert rig.ask(a_reading(0, 1)).sequence == 1
-    code, found = served.ended()
-    assert code == 1 and found["ended"] == "silent"
+    code, result = served.ended()
+    assert code == 1 and result["ended"] == "silent"
 
 
 def test_restarted_rig_does_not_continue_the_old_session(process):
@@ -226,8 +226,8 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
     for one in (again, rig):  # from another port, and from the same
         one.send(ask_for_session(77))
         assert one.hears_nothing()
-    code, found = served.ended()
-    assert code == 1 and found["ended"] == "silent" and found["ignored"] == 2
+    code, result = served.ended()
+    assert code == 1 and result["ended"] == "silent" and result["ignored"] == 2
 
 
 def test_lost_question_or_answer_is_asked_for_again(process):
@@ -241,8 +241,8 @@ def test_lost_question_or_answer_is_asked_for_again(process):
     with pytest.raises(PacketError):
         decode_session(first, 2)
     rig.tell(a_reading(0, 99, event=STOP))
-    code, found = served.ended()
-    assert code == 0 and found["ignored"] == 1
+    code, result = served.ended()
+    assert code == 0 and result["ignored"] == 1
 
 
 def test_rig_of_another_version_is_ignored(process):

@@ -96,8 +96,8 @@ def test_values_in_the_unit_of_a_list_belong_to_its_first_entry():
     values = draw(mechanism_with("contact.damping", normal), 4096, 1)["contact.damping"]
     np.testing.assert_allclose(values[:, 1], 2.0 * values[:, 0], rtol=1e-15)
     assert stats.kstest(values[:, 0], stats.norm(1.0, 0.1).cdf).pvalue > 0.01
-    own = draw(mechanism_with("contact.damping", normal | {"independent": True}), 4096, 1)
-    assert stats.kstest(own["contact.damping"][:, 1], stats.norm(2.0, 0.1).cdf).pvalue > 0.01
+    independent = draw(mechanism_with("contact.damping", normal | {"independent": True}), 4096, 1)
+    assert stats.kstest(independent["contact.damping"][:, 1], stats.norm(2.0, 0.1).cdf).pvalue > 0.01
     # Nominally undamped contact can get damping.
     undamped = mechanism_with("contact.damping", absolute, contact__damping=[0.0, 0.0])
     values = draw(undamped, 1000, 1)["contact.damping"]
@@ -111,8 +111,8 @@ def test_nested_lists_keep_their_shape():
     assert values.shape == (5, 2, 3)
     factors = values[:, :1, :1] / nominal[0, 0] * np.ones((2, 3))
     np.testing.assert_allclose(values / nominal, factors, rtol=1e-15)
-    own = load("layered", ['uncertainty."contact.stiffness".independent=true']).mechanism
-    values = draw(own, 5, 0)["contact.stiffness"] / nominal
+    independent = load("layered", ['uncertainty."contact.stiffness".independent=true']).mechanism
+    values = draw(independent, 5, 0)["contact.stiffness"] / nominal
     assert values.shape == (5, 2, 3) and len(np.unique(values)) == 30
 
 
@@ -298,8 +298,8 @@ def test_rules_hold_over_the_whole_uncertain_range():
     assert "contact.clearance" in refusal("contact.clearance", factor, **start)
     mixed = {"contact__damping": [0.0, 2.0]}
     assert "0 as the first entry" in refusal("contact.damping", damped, **mixed)
-    own = mechanism_with("contact.damping", damped | {"independent": True}, **mixed)
-    assert np.all(draw(own, 9, 0)["contact.damping"] >= 1.0)
+    independent = mechanism_with("contact.damping", damped | {"independent": True}, **mixed)
+    assert np.all(draw(independent, 9, 0)["contact.damping"] >= 1.0)
 
 
 def test_negative_nominal_value_keeps_its_sign():

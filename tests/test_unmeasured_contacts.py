@@ -37,9 +37,9 @@ def run(made: Mechanism, seed: int = 0):
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_hardware_that_never_touches_is_not_reached(noise):
-    found = run(rig(1.2 * DEEPEST, noise_std=noise))
-    assert found.status == "not reached"
-    for contact in found.contacts:
+    result = run(rig(1.2 * DEEPEST, noise_std=noise))
+    assert result.status == "not reached"
+    for contact in result.contacts:
         assert contact.status == "not reached"
         assert all(math.isnan(number) for number in contact[:9])
 
@@ -51,8 +51,8 @@ def test_model_turned_back_by_a_bias_alone_is_not_reached(noise):
     The first turns the model back 0.09 mm before the surface, the second 0.2 mm behind it.
     """
     for bias in (70.0, 40.0):
-        found = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))
-        assert found.status == "not reached" and math.isnan(found.contacts[0].restitution)
+        result = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))
+        assert result.status == "not reached" and math.isnan(result.contacts[0].restitution)
 
 
 def test_dead_zone_that_hides_the_whole_contact_leaves_it_unreached():
@@ -64,20 +64,20 @@ def test_dead_zone_that_hides_the_whole_contact_leaves_it_unreached():
 
 
 def test_single_reading_is_a_contact():
-    found = run(rig(0.99996 * DEEPEST))
-    assert found.contacts[0].status == "ok" and 0 < found.contacts[0].duration < 2e-3
-    assert np.count_nonzero(found.force_measured[found.contact == 0]) == 1
+    result = run(rig(0.99996 * DEEPEST))
+    assert result.contacts[0].status == "ok" and 0 < result.contacts[0].duration < 2e-3
+    assert np.count_nonzero(result.force_measured[result.contact == 0]) == 1
 
 
 def test_hardware_that_touches_late_is_waited_for():
     """Turn the model back by the virtual spring after 85 ms; the hardware touches after 91 ms."""
-    found = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
-    assert found.contacts[0].status == "ok" and found.contacts[0].peak_force > 0
+    result = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
+    assert result.contacts[0].status == "ok" and result.contacts[0].peak_force > 0
 
 
 @pytest.mark.slow
 def test_impulse_ledger_makes_no_contact_of_its_own():
     """Place the surface where the run does not reach it."""
     made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
-    found = jaxhil.simulate(made, "impulse_ledger")
-    assert found.status in ("not reached", "timeout") and math.isnan(found.contacts[0].restitution)
+    result = jaxhil.simulate(made, "impulse_ledger")
+    assert result.status in ("not reached", "timeout") and math.isnan(result.contacts[0].restitution)

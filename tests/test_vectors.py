@@ -54,8 +54,8 @@ def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
         rows = runs[number]
         assert len(rows) == len(lane.command) > 300
         assert [row.force_measured for row in rows] == lane.signals.force_measured.tolist()
-        expected, found = lane.command, np.array([row.force_command for row in rows])
-        assert np.max(np.abs(found - expected)) <= 1e-13 * np.ptp(expected)
+        expected, result = lane.command, np.array([row.force_command for row in rows])
+        assert np.max(np.abs(result - expected)) <= 1e-13 * np.ptp(expected)
         assert np.array([row.force_simulated for row in rows]) == pytest.approx(expected, rel=0, abs=0)
         begins = np.flatnonzero(lane.signals.age == 0)
         assert rows[0].event == BEGINS and [row.event for row in rows].count(BEGINS) == 1
@@ -126,22 +126,22 @@ def test_vector_text_gives_back_the_same_bits(vectors):
 
 def test_vectors_are_not_compared_where_a_guard_acts(loaded):
     tight = check_document(with_limits(loaded.document, {"force_limit": 20.0}))
-    found = make_vectors(tight, seed=3, draws=2)
-    assert found.reasons == []
-    end = next(i for i, row in enumerate(found.rows) if row.faults)
-    assert found.ended[0] == f"tick {end}: the controller acts on force_limit"
-    nominal = [row for row in found.rows if row.run == 0]
+    result = make_vectors(tight, seed=3, draws=2)
+    assert result.reasons == []
+    end = next(i for i, row in enumerate(result.rows) if row.faults)
+    assert result.ended[0] == f"tick {end}: the controller acts on force_limit"
+    nominal = [row for row in result.rows if row.run == 0]
     assert all(math.isnan(row.force_simulated) for row in nominal[end:])
-    assert not any(math.isnan(row.force_simulated) for row in found.rows[:end])
+    assert not any(math.isnan(row.force_simulated) for row in result.rows[:end])
 
 
 def test_trip_between_two_contacts_ends_the_comparison(loaded):
     """Let the audit, which waits for the force to die out, come with the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
-    found = make_vectors(check_document(with_limits(loaded.document, limits)), seed=3, draws=1)
-    assert found.reasons == []
-    for run, ended in enumerate(found.ended):
-        rows = [row for row in found.rows if row.run == run]
+    result = make_vectors(check_document(with_limits(loaded.document, limits)), seed=3, draws=1)
+    assert result.reasons == []
+    for run, ended in enumerate(result.ended):
+        rows = [row for row in result.rows if row.run == run]
         begins = next(tick for tick, row in enumerate(rows) if row.event == NEXT_CONTACT)
         assert ended == f"tick {begins}: the controller acts on restitution"
         assert [math.isnan(row.force_simulated) for row in rows[begins - 1 : begins + 1]] == [False, True]
@@ -153,19 +153,19 @@ def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
             return super().step(*readings) * (1 + 1e-9)
 
     monkeypatch.setitem(ON_THE_RIG, loaded.compensator, Wrong)
-    found = make_vectors(loaded, seed=3, draws=2)
-    assert len(found.reasons) == 3 and found.reasons[0].startswith("the nominal run, tick ")
-    assert "allowed 1e-11" in found.reasons[1] and found.reasons[1].startswith("draw 1, ")
+    result = make_vectors(loaded, seed=3, draws=2)
+    assert len(result.reasons) == 3 and result.reasons[0].startswith("the nominal run, tick ")
+    assert "allowed 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
 
 
 def test_vectors_of_a_noisy_biased_rig_agree():
     """Leave out the first tick: the loop takes its force as none, whatever the sensor reads."""
     rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
-    found = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
-    assert found.reasons == [] and found.ended == [None, None]
-    assert math.isnan(found.rows[0].force_simulated) and found.rows[0].force_command != 0
-    assert found.rows[0].acceleration == 0
-    assert not math.isnan(found.rows[1].force_simulated)
+    result = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
+    assert result.reasons == [] and result.ended == [None, None]
+    assert math.isnan(result.rows[0].force_simulated) and result.rows[0].force_command != 0
+    assert result.rows[0].acceleration == 0
+    assert not math.isnan(result.rows[1].force_simulated)
 
 
 def test_vector_draws_change_nothing_that_the_gain_file_states(loaded):

@@ -54,12 +54,14 @@ def test_simulated_loop_is_marginal_at_the_limit():
     gains = {"virtual_damping": np.tile(damping, 2), "virtual_stiffness": np.tile(added, 2)}
     leaves = {"force_sensor__delay": np.tile(delay, 2), "control_period": np.repeat([1e-3, 5e-4], 9)}
     coarse, fine = np.split(growth(persistent(spring(), "virtual_contact", 1.5, gains, **leaves)), 2)
-    found = 2 * fine - coarse
+    result = 2 * fine - coarse
     roots = [
         characteristic_root(lambda s, b=b, k=k, t=t: MASS * s**2 + b * s + k + STIFFNESS * cmath.exp(-s * t))
         for b, k, t in zip(damping, added, delay, strict=True)
     ]
     expected = [decay(root) for root in roots]
-    print(np.max(np.abs(found - expected)), found)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-5)
-    assert np.all(np.abs(found[1::3]) < 3e-5) and np.all(found[0::3] > 0.01) and np.all(found[2::3] < -0.01)
+    print(np.max(np.abs(result - expected)), result)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=3e-5)
+    assert (
+        np.all(np.abs(result[1::3]) < 3e-5) and np.all(result[0::3] > 0.01) and np.all(result[2::3] < -0.01)
+    )

@@ -61,8 +61,8 @@ def test_watchdog_between_two_surfaces_with_noise_does_as_calibrated(tmp_path):
     narrow, wide = counted(loaded, [one for one, _ in both], 1024, lanes=128, in_python=12)
     assert narrow.bad > 100 and wide.bad > 4
     for (_, rates), count in zip(both, (narrow, wide), strict=True):
-        found = {"false_alarms": (count.false, count.good), "missed_alarms": (count.missed, count.bad)}
-        for kind, (alarms, runs) in found.items():
+        result = {"false_alarms": (count.false, count.good), "missed_alarms": (count.missed, count.bad)}
+        for kind, (alarms, runs) in result.items():
             _, low, high = binomial_interval(len(alarms), runs)
             stated = rates[kind]
             assert low <= stated["high"] and high >= stated["low"], f"{stated}\n{count}"

@@ -53,14 +53,14 @@ def test_ros2_parameters_are_read_back(made):
     text = ros2_yaml(made)["ros2.yaml"].decode("ascii")
     tree = YAML(typ="safe", pure=True).load(text)
     assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
-    found = tree["/jaxhil_controller"]["ros__parameters"]
+    result = tree["/jaxhil_controller"]["ros__parameters"]
     for section, entries in (("gains", gain_entries(made)), ("limits", limit_entries(made))):
-        assert list(found.get(section, {})) == list(entries)
+        assert list(result.get(section, {})) == list(entries)
         for name, one in entries.items():
-            assert bits(found[section][name]) == bits(one.value)
-            assert found["units"][section][name] == one.unit
-    assert bits(found["control_period"]) == bits(0.001)
-    assert (found["compensator"], found["sha256"]) == ("response_error", made["sha256"])
+            assert bits(result[section][name]) == bits(one.value)
+            assert result["units"][section][name] == one.unit
+    assert bits(result["control_period"]) == bits(0.001)
+    assert (result["compensator"], result["sha256"]) == ("response_error", made["sha256"])
 
 
 @writer_test
@@ -82,12 +82,12 @@ def test_texts_that_look_like_numbers_stay_texts():
     made = gain_document("none")
     made["mechanism"]["name"] = "1e3"
     made["sha256"] = "1234e5"
-    found = YAML(typ="safe", pure=True).load(ros2_yaml(made)["ros2.yaml"])["/jaxhil_controller"][
+    result = YAML(typ="safe", pure=True).load(ros2_yaml(made)["ros2.yaml"])["/jaxhil_controller"][
         "ros__parameters"
     ]
-    assert (found["mechanism"], found["sha256"]) == ("1e3", "1234e5")
+    assert (result["mechanism"], result["sha256"]) == ("1e3", "1234e5")
     # ROS 2 refuses an empty table.
-    assert "gains" not in found and "limits" not in found
+    assert "gains" not in result and "limits" not in result
 
 
 @writer_test
@@ -95,30 +95,30 @@ def test_texts_that_look_like_numbers_stay_texts():
 def test_matlab_struct_is_read_back(made):
     files = matlab(made)
     assert files == matlab(made)
-    found = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
+    result = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
     for name, one in gain_entries(made).items():
-        entry = found["gains"][name]
+        entry = result["gains"][name]
         for key in ("value", "lower", "upper"):
             assert bits(float(entry[key])) == bits(getattr(one, key))
         assert entry["unit"] == one.unit
     for name, one in limit_entries(made).items():
-        assert bits(float(found["limits"][name]["value"])) == bits(one.value)
-        assert found["limits"][name]["unit"] == one.unit
-    assert (found["compensator"], found["sha256"]) == ("response_error", made["sha256"])
-    assert found["control_period"] == 0.001
+        assert bits(float(result["limits"][name]["value"])) == bits(one.value)
+        assert result["limits"][name]["unit"] == one.unit
+    assert (result["compensator"], result["sha256"]) == ("response_error", made["sha256"])
+    assert result["control_period"] == 0.001
 
 
 def mat_elements(content):
     """Yield (type, bytes) of the elements of MATLAB's level 5 format, by its published description."""
-    place = 0
-    while place < len(content):
-        kind, size = struct.unpack_from("<II", content, place)
+    offset = 0
+    while offset < len(content):
+        kind, size = struct.unpack_from("<II", content, offset)
         if kind >> 16:  # a small element: size and type in one word
-            yield kind & 0xFFFF, content[place + 4 : place + 4 + (kind >> 16)]
-            place += 8
+            yield kind & 0xFFFF, content[offset + 4 : offset + 4 + (kind >> 16)]
+            offset += 8
         else:
-            yield kind, content[place + 8 : place + 8 + size]
-            place += 8 + size + (-size % 8)
+            yield kind, content[offset + 8 : offset + 8 + size]
+            offset += 8 + size + (-size % 8)
 
 
 def mat_value(content):
@@ -142,39 +142,39 @@ def test_matlab_struct_follows_the_description_of_the_format():
     content = matlab(made)["gains.mat"]
     assert content[124:128] == b"\x00\x01IM"
     ((kind, matrix),) = mat_elements(content[128:])
-    found = mat_value(matrix)
+    result = mat_value(matrix)
     assert kind == 14
-    assert list(found) == ["compensator", "control_period", "mechanism", "sha256", "gains", "limits"]
+    assert list(result) == ["compensator", "control_period", "mechanism", "sha256", "gains", "limits"]
     for name, one in gain_entries(made).items():
-        assert [bits(x) for x in found["gains"][name]["value"]] == [bits(one.value)]
-        assert found["gains"][name]["unit"] == one.unit
-    assert [one["value"] for one in found["limits"].values()] == [(1e6,), (2.5,)]
+        assert [bits(x) for x in result["gains"][name]["value"]] == [bits(one.value)]
+        assert result["gains"][name]["unit"] == one.unit
+    assert [one["value"] for one in result["limits"].values()] == [(1e6,), (2.5,)]
 
 
 @writer_test
 @given(documents)
 def test_csv_table_is_read_back(made):
     rows = list(csv.DictReader(io.StringIO(csv_table(made)["gains.csv"].decode("ascii"))))
-    found = {row["name"]: row for row in rows}
-    assert len(found) == len(rows)
+    result = {row["name"]: row for row in rows}
+    assert len(result) == len(rows)
     for name, one in gain_entries(made).items():
         for key in ("value", "lower", "upper"):
-            assert bits(float(found[name][key])) == bits(getattr(one, key))
-        assert found[name]["unit"] == one.unit
+            assert bits(float(result[name][key])) == bits(getattr(one, key))
+        assert result[name]["unit"] == one.unit
     for name, one in limit_entries(made).items():
-        row = found[f"limits.{name}"]
+        row = result[f"limits.{name}"]
         assert bits(float(row["value"])) == bits(one.value) and row["unit"] == one.unit
         assert row["lower"] == row["upper"] == ""
-    assert bits(float(found["control_period"]["value"])) == bits(0.001)
+    assert bits(float(result["control_period"]["value"])) == bits(0.001)
 
 
 @pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
 def test_every_compensator_is_written(compensator):
     made = gain_document(compensator)
     text = ros2_yaml(made)["ros2.yaml"]
-    found = YAML(typ="safe", pure=True).load(text)["/jaxhil_controller"]["ros__parameters"]
+    result = YAML(typ="safe", pure=True).load(text)["/jaxhil_controller"]["ros__parameters"]
     values = {name: one["value"] for name, one in made["gains"].items()}
-    assert found.get("gains", {}) == values
+    assert result.get("gains", {}) == values
     mat = loadmat(io.BytesIO(matlab(made)["gains.mat"]), simplify_cells=True)["jaxhil"]
     assert {name: mat["gains"][name]["value"] for name in values} == values
 
