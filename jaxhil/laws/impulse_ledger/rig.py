@@ -48,6 +48,7 @@ FEW_READINGS = 5  # readings in contact; with fewer the status is `unsure`
 LATE = 0.8  # share of the contact that is over at the onset; with more the status is `too_short`
 UNCERTAIN = 0.006  # standard deviation of the reference speed [1]; with more the status is `noisy`
 IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
+LEAST_DAMPING = -0.002  # of the peak force; a damping surely below this fits no contact
 USUAL_PRELOAD = 1.0  # 1/s; prior standard deviation of the preload, in addition to a specified one
 LARGEST_DELAY_SPREAD = 0.004  # s; with more the first order in the delay is not accurate
 MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from the specified one
@@ -276,7 +277,10 @@ class ImpulseLedger(Compensator):
             return NOISY
         spread = reference.spread(self._model.covariance, self._estimate[1])
         if reference.released and (
-            spread > UNCERTAIN or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
+            spread > UNCERTAIN
+            or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
+            # A force that is older than specified, or behind a lag, looks like a damper that drives.
+            or self._model.largest_damping(0.5 * self._deepest) < LEAST_DAMPING * peak
         ):
             return UNEXPLAINED
         return IDENTIFIED if free else SATURATED

@@ -161,6 +161,14 @@ class ContactModel:
             theta[j] = theta[j] if theta[j] > 0.0 else 0.0
         self.theta = theta
 
+    def largest_damping(self, depth: float) -> float:
+        """Return the damping [1/s] at a depth [s], six standard deviations above its mean."""
+        share = depth / REACH
+        low, high = self.covariance[DAMPING], self.covariance[DEPTH_DAMPING]
+        variance = low[DAMPING] + 2.0 * share * low[DEPTH_DAMPING] + share * share * high[DEPTH_DAMPING]
+        damping = self.mean[DAMPING] + share * self.mean[DEPTH_DAMPING]
+        return damping + 6.0 * sqrt(variance) if variance > 0.0 else damping
+
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Return mean [s] and variance [s^2] of the delay after a contact.
 
