@@ -35,7 +35,8 @@ def quiet(kind):
     """Return the rig without noise and quantisation."""
     sensors = ("force_sensor", "position_sensor")
     kept = {
-        one: {k: v for k, v in kind.rig[one].items() if k not in ("noise_std", "quantum")} for one in sensors
+        sensor: {k: v for k, v in kind.rig[sensor].items() if k not in ("noise_std", "quantum")}
+        for sensor in sensors
     }
     return replace(kind, rig={**kind.rig, **kept})
 
@@ -67,7 +68,7 @@ def test_monitor_finds_no_deviation_without_noise(name):
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
     result = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
-    value = np.array([one.value for one in result.contacts])
+    value = np.array([contact.value for contact in result.contacts])
     is_finite = np.isfinite(value).any(axis=0)
     assert is_finite[:4].all() and is_finite[BIAS] == (name != "dead_zone") and not is_finite[NOISE]
     # The generator's lag is a quadrature over a force that begins with a jump.
@@ -79,7 +80,7 @@ def test_monitor_finds_no_deviation_without_noise(name):
 def test_monitor_of_a_matching_rig_scatters_as_predicted():
     result = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
     assert result.state == "good" and result.alarm is None and result.changes == ()
-    z = np.array([one.z for one in result.contacts])
+    z = np.array([contact.z for contact in result.contacts])
     assert z.shape == (6, len(NAMES)) and 0.7 < z.std() < 1.3
     assert "all of 6 contacts" in result.verdict
 
@@ -198,5 +199,5 @@ def test_monitor_refuses_unusable_input_in_one_line(jaxhil, tmp_path, arguments,
     for name, document in (("TWO", two), ("FAR", far), ("OTHER", other)):
         paths[name] = tmp_path / f"{name}.toml"
         paths[name].write_text(to_toml(document))
-    ran = jaxhil("monitor", *(paths.get(one, one) for one in arguments))
+    ran = jaxhil("monitor", *(paths.get(argument, argument) for argument in arguments))
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and words in ran.err

@@ -54,7 +54,7 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
         speeds = np.random.default_rng(seed).choice(SPEEDS, 250)
         result = monitor(contacts("clean", seed, speeds), mechanism)
         alarms, number = alarms + (result.alarm is not None), number + len(result.contacts)
-        z += [one.z for one in result.contacts]
+        z += [contact.z for contact in result.contacts]
     print(f"{alarms} alarms in {number} contacts")
     for name, mean, std in zip(NAMES, np.mean(z, axis=0), np.std(z, axis=0), strict=True):
         print(f"  {name:18s} mean {mean:+.3f}, std {std:.3f} of the predicted")
@@ -71,8 +71,8 @@ def test_monitor_finds_drifts_early(files, number):
         stiffer = monitor(contacts("drifting", seed, speeds), mechanism)
         later = monitor(delayed(seed, speeds, 0.0006), mechanism)
         assert stiffer.state == later.state == "bad"
-        assert "stiffness" in {one.name for one in stiffer.changes}
-        assert "apparent damping" in {one.name for one in later.changes}
+        assert "stiffness" in {change.name for change in stiffer.changes}
+        assert "apparent damping" in {change.name for change in later.changes}
         result["stiffness [%]"].append(15.0 * stiffer.alarm / (number - 1))
         result["force delay [ms]"].append(0.6 * later.alarm / (number - 1))
     for name, reached in result.items():

@@ -89,7 +89,7 @@ def start(pair):
 
 
 def wrenches():
-    """(steps, 6, lanes)."""
+    """Return wrenches (steps, 6, lanes)."""
     wrenches_drawn = np.zeros((STEPS, 6, LANES))
     wrenches_drawn[:, :, PUSHED] = SEEDED.normal(size=(STEPS, 6, 1)) * 50
     return wrenches_drawn

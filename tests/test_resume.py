@@ -195,7 +195,9 @@ def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
         if law == "smith":
             raise KeyboardInterrupt
         figures = {"literature": {"rms": Estimate(0.1, math.nan, 1 / 3)}}
-        return [LawFigures(law, one.mechanism.name, {"literature": {"g": 0.1}}, figures) for one in scenes]
+        return [
+            LawFigures(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures) for scene in scenes
+        ]
 
     def build(mechanisms, settings):
         return [[Scene(one) for one in group] for group in groups if group[0] in mechanisms]

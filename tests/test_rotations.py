@@ -49,50 +49,50 @@ def everything(theta, rate):
 
 
 @pytest.fixture(scope="module")
-def found():
+def results():
     return [np.asarray(part) for part in everything(jnp.asarray(THETA), jnp.asarray(RATE))]
 
 
-def test_exponential_and_rotation_agree_with_scipy(found):
+def test_exponential_and_rotation_agree_with_scipy(results):
     turns = Rotation.from_rotvec(THETA.T)
-    sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * found[0], axis=0))
-    np.testing.assert_allclose(found[0], sign * np.roll(turns.as_quat(), 1, axis=1).T, atol=4e-16)
-    np.testing.assert_allclose(found[1], turns.apply(RATE.T).T, atol=2e-15)
+    sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * results[0], axis=0))
+    np.testing.assert_allclose(results[0], sign * np.roll(turns.as_quat(), 1, axis=1).T, atol=4e-16)
+    np.testing.assert_allclose(results[1], turns.apply(RATE.T).T, atol=2e-15)
     both = turns * Rotation.from_rotvec(RATE.T)
-    np.testing.assert_allclose(found[6], both.apply(RATE.T).T, atol=4e-15)
-    np.testing.assert_allclose(found[5], RATE, atol=2e-15)
-    np.testing.assert_allclose(found[8], RATE, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(results[6], both.apply(RATE.T).T, atol=4e-15)
+    np.testing.assert_allclose(results[5], RATE, atol=2e-15)
+    np.testing.assert_allclose(results[8], RATE, rtol=1e-12, atol=1e-13)
 
 
-def test_logarithm_inverts_the_exponential(found):
-    np.testing.assert_allclose(found[2][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
-    np.testing.assert_allclose(found[7][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
+def test_logarithm_inverts_the_exponential(results):
+    np.testing.assert_allclose(results[2][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
+    np.testing.assert_allclose(results[7][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     # Half a turn in either direction is the same rotation.
-    np.testing.assert_allclose(np.linalg.norm(found[2][:, -1]), np.pi, rtol=1e-15)
-    np.testing.assert_allclose(np.abs(found[2][:, -1] @ AXES[:, -1]), np.pi, rtol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(results[2][:, -1]), np.pi, rtol=1e-15)
+    np.testing.assert_allclose(np.abs(results[2][:, -1] @ AXES[:, -1]), np.pi, rtol=1e-15)
 
 
-def test_left_jacobian_is_the_mean_rotation(found):
+def test_left_jacobian_is_the_mean_rotation(results):
     """Compare with the mean of exp(s theta) over s in [0, 1], the upper right block of an exponential."""
     for column in range(THETA.shape[1]):
         x, y, z = THETA[:, column]
         hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         block = expm(np.block([[hat, np.eye(3)], [np.zeros((3, 6))]]))[:3, 3:]
-        np.testing.assert_allclose(found[3][:, column], block @ RATE[:, column], rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(found[4], RATE, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(results[3][:, column], block @ RATE[:, column], rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(results[4], RATE, rtol=1e-12, atol=1e-13)
 
 
 def test_rotations_of_many_radians_agree_with_scipy():
     """Cover the limits of the series and multiples of half a turn, exactly and next to each."""
     angles = np.r_[np.pi * np.arange(1, 9) + 1e-7, np.pi * np.arange(1, 9) - 1e-7, np.linspace(3, 400, 24)]
-    found = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
+    results = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
     turns = Rotation.from_rotvec((AXES * angles).T)
-    sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * found[0], axis=0))
-    np.testing.assert_allclose(sign * found[0], np.roll(turns.as_quat(), 1, axis=1).T, atol=5e-14)
+    sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * results[0], axis=0))
+    np.testing.assert_allclose(sign * results[0], np.roll(turns.as_quat(), 1, axis=1).T, atol=5e-14)
     crossed = np.cross(AXES.T, RATE.T).T
     along = AXES * np.sum(AXES * RATE, axis=0)
     mean = along + np.sin(angles) / angles * (RATE - along) + (1 - np.cos(angles)) / angles * crossed
-    np.testing.assert_allclose(found[3], mean, atol=1e-13)
+    np.testing.assert_allclose(results[3], mean, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -124,13 +124,13 @@ def test_rotation_derivatives_to_third_order_agree_along_a_ray():
 
     def along(angles):
         theta, turn = angles * axis, exponential(angles * axis)
-        found = (
+        results = (
             rotate(turn, rate),
             logarithm(turn),
             left_jacobian(theta, rate),
             inverse_left_jacobian(theta, rate),
         )
-        return jnp.stack([components(part) for part in found])
+        return jnp.stack([components(part) for part in results])
 
     def slope(function):
         return lambda angles: jax.jvp(function, (angles,), (jnp.ones_like(angles),))[1]

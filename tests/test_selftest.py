@@ -68,7 +68,7 @@ def mutated(source, content):
     index = source.randrange(len(content))
     old = chr(content[index])
     choices = string.digits if old.isdigit() else string.printable
-    new = source.choice([one for one in choices if one != old] + ([""] if not old.isdigit() else []))
+    new = source.choice([choice for choice in choices if choice != old] + ([""] if not old.isdigit() else []))
     return content[:index] + new.encode() + content[index + 1 :], content.count(b"\n", 0, index) + 1
 
 

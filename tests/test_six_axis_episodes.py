@@ -64,15 +64,15 @@ def scenario():
 
 
 @pytest.fixture(scope="module")
-def judged():
+def evaluated():
     given = scenario()
     loop = build_loop(given, **STATIC)
     return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, given))
 
 
-def test_central_episode_is_that_of_one_axis(judged):
+def test_central_episode_is_that_of_one_axis(evaluated):
     expected = package.simulate("claw-350kg", "none").contacts[0]
-    result = judged.metrics
+    result = evaluated.metrics
 
     def of(name):
         return getattr(result, name)[..., 0, CENTRAL]
@@ -91,8 +91,8 @@ def test_central_episode_is_that_of_one_axis(judged):
     np.testing.assert_allclose(of("normal"), [0, 0, 1], atol=1e-12)
 
 
-def test_oblique_episode_has_all_three_error_parts(judged):
-    result = judged.metrics
+def test_oblique_episode_has_all_three_error_parts(evaluated):
+    result = evaluated.metrics
 
     def of(name):
         return getattr(result, name)[..., 0, ASIDE]
@@ -104,9 +104,9 @@ def test_oblique_episode_has_all_three_error_parts(judged):
     assert 100 < of("effective_mass") < 300
 
 
-def test_episode_does_not_depend_on_the_start_of_its_run(judged):
+def test_episode_does_not_depend_on_the_start_of_its_run(evaluated):
     """Expect the same metrics, whichever ticks the check for the end falls on."""
-    for name, figure in judged.metrics._asdict().items():
+    for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-10, err_msg=name)
 
@@ -123,7 +123,7 @@ def followed(loop, given, ticks):
     return seen.forces[0].touch.depth[:, 0], *jax.vmap(of)(seen.states)
 
 
-def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(judged):
+def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(evaluated):
     """Include a bias, by which the wrench never dies out and the numerical model moves before and after."""
     given = scenario()
     depths, own, energy = (
@@ -133,11 +133,11 @@ def test_episode_lasts_from_the_last_free_tick_to_the_first_tick_after(judged):
     # Zero for the delay and two periods, and for the longest waiting time.
     over = touches[-1] + 7 + 100 + 1
     change = energy[over] - energy[model - 1]
-    np.testing.assert_allclose(judged.metrics.energy_change[0, BIASED], change, rtol=1e-10)
+    np.testing.assert_allclose(evaluated.metrics.energy_change[0, BIASED], change, rtol=1e-10)
 
 
-def test_episode_without_contact_is_a_miss(judged):
-    result = judged.metrics
+def test_episode_without_contact_is_a_miss(evaluated):
+    result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, AWAY]] == "miss"
     assert np.isnan(result.energy_error[0, AWAY]) and result.touches[0, AWAY] == 0
-    np.testing.assert_allclose(judged.final_time[AWAY], 0.6)
+    np.testing.assert_allclose(evaluated.final_time[AWAY], 0.6)

@@ -6,13 +6,13 @@ from jaxhil.mechanism.file import load_any, six_axis_names
 from jaxhil.sixdof.units import unit_warnings
 
 
-def told(name, changes):
+def warnings_of(name, changes):
     return unit_warnings(load_any(name, changes | {"uncertainty": {}}).mechanism)
 
 
 @pytest.mark.parametrize("name", six_axis_names())
 def test_six_axis_builtins_are_plausible(name):
-    assert told(name, {}) == ()
+    assert warnings_of(name, {}) == ()
 
 
 @pytest.mark.parametrize(
@@ -37,5 +37,5 @@ def test_six_axis_builtins_are_plausible(name):
     ],
 )
 def test_values_far_from_any_docking_are_reported(changes, reason):
-    warnings = told("probe-drogue", changes)
+    warnings = warnings_of("probe-drogue", changes)
     assert any(reason in warning for warning in warnings), warnings

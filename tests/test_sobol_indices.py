@@ -28,7 +28,7 @@ CASES = {
 }
 
 
-def found(case, number, seed):
+def estimates(case, number, seed):
     function, first_order, _ = CASES[case]
     inputs = len(first_order)
     return sobol_indices(function(saltelli_design(inputs, number, seed)), inputs, number, seed=seed)
@@ -37,7 +37,7 @@ def found(case, number, seed):
 @pytest.mark.parametrize("case", CASES)
 def test_sobol_indices_agree_with_closed_forms(case):
     _, first_order, total = CASES[case]
-    indices = found(case, 4096, seed=0)
+    indices = estimates(case, 4096, seed=0)
     np.testing.assert_allclose(indices.first_order.value, first_order, rtol=0, atol=3e-3)
     np.testing.assert_allclose(indices.total.value, total, rtol=0, atol=3e-3)
     for interval, truth in ((indices.first_order, first_order), (indices.total, total)):
@@ -59,7 +59,7 @@ def test_sobol_intervals_of_repeats_cover(case, number, capsys):
     _, first_order, total = CASES[case]
     inside, widths = [], []
     for seed in range(60):
-        indices = found(case, number, seed)
+        indices = estimates(case, number, seed)
         for interval, truth in ((indices.first_order, first_order), (indices.total, total)):
             inside.append((interval.low <= truth) & (truth <= interval.high))
             widths.append(interval.width)

@@ -194,7 +194,7 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     last = float(binomial_interval(0, NUMBER).high)
     low, high = axes.get_ylim()
     assert low < 0.9 * last and last < 0.9 * high
-    labels = [one.get_label() for one in axes.collections]
+    labels = [collection.get_label() for collection in axes.collections]
     assert f"95 % at a number fixed beforehand, last 0 to {last:.3g}" in labels
 
 

@@ -182,4 +182,4 @@ def test_toy_contact_law_is_simulated_tuned_swept_probed_and_identified(copied, 
     assert probed == "True toy" and perturbed == "400.0 True"
     law, *numbers = identified.split()
     assert law == "toy"
-    assert [float(one) for one in numbers] == pytest.approx([1.066e5, 400.0, 3e-4], rel=0.1)
+    assert [float(number) for number in numbers] == pytest.approx([1.066e5, 400.0, 3e-4], rel=0.1)

@@ -44,7 +44,7 @@ def test_first_contacts_are_those_of_the_closed_loop(name):
     assert [one.restitution for one in result] == [one.restitution for one in wanted]
     assert [one.begun for one in result] == [one.begun for one in wanted]
     # Run after run, cycle through the lists of the mechanism at the nominal speed.
-    numbers = [one.number for one in rig.contacts]
+    numbers = [contact.number for contact in rig.contacts]
     assert len(numbers) > len(wanted)
     assert numbers == [i % mechanism.approach.contacts for i in range(len(numbers))]
     firsts = rig.contacts if name != "rattling" else rig.contacts[:: mechanism.approach.contacts]
@@ -180,10 +180,10 @@ def test_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets)
         return
     assert not rig.tripped and task.status == "ok"
     assert len(rig.forgiven) == 2 and all("missed_tick" in words for words in rig.forgiven)
-    statuses = [one.status for one in rig.contacts]
+    statuses = [contact.status for contact in rig.contacts]
     assert statuses.count("stalled") == 2 and statuses.count("ok") == len(statuses) - 2 > 6
-    assert all(one.oldest_command > 3 for one in rig.contacts if one.status == "stalled")
-    assert all(abs(one.restitution - 0.94) < 0.05 for one in rig.contacts if one.status == "ok")
+    assert all(contact.oldest_command > 3 for contact in rig.contacts if contact.status == "stalled")
+    assert all(abs(contact.restitution - 0.94) < 0.05 for contact in rig.contacts if contact.status == "ok")
 
 
 def test_trip_that_no_stall_explains_is_not_reset(varying):
@@ -218,7 +218,7 @@ def test_failed_sensor_trips_and_the_rig_is_safe(varying):
     rig, _, answers = packets(mechanism, law, 1500, broken)
     rig.finish()
     assert "force_not_finite" in rig.tripped
-    assert [one.status for one in rig.contacts] == ["tripped"]
+    assert [contact.status for contact in rig.contacts] == ["tripped"]
     assert all(math.isfinite(one.position_command) for one in answers) and rig.commanded.not_finite == 0
     last = answers[-1]
     assert last.position_command < 0.0 and last.command_rate == 0.0 and last.force_command == 0.0
