@@ -1,4 +1,4 @@
-"""Commands of README and guide print what stands below them; plots stand below their command."""
+"""Commands of README and guide print what stands below them; numbers stand below their command."""
 
 import os
 import re
@@ -27,8 +27,8 @@ ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_plots_stand_below_the_command_that_prints_them(page):
-    """Look for the command, or the script, between a block of plots and the heading above it."""
+def test_shown_numbers_stand_below_the_command_that_prints_them(page):
+    """Look for the command, or the script, between a block of numbers and the heading above it."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text" and re.search(r"\d\.\d", block[2]):
