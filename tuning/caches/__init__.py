@@ -1,1 +1,1 @@
-"""What is kept on disk lest it be computed twice, and what it follows from besides the input."""
+"""Results and compiled programs on disk, and the fingerprints that tell whether they are still valid."""
