@@ -48,7 +48,8 @@ FEW_READINGS = 5  # readings in contact; with fewer the status is `unsure`
 LATE = 0.8  # share of the contact that is over at the onset; with more the status is `too_short`
 UNCERTAIN = 0.006  # standard deviation of the reference speed [1]; with more the status is `noisy`
 IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
-LEAST_DAMPING = -0.002  # of the peak force; a damping surely below this fits no contact
+MOST_GAIN = 0.01  # energy that a contact may add by the estimates [1]
+LEAST_DAMPING = -0.003  # of the peak force; a damping surely below this fits no contact
 USUAL_PRELOAD = 1.0  # 1/s; prior standard deviation of the preload, in addition to a specified one
 LARGEST_DELAY_SPREAD = 0.004  # s; with more the first order in the delay is not accurate
 MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from the specified one
@@ -279,11 +280,18 @@ class ImpulseLedger(Compensator):
         if reference.released and (
             spread > UNCERTAIN
             or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
-            # A force that is older than specified, or behind a lag, looks like a damper that drives.
-            or self._model.largest_damping(0.5 * self._deepest) < LEAST_DAMPING * peak
+            or self._gains_energy(peak)
         ):
             return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
+
+    def _gains_energy(self, peak: float) -> bool:
+        """Return whether the contact seems to add energy; `peak` is its peak force [1/s].
+
+        A force that is older than specified, or behind a lag, looks like a damper that drives.
+        """
+        gains = self._reference.imbalance() < -MOST_GAIN
+        return gains and self._model.largest_damping(self._deepest) < LEAST_DAMPING * peak
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> float:
         """Return the measured force [N] in a run that began in contact; 0 while the model is outside.
