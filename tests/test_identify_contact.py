@@ -12,8 +12,9 @@ from jaxhil.contact.laws import contact_law
 from tuning.identification import contact_profile
 from tuning.identification.contact import after_gaps, pieces
 from tuning.identification.contact_laws import kelvin_voigt
-from tuning.identification.contact_problem import LONGEST, Problem, Readings
+from tuning.identification.contact_problem import LONGEST, Problem
 from tuning.identification.contact_profile import profile
+from tuning.identification.force_readings import Readings
 from tuning.identification.law_choice import judge, quick
 from tuning.identification.motion import Motion, exponential
 from tuning.identification.rational import STRUCTURES, Model

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from tuning.identification.contact_problem import Readings
 from tuning.identification.estimate import Options, identify
+from tuning.identification.force_readings import Readings
 from tuning.identification.motion import Motion
 
 pytestmark = pytest.mark.benchmark

@@ -18,8 +18,9 @@ from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
 from tuning.caches.worker import setting
 from tuning.identification.contact import ROUGH, ContactFit
-from tuning.identification.contact_problem import Problem, Readings
+from tuning.identification.contact_problem import Problem
 from tuning.identification.contact_profile import profile
+from tuning.identification.force_readings import Readings
 
 FEWEST = 6  # contacts that a bootstrap needs
 FITS = 5  # fits in a chunk, which one worker computes and which is checkpointed

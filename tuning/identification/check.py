@@ -14,9 +14,10 @@ from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import contact as contacts
 from tuning.identification import free_motion, known, two_clocks, validation
 from tuning.identification.contact import ContactFit
-from tuning.identification.contact_problem import LONGEST, Inner, Problem, Readings
+from tuning.identification.contact_problem import LONGEST, Inner, Problem
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.edges import edges
+from tuning.identification.force_readings import Readings
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise, at_rest

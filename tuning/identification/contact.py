@@ -15,8 +15,9 @@ import numpy as np
 
 from tuning.identification import two_clocks, undamped
 from tuning.identification.contact_laws import Law, kelvin_voigt
-from tuning.identification.contact_problem import LONGEST, Problem, Readings
+from tuning.identification.contact_problem import LONGEST, Problem
 from tuning.identification.contact_profile import Posterior, profile
+from tuning.identification.force_readings import Readings
 from tuning.identification.law_choice import Judged, judge, quick
 from tuning.identification.motion import Motion
 from tuning.identification.noise import Noise

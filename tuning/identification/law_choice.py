@@ -23,8 +23,9 @@ from scipy import optimize
 from jaxhil.contact.laws import LAWS
 from jaxhil.contact.regression import Family
 from tuning.identification.contact_laws import Law, kelvin_voigt
-from tuning.identification.contact_problem import COARSE, LONGEST, Problem, Readings
+from tuning.identification.contact_problem import COARSE, LONGEST, Problem
 from tuning.identification.contact_profile import first_plane
+from tuning.identification.force_readings import Readings
 from tuning.identification.motion import Motion
 
 FEWEST = 4  # contacts that cross-validation needs

@@ -16,7 +16,8 @@ import numpy as np
 
 from jaxhil.errors import InputError
 from tuning.identification.contact_laws import Law
-from tuning.identification.contact_problem import LONGEST, Problem, Readings
+from tuning.identification.contact_problem import LONGEST, Problem
+from tuning.identification.force_readings import Readings
 from tuning.identification.law_choice import at_onset, judge, quick
 from tuning.identification.motion import Motion
 from tuning.identification.rational import Model
