@@ -127,6 +127,14 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
     assert not result.good and any("--fix rig.contact_plane" in note for note in result.notes)
 
 
+@pytest.mark.parametrize("law", ["hunt_crossley", "piecewise_linear"])
+def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
+    """Expect an interval of several newtons: 4 N of dead zone are as likely as a surface 33 um off."""
+    campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
+    dead = identify(campaign, options=Options(law=law))["rig.force_sensor.dead_zone"]
+    assert dead.low < 4.0 < dead.high and dead.high - dead.low > 5.0
+
+
 @pytest.mark.slow
 def test_identify_uses_prior_for_missing_motion_or_contact():
     campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)

@@ -222,13 +222,15 @@ def _with_unknown_surface(posterior: Posterior, seed: int) -> Posterior:
     A spring that begins later lacks as much force as a dead zone removes.
     """
     names, draws = posterior.names, posterior.draws.copy()
-    stiffness = next(i for i, name in enumerate(names) if name.startswith("stiffness"))
+    slope = draws[
+        :, names.index("plane") + 1
+    ]  # the first coefficient of every law is its slope at the surface
     lacking = -draws[:, names.index("bias")]
     surface = SURFACE_STD * np.random.default_rng(seed).standard_normal(len(draws))
     # The dead zone is not below 0.
-    surface = np.maximum(surface, -lacking / draws[:, stiffness])
+    surface = np.maximum(surface, -lacking / slope)
     draws[:, names.index("plane")] += surface
-    draws[:, names.index("bias")] -= draws[:, stiffness] * surface
+    draws[:, names.index("bias")] -= slope * surface
     return replace(posterior, draws=draws)
 
 

@@ -277,21 +277,15 @@ class ImpulseLedger(Compensator):
         if reference.spread(self._model.covariance, 0.0) > UNCERTAIN:
             return NOISY
         spread = reference.spread(self._model.covariance, self._estimate[1])
-        if reference.released and (
-            spread > UNCERTAIN
-            or abs(reference.imbalance()) > IMBALANCE + 3.0 * spread
-            or self._gains_energy(peak)
-        ):
-            return UNEXPLAINED
+        if reference.released:
+            imbalance = reference.imbalance()
+            # A force that is older than specified, or behind a lag, looks like a damper that drives.
+            drives = (
+                imbalance < -MOST_GAIN and self._model.largest_damping(self._deepest) < LEAST_DAMPING * peak
+            )
+            if spread > UNCERTAIN or abs(imbalance) > IMBALANCE + 3.0 * spread or drives:
+                return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
-
-    def _gains_energy(self, peak: float) -> bool:
-        """Return whether the contact seems to add energy; `peak` is its peak force [1/s].
-
-        A force that is older than specified, or behind a lag, looks like a damper that drives.
-        """
-        gains = self._reference.imbalance() < -MOST_GAIN
-        return gains and self._model.largest_damping(self._deepest) < LEAST_DAMPING * peak
 
     def _pass_on(self, force: float, position_desired: float, position: float) -> float:
         """Return the measured force [N] in a run that began in contact; 0 while the model is outside.
