@@ -363,6 +363,19 @@ def test_share_of_doubtful_ticks_separates_short_contacts(suite):
         assert most > DOUBTFUL
 
 
+def test_contact_that_seems_to_add_energy_is_unexplained():
+    """The force is 1 ms older than specified; some errors are too small for the test of the energy alone."""
+    nominal = load("suite-noisy").mechanism
+    errors, statuses = [], []
+    for index, mechanism in enumerate(contacts_of("hardening", 6, 10, ("rig.force_sensor.delay=0.009",))):
+        law = controller(mechanism, LAW, literature_gains(nominal, LAW))
+        velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
+        errors.append(abs(abs(velocity[-1]) / velocity[0] - 1))
+        statuses.append(law.last_contact.status)
+    wrong = [status for error, status in zip(errors, statuses, strict=True) if error > 0.015]
+    assert len(wrong) > 2 and "identified" not in wrong
+
+
 class Wrong(NamedTuple):
     """Differences from the nominal mechanism, and those of them that the controller knows."""
 
