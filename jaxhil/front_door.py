@@ -48,6 +48,12 @@ def simulate(
 
     Raises:
         InputError: An argument is invalid.
+
+    Example:
+        >>> import jaxhil
+        >>> run = jaxhil.simulate("rig-300kg", "phase_lead", {"phase_lead": 0.028})
+        >>> round(run.contacts[0].restitution, 2)
+        1.13
     """
     checked = as_any_mechanism(mechanism)
     if isinstance(checked, SixAxisMechanism):

@@ -11,6 +11,7 @@ def rig_model(mechanism: AnyMechanism) -> RigModel:
 
     Example:
         >>> import jaxhil
+        >>> from jaxhil.rig_models import rig_model
         >>> rig_model(jaxhil.load("rig-300kg")).axes
         1
     """

@@ -21,6 +21,7 @@ def names(axes: int = 1) -> tuple[str, ...]:
         axes: number of axes of motion, 1 or 6.
 
     Example:
+        >>> from jaxhil.laws import names
         >>> names(6)
         ('none', 'phase_lead', 'phase_lead_per_axis')
     """

@@ -30,6 +30,11 @@ def load(
 
     Raises:
         InputError: if the file, a key or a value is wrong. The message is one line.
+
+    Example:
+        >>> import jaxhil
+        >>> jaxhil.load("rig-300kg", {"rig.force_sensor.delay": 0.003}).rig.force_sensor.delay
+        0.003
     """
     if not (overrides is None or isinstance(overrides, Mapping)):
         raise InputError(f"overrides: found {shown(overrides)}, allowed a dict from dotted paths to values")

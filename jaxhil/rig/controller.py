@@ -100,6 +100,19 @@ class Controller:
 
         Raises:
             GainFileError: if the document is invalid.
+
+        Example:
+            >>> from jaxhil.rig import Controller, digest
+            >>> document = {
+            ...     "schema": "jaxhil/gains/1",
+            ...     "compensator": "none",
+            ...     "gains": {},
+            ...     "control_period": 0.001,
+            ...     "mechanism": {"rig": {"control_period": 0.001}, "contact": {}},
+            ... }
+            >>> controller = Controller.from_dict(document | {"sha256": digest(document)})
+            >>> controller.step(10.0, 0.001, -0.005, 0.0012)
+            10.0
         """
         return cls(check_gain_document(document))
 

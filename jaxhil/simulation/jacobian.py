@@ -81,6 +81,12 @@ def jacobian(
     Raises:
         InputError: `of` or a key is unknown, a key is not a real number or not finite, or the run is not
             differentiable with respect to it: quantisation, and delays or dead zones that are 0.
+
+    Example:
+        >>> import jaxhil
+        >>> slopes = jaxhil.jacobian("rig-300kg", by="rig.force_sensor.delay")
+        >>> slopes["rig.force_sensor.delay"].shape
+        (1,)
     """
     checked = as_mechanism(mechanism)
     number = check_seed(seed)

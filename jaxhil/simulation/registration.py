@@ -35,6 +35,15 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
     letters, digits and underscores, if the law contains arrays, if gains have no unit or have bounds that do
     not enclose the nominal value (evaluated on the default mechanism), or if the runtime class does not fit
     the law.
+
+    Example:
+        >>> import jaxhil
+        >>> from jaxhil.laws.phase_lead.simulation import PhaseLead
+        >>> class MyLead(PhaseLead):
+        ...     name = "my_lead"
+        >>> jaxhil.register(MyLead())
+        >>> jaxhil.simulate("rig-300kg", "my_lead").compensator
+        'my_lead'
     """
     if not isinstance(law, (Compensator, ContactLaw)):
         found = f"the class {law.__name__}" if isinstance(law, type) else shown(law)

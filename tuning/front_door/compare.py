@@ -114,6 +114,12 @@ def compare(
 
     Raises:
         InputError: If an argument is unusable; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> board = tuning.compare("rig-300kg", ["none", "phase_lead"], untuned=True, judged=8)
+        >>> sorted(board.figures)
+        ['none', 'phase_lead']
     """
     loaded, is_list = arguments.mechanisms(mechanism)
     settings = CompareOptions(compensators=tuple(_names(compensators)), **options)

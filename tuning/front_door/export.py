@@ -116,6 +116,15 @@ def export(
     Raises:
         InputError: If an argument is unusable, the compensator has no runtime, or the folder cannot be
             written; the message has one line.
+
+    Example:
+        >>> import tempfile
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     exported = tuning.export(tuned, folder, formats=["c99"])
+        >>> "gains.json" in exported.sizes
+        True
     """
     settings = ExportOptions(**options)
     check_options(settings)

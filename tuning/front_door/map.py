@@ -108,6 +108,12 @@ def map(
 
     Raises:
         InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> result = tuning.map("rig-300kg", "rig.force_sensor.delay", "contact.stiffness", points=3)
+        >>> result.error.shape
+        (3, 3)
     """
     settings = MapOptions(**options)
     check_options(settings)

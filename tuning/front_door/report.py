@@ -48,6 +48,16 @@ def report(
     Raises:
         InputError: If a path is no result, a result was changed after it was written, or results belong to
             different mechanisms or gains; the message has one line.
+
+    Example:
+        >>> import tempfile
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     tuned.save(f"{folder}/gains.json")
+        ...     page = tuning.report(folder)
+        >>> page.verdict  # gains alone do not show how robust they are: that takes a sweep
+        'unknown'
     """
     arguments.flags(progress=progress)
     listed, _ = arguments.several(results, (str, os.PathLike))

@@ -134,6 +134,12 @@ def sweep(
 
     Raises:
         InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> tuning.sweep(tuned, scenarios=64).verdict
+        'bad'
     """
     settings = SweepOptions(**options)
     settings.check()

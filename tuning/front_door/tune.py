@@ -45,6 +45,14 @@ def tune(
 
     Raises:
         InputError: If an argument is unusable; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> sorted(tuned.gains)
+        ['lead_filter', 'phase_lead']
+        >>> tuned.verdict
+        'bad'
     """
     settings = TuneOptions(compensator=compensator, **options)
     arguments.flags(progress=progress)

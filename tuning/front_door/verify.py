@@ -68,6 +68,12 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
 
     Raises:
         InputError: If there is nothing to read, or the compensator has no runtime; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> tuning.verify(tuned, scenarios=2).good
+        True
     """
     settings = VerifyOptions(**options)
     check_options(settings)
