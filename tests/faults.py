@@ -101,8 +101,8 @@ def serve() -> None:
     import tuning.cli.parser
     import tuning.front_door.sweep
     import tuning.gains.tune_all
-    import tuning.pictures.plots
-    import tuning.sweeps.pictures
+    import tuning.plots.sweep
+    import tuning.plots.tuning_results
     import tuning.sweeps.replay
     import tuning.sweeps.stored_studies
     import tuning.watchdog.calibration  # noqa: F401

@@ -13,9 +13,9 @@ import pytest
 from jaxhil.simulation.contact_plot import save
 from tuning import terminal
 from tuning.benchmark.cost import microseconds_per_tick
-from tuning.benchmark.plots import errors_plot, transparency_plot
 from tuning.benchmark.study import LawFigures
 from tuning.benchmark.tables import HEADINGS, leaderboard, least, mechanism_table, winners
+from tuning.plots.comparison import errors_plot, transparency_plot
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]

@@ -18,7 +18,7 @@ FEW = (0.003, 0.006, 0.012) * 3
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
     """Skip the plots; they have their own tests."""
-    monkeypatch.setattr("tuning.identification.pictures.draw", lambda *_: {})
+    monkeypatch.setattr("tuning.plots.identification.draw", lambda *_: {})
 
 
 @pytest.fixture(scope="module")

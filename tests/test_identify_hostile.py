@@ -17,7 +17,7 @@ PRIOR = "--prior", "rig-300kg"
 
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
-    monkeypatch.setattr("tuning.identification.pictures.draw", lambda *_: {})
+    monkeypatch.setattr("tuning.plots.identification.draw", lambda *_: {})
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import jaxhil
 import tuning
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.reporting import map_grid
-from tuning.reporting.closed_forms import characteristic_root, critical_delay, series
-from tuning.reporting.contact_growth import LINEAR_COMPENSATORS, growth
+from tuning.stability_map import grid
+from tuning.stability_map.closed_forms import characteristic_root, critical_delay, series
+from tuning.stability_map.contact_growth import LINEAR_COMPENSATORS, growth
 
 SOFT = {  # one contact of about 4.8 s; the other motions are almost uniform on this scale
     "approach.contacts": 1, "contact.stiffness": [150.0], "contact.damping": [0.4], "uncertainty": {},
@@ -220,10 +220,10 @@ def test_map_on_a_cluster_is_the_same_to_the_bit(tmp_path):
 
 
 def test_interrupted_map_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(map_grid, "PART", 128)
+    monkeypatch.setattr(grid, "PART", 128)
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 8}
     whole = tuning.map("varying", **asked, folder=tmp_path / "whole")
-    run_part, runs = map_grid.run_part, []
+    run_part, runs = grid.run_part, []
 
     def interrupted(*part):
         if len(runs) == 2:
@@ -232,11 +232,11 @@ def test_interrupted_map_resumes(tmp_path, monkeypatch):
         return run_part(*part)
 
     with monkeypatch.context() as patched:
-        patched.setattr(map_grid, "run_part", interrupted)
+        patched.setattr(grid, "run_part", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tuning.map("varying", **asked, folder=tmp_path / "map")
-    monkeypatch.setattr(map_grid, "run_part", lambda *part: runs.append(part) or run_part(*part))
+    monkeypatch.setattr(grid, "run_part", lambda *part: runs.append(part) or run_part(*part))
     again = tuning.map("varying", **asked, folder=tmp_path / "map", resume=True)
     assert again.document == whole.document
-    assert len(runs) == -(-map_grid.runs(8) // 128)
+    assert len(runs) == -(-grid.runs(8) // 128)
     assert not (tmp_path / "map" / ".pieces").exists()

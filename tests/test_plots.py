@@ -23,7 +23,7 @@ from tuning.gains.pareto import Front, Point
 from tuning.gains.rounds import Start
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune import TuneResult, figures
-from tuning.pictures.plots import errors_plot, front_plot, loss_plot
+from tuning.plots.tuning_results import errors_plot, front_plot, loss_plot
 
 LANES = 40
 

@@ -13,7 +13,8 @@ from matplotlib import image
 
 from jaxhil.rig.limits import LIMITS
 from tuning.bundle.bundle import with_limits
-from tuning.bundle.summary import COLOURS, picture_png, summary_html
+from tuning.bundle.summary import summary_html
+from tuning.plots.bundle_summary import COLOURS, summary_png
 
 FIGURES = {
     "rms": 0.5, "p99": 1.25, "max": 1.5, "mean": 0.375, "diverging": 1.0, "peak_ratio": 1.75,
@@ -134,7 +135,7 @@ def test_summary_is_self_contained_and_reproducible(made, page):
 
 def test_summary_has_one_picture(made, page, tmp_path):
     content = base64.b64decode(page.references[0].partition(",")[2])
-    assert content == picture_png(made)
+    assert content == summary_png(made)
     (tmp_path / "picture.png").write_bytes(content)
     pixels = image.imread(tmp_path / "picture.png")[..., :3]
     assert pixels.shape[1] > 1000 and pixels.shape[1] / pixels.shape[0] > 2.5
@@ -148,8 +149,8 @@ def test_summary_has_one_picture(made, page, tmp_path):
 
 def test_summary_picture_ignores_the_callers_matplotlib_settings(made):
     with matplotlib.rc_context({"figure.constrained_layout.use": True, "font.size": 20}):
-        inside = picture_png(made)
-    assert inside == picture_png(made)
+        inside = summary_png(made)
+    assert inside == summary_png(made)
 
 
 def test_summary_rows_fit_on_one_sheet(page):

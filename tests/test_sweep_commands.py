@@ -146,9 +146,9 @@ KEPT = ("studies/drivers-16.json", "studies/rare-1.6-10x1000.json")
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Options for subset simulation with few samples, and no pictures."""
+    """Options for subset simulation with few samples, and no plots."""
     monkeypatch.setattr("tuning.sweeps.studies.rare_failure", partial(rare_failure, samples=20))
-    monkeypatch.setattr("tuning.sweeps.pictures.write_pictures", lambda *_: [])
+    monkeypatch.setattr("tuning.plots.sweep.write_plots", lambda *_: [])
 
 
 def no_study(monkeypatch, *names):
@@ -203,7 +203,7 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("tuning.sweeps.pictures.write_pictures", interrupted)
+        patched.setattr("tuning.plots.sweep.write_plots", interrupted)
         assert jaxhil(*again, *STUDIES)[:2] == (130, "")
     assert json.loads((folder / "verdict.json").read_text())["verdict"] == "bad"
     with monkeypatch.context() as patched:
@@ -269,11 +269,11 @@ def test_full_disk_costs_no_verdict(jaxhil, own, quick):
 
 
 def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
-    ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "pictures" / "77.png")
+    ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "plots" / "77.png")
     result = document(ran)
     assert ran[0] == 0 and result["verdict"] == "good" and result["different"] == []
     assert result["index"] == 77 and len(result["contacts"]) == 1
-    assert (tmp_path / "pictures" / "77.png").stat().st_size > 10_000
+    assert (tmp_path / "plots" / "77.png").stat().st_size > 10_000
     code, out, _ = jaxhil("replay", store, 0)
     assert code == 0 and "to the bit" in out
 

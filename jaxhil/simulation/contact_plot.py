@@ -81,8 +81,7 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     grid[0, 0].set_ylabel("force on the model [N]")
     grid[1, 0].set_ylabel("position of the model [mm]\n(thin line: a surface)")
     figure.align_ylabels(grid[:, 0])
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
+    legend_below(figure, grid[0, 0])
     return figure
 
 
@@ -114,6 +113,13 @@ def finish(axes: Axes, legend: Any) -> None:
         axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", va="center")
     elif legend is not None:
         axes.legend(loc=legend, fontsize=8, framealpha=0.9)
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int | None = None) -> None:
+    """Draw the legend of one of the axes below all, by default in one row."""
+    handles, labels = axes.get_legend_handles_labels()
+    columns = columns or len(labels)
+    figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize=9, frameon=False)
 
 
 @matplotlib.style.context("default")

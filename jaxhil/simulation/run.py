@@ -26,7 +26,7 @@ from jaxhil.simulation.plausibility import Meaning, check_run, meaning
 from jaxhil.simulation.recording import record_lanes
 from jaxhil.simulation.scenario import build_scenarios
 
-PICTURES = (".png", ".pdf", ".svg")
+PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 class ContactResult(NamedTuple):
@@ -158,8 +158,8 @@ class Run:
         cannot be written.
         """
         target = as_path(path)
-        if target.suffix.lower() not in PICTURES:
-            allowed = f"a name that ends in {', '.join(PICTURES)}"
+        if target.suffix.lower() not in PLOT_SUFFIXES:
+            allowed = f"a name that ends in {', '.join(PLOT_SUFFIXES)}"
             raise InputError(f"plot: found {shown(str(target))}, allowed {allowed}")
         from jaxhil.simulation.contact_plot import contact_plot, save
         from jaxhil.simulation.motion import nominal_motion

@@ -25,7 +25,7 @@ NOT_SIGNED = "not signed"
 NOT_CHECKED = "there is one; only verification with the public key (--key) proves whose"
 PROVED = "by the key given"
 OTHER = "not by the key given, or not of this manifest"
-PICTURE = re.compile(rb'src="data:image/png;base64,([A-Za-z0-9+/=]*)"')
+PLOT = re.compile(rb'src="data:image/png;base64,([A-Za-z0-9+/=]*)"')
 
 # Function that checks the signature of bytes, as `tuning.bundle.signing.verifier` returns it.
 Verifier = Callable[[bytes, bytes], bool]
@@ -116,9 +116,9 @@ def _intact(folder: Path, signed_by: Verifier | None) -> Checked:
 
 
 def _exported(files: Mapping[str, bytes], document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the files that this version exports for the document, with the given vectors and picture."""
-    picture = PICTURE.search(files["summary.html"])
-    drawn = base64.b64decode(picture[1], validate=True) if picture else b""
+    """Return the files that this version exports for the document, with the given vectors and plot."""
+    plot = PLOT.search(files["summary.html"])
+    drawn = base64.b64decode(plot[1], validate=True) if plot else b""
     return bundle_files(document, formats_among(files, document), files["vectors.csv"], drawn)
 
 

@@ -1,6 +1,6 @@
 """Content of the files of a bundle, as this version writes them.
 
-Given the vectors and the picture of the summary, the gain document determines every byte of a bundle.
+Given the vectors and the plot of the summary, the gain document determines every byte of a bundle.
 `export` writes this content, and `verify` compares a bundle with it.
 """
 
@@ -41,7 +41,7 @@ def code_files(compensator: str) -> dict[str, bytes]:
 
 
 def bundle_files(
-    document: Mapping[str, Any], formats: Sequence[str], vectors: bytes, picture: bytes | None = None
+    document: Mapping[str, Any], formats: Sequence[str], vectors: bytes, plot: bytes | None = None
 ) -> dict[str, bytes]:
     """Return all files of the bundle of a checked gain document, by path.
 
@@ -49,7 +49,7 @@ def bundle_files(
         document: the gain document.
         formats: names of the additional formats of the gains.
         vectors: content of vectors.csv.
-        picture: picture of the summary (PNG); None draws it.
+        plot: plot of the summary (PNG); None draws it.
 
     Returns:
         Content of each file by its path in the bundle.
@@ -70,7 +70,7 @@ def bundle_files(
     files = {
         "gains.json": gains.encode("ascii"),
         "vectors.csv": vectors,
-        "summary.html": summary_html(document, picture),
+        "summary.html": summary_html(document, plot),
         **code_files(document["compensator"]),
     }
     for name in formats:

@@ -1,32 +1,17 @@
 """Summary of a bundle on one page: purpose, gains, limits, watchdog, errors, and range of validity.
 
-It is one HTML file with an embedded picture, made for one printed sheet of A4.
+It is one HTML file with an embedded plot, made for one printed sheet of A4.
 """
 
 import base64
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
-import matplotlib.style
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from jaxhil.errors import one_line
-from jaxhil.simulation.contact_plot import BLACK, BLUE, LABELS, ORANGE, VERMILION, finish
+from jaxhil.simulation.contact_plot import LABELS
 from tuning.bundle.writers import Entry, gain_entries, limit_entries
-
-COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
-HATCHES = {"before": "///", "literature": "...", "tuned": ""}
-KEYS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # statistics of |e - e*|
-QUANTITIES = {
-    "contact_frequency": ("contact frequency", "Hz", 1.0),
-    "delay": ("delay", "ms", 1e3),
-    "approach_velocity": ("approach velocity", "mm/s", 1e3),
-    "force": ("contact force", "N", 1.0),
-}
+from tuning.plots.bundle_summary import KEYS, summary_png
 
 # Prefixes of the limits that are fitted numbers of the watchdog's expected restitution.
 FITTED = ("expected_", "softness_", "speed_", "loss_", "reference_")
@@ -47,10 +32,10 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 
 
 def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
-    """Return the page of a checked gain document; `drawn` is its picture (PNG), None to draw it."""
+    """Return the page of a checked gain document; `drawn` is its plot (PNG), None to draw it."""
     mechanism = document["mechanism"]
     name = escape(one_line(mechanism["name"], 80))
-    picture = base64.b64encode(picture_png(document) if drawn is None else drawn).decode("ascii")
+    plot = base64.b64encode(summary_png(document) if drawn is None else drawn).decode("ascii")
     versions = ", ".join(f"{key} {value}" for key, value in document["versions"].items())
     parts = [
         "<!DOCTYPE html>",
@@ -62,7 +47,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
         f"Tuned {escape(one_line(document['created'], 40))}; seed {document['seed']}; "
         f"{escape(one_line(versions, 200))}.<br>",
         f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
-        f'<img alt="Restitution error, and what was tuned over" src="data:image/png;base64,{picture}">',
+        f'<img alt="Restitution error, and what was tuned over" src="data:image/png;base64,{plot}">',
         *_figures(document),
         '<div class="columns"><div>',
         *_gains(document),
@@ -90,88 +75,6 @@ def about(mechanism: Mapping[str, Any]) -> str:
         f"{_number(1e3 * rig['simulator'].get('delay', 0.0))} ms; force sensor delay "
         f"{_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms."
     )
-
-
-@matplotlib.style.context("default")
-def picture_png(document: Mapping[str, Any]) -> bytes:
-    """Draw the restitution error before and after tuning, and the ranges that the gains were tuned over."""
-    figure = Figure(figsize=(9.3, 3.1))
-    FigureCanvasAgg(figure)
-    left = figure.add_axes((0.075, 0.2, 0.48, 0.6))
-    _errors(left, document)
-    spans = [(key, span) for key, span in document["envelope"].items() if _is_span(span)][:4]
-    figure.text(0.61, 0.93, "Tuned over (the gains hold there)", fontsize=10, va="center")
-    if not spans:
-        figure.text(0.61, 0.5, "the gain file does not say", fontsize=9)
-    for number, (key, span) in enumerate(spans):
-        _strip(figure.add_axes((0.63, 0.72 - 0.2 * number, 0.34, 0.06)), key, span)
-    file = io.BytesIO()
-    figure.savefig(file, dpi=160, format="png", metadata={"Software": None})
-    return file.getvalue()
-
-
-def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Draw groups of bars: errors of the nominal run and of fresh scenarios, by gains."""
-    groups = _error_groups(document["figures"])
-    series = [name for name in COLOURS if any(name in values for _, values in groups)]
-    width = 0.8 / max(1, len(series))
-    axes.set_title("Restitution error |e - e*|", fontsize=10, loc="left", y=1.13)
-    for index, name in enumerate(series):
-        heights = [(i, values[name]) for i, (_, values) in enumerate(groups) if name in values]
-        centres = [i + (index - (len(series) - 1) / 2) * width for i, _ in heights]
-        bars = axes.bar(
-            centres, [value for _, value in heights], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
-            edgecolor="white", linewidth=0.4, label=LABELS[name].partition(":")[0],
-        )  # fmt: skip
-        axes.bar_label(bars, [f"{value:.2g}" for _, value in heights], fontsize=6, padding=1)
-    axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
-    axes.tick_params(axis="y", labelsize=8)
-    axes.set_ylabel("|e - e*| [1]", fontsize=9)
-    finish(axes, None)
-    axes.grid(False, axis="x")
-    positive = [value for _, values in groups for value in values.values() if value > 0]
-    if positive:
-        axes.set_yscale("log")
-        axes.set_ylim(min(positive) / 2, max(positive) * 3)
-        axes.legend(
-            loc="lower left", bbox_to_anchor=(0, 0.98), ncols=3, fontsize=8, frameon=False, borderaxespad=0.2
-        )
-
-
-def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Return the label of each group of bars, and the error by gains."""
-    groups = []
-    for kind, key, label in (
-        ("nominal", "rms", "nominal run,\nrms"),
-        *(("robust", key, f"scenarios,\n{text}") for key, text in KEYS.items()),
-    ):
-        errors = figures.get(kind, {})
-        values = {
-            name: statistics[key]
-            for name, statistics in (errors.items() if isinstance(errors, Mapping) else ())
-            if name in COLOURS
-            and isinstance(statistics, Mapping)
-            and isinstance(statistics.get(key), (int, float))
-        }
-        if values:
-            groups.append((label, values))
-    return groups
-
-
-def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
-    """Draw the range of one quantity on its own axis."""
-    name, unit, factor = QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
-    low, high = sorted((factor * span["low"], factor * span["high"]))
-    room = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
-    axes.barh(0, high - low, left=low, height=1, color=BLUE)
-    axes.plot([low, high], [0, 0], linestyle="none", marker="|", color=BLACK, markersize=9)
-    axes.set(xlim=(low - room, high + room), ylim=(-0.9, 0.9), yticks=[])
-    axes.tick_params(axis="x", labelsize=7, pad=1.5)
-    axes.set_title(
-        f"{one_line(name, 30)}: {low:.3g} to {high:.3g} {one_line(unit, 10)}", fontsize=8, loc="left", pad=3
-    )
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
 
 
 def _figures(document: Mapping[str, Any]) -> Iterator[str]:
@@ -329,10 +232,3 @@ def _flat(value: Any) -> Iterator[float]:
     """Yield the numbers of nested lists."""
     for entry in value:
         yield from _flat(entry) if isinstance(entry, (list, tuple)) else (entry,)
-
-
-def _is_span(value: Any) -> bool:
-    """Return whether a value is a range with numbers `low` and `high`."""
-    return isinstance(value, Mapping) and all(
-        isinstance(value.get(key), (int, float)) for key in ("low", "high")
-    )

@@ -25,7 +25,7 @@ from tuning.front_door.options import (
 from tuning.front_door.sweep_options import SweepOptions
 from tuning.front_door.tune_options import TuneOptions
 
-PICTURES = (".png", ".pdf", ".svg")
+PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
 DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
@@ -71,7 +71,7 @@ class Simulate:
     overrides: Overrides = ()
     unset: Unset = ()
     plot: Annotated[
-        str | None, arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
+        str | None, arg(metavar="[FILE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
     ] = None
     animate: Annotated[
         str | None,
@@ -149,7 +149,7 @@ class Replay:
     index: Annotated[Positional[int], arg(metavar="INDEX", help="Number of the scenario.")]
     plot: Annotated[
         str | None,
-        arg(metavar="[PICTURE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
+        arg(metavar="[FILE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
     ] = None
     json: Json = False
     timings: Timings = False

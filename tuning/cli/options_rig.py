@@ -97,7 +97,7 @@ class RigOptions:
     plot: Annotated[
         str | None,
         arg(
-            metavar="[PICTURE]",
+            metavar="[FILE]",
             help=f"Plot latencies to a .png, .pdf or .svg file; bare: {DEFAULT_RIG_PLOT}.",
         ),
     ] = None

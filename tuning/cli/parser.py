@@ -15,7 +15,7 @@ from tyro.conf import subcommand
 from tuning.cli.options import (
     DEFAULT_PLOT,
     DEFAULT_REPLAY_PLOT,
-    PICTURES,
+    PLOT_SUFFIXES,
     Compare,
     Init,
     Mechanisms,
@@ -89,7 +89,7 @@ def complete_bare(arguments: list[str]) -> list[str]:
     for index, word in enumerate(arguments):
         completed.append(word)
         following = arguments[index + 1] if index + 1 < len(arguments) else ""
-        if word == "--plot" and not following.lower().endswith(PICTURES):
+        if word == "--plot" and not following.lower().endswith(PLOT_SUFFIXES):
             completed.append(plot)
         elif word in ("--drivers", "--rare") and not _is_number(following):
             completed.append(str(DEFAULT_DRIVERS) if word == "--drivers" else "0")

@@ -29,10 +29,10 @@ from tuning.front_door.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.reporting.map_grid import Map
+    from tuning.stability_map.grid import Map
 
 SCHEMA = "jaxhil/map/1"
-DOCUMENT, PICTURE = "map.json", "map.png"
+DOCUMENT, PLOT = "map.json", "map.png"
 MOST_POINTS = 1000
 
 
@@ -50,12 +50,12 @@ class StabilityMap:
     def plot(self, path: str | os.PathLike[str]) -> None:
         """Draw the map to a .png, .pdf or .svg file. Raise `InputError` if it cannot be written."""
         from jaxhil.simulation.contact_plot import save
-        from tuning.reporting.map_picture import map_picture
+        from tuning.plots.stability_map import map_plot
 
         title = f"{self.document['mechanism']}, compensation: {self.document['compensator']}"
         target = arguments.folder("path", path)
         with writing(target):
-            save(map_picture(self.found, title, self.document["limit"]), target)
+            save(map_plot(self.found, title, self.document["limit"]), target)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +125,8 @@ def map(
         from jaxhil.laws.compensators import COMPENSATORS
         from jaxhil.simulation.gain_choice import choose_gains
         from tuning.caches.pieces import FOLDER, Pieces
-        from tuning.reporting.map_axes import check_axes, parse_axis
-        from tuning.reporting.map_grid import compute_map, runs
+        from tuning.stability_map.axes import check_axes, parse_axis
+        from tuning.stability_map.grid import compute_map, runs
 
         name, values = choose_gains(checked, compensator, gains)
         law = COMPENSATORS[name]
@@ -166,7 +166,7 @@ def _write(stability_map: StabilityMap, folder: Path) -> None:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / DOCUMENT, terminal.as_json(stability_map.document).encode("ascii"))
-    stability_map.plot(folder / PICTURE)
+    stability_map.plot(folder / PLOT)
 
 
 def _document(

@@ -68,10 +68,10 @@ def report(
         from tuning.reporting.content import requirements, verdict_of
         from tuning.reporting.page import page
         from tuning.reporting.reading import read_results
-        from tuning.reporting.study_sections import pictures
+        from tuning.reporting.study_sections import count_plots
 
         loaded = read_results(paths)
-        with terminal.progress(pictures(loaded), "pictures", progress) as bar:
+        with terminal.progress(count_plots(loaded), "plots", progress) as bar:
             html = page(loaded, bar.turn_to)
         evaluated = requirements(loaded)
         return Report(html, verdict_of(evaluated), [dict(vars(requirement)) for requirement in evaluated])

@@ -220,7 +220,7 @@ def _complete(
 
     Return the errors for files that could not be written, so that a full disk does not cost the verdict.
     """
-    from tuning.sweeps.pictures import write_pictures
+    from tuning.plots.sweep import write_plots
     from tuning.sweeps.run import compare_precisions
     from tuning.sweeps.store import write_verdict
 
@@ -228,7 +228,7 @@ def _complete(
 
     def plots() -> list[str]:
         with sweep_studies.put_off(unwritten):
-            return write_pictures(store, options.acceptable) if keep else []
+            return write_plots(store, options.acceptable) if keep else []
         return []
 
     def write() -> None:

@@ -1,1 +1,1 @@
-"""Stability maps and the report page for a review board."""
+"""Report page for a review board."""

@@ -4,42 +4,36 @@ No script draws them, so they are visible without JavaScript and on paper; a plo
 than 3 MB. The point of a scenario is a link to its plot.
 """
 
-import html
-import io
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import matplotlib.style
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.contact_plot import BLACK, SKY, VERMILION, contact_plot, finish, new_figure
+from jaxhil.simulation.contact_plot import contact_plot
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.motion import nominal_motion
 from jaxhil.sixdof.run import simulate_six_axes
-from tuning.identification.pictures import compare
-from tuning.pictures.six_axes import six_axes_plot
-from tuning.reporting.closed_forms import ClosedForms
-from tuning.reporting.contact_growth import Growth
-from tuning.reporting.documents import AxisOfMap, Identification, MapDocument, WorstScenario
-from tuning.reporting.map_axes import MapAxis
-from tuning.reporting.map_grid import Map, Margin, Nominal, Radii
-from tuning.reporting.map_picture import map_picture
+from tuning.identification.monitor.figures import FIGURES
+from tuning.plots.identification import compare
+from tuning.plots.monitor import monitor_plot
+from tuning.plots.parts import as_svg
+from tuning.plots.scenarios import linked_scenarios
+from tuning.plots.six_axes import six_axes_plot
+from tuning.plots.stability_map import map_plot
+from tuning.reporting.documents import AxisOfMap, Identification, MapDocument, Monitoring, WorstScenario
+from tuning.stability_map.axes import MapAxis
+from tuning.stability_map.closed_forms import ClosedForms
+from tuning.stability_map.contact_growth import Growth
+from tuning.stability_map.grid import Map, Margin, Nominal, Radii
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.pictures import plain_ticks
-from tuning.sweeps.regions import Points, add_rows, empty_regions, make_plan
+from tuning.sweeps.regions import Points, read_regions
 from tuning.sweeps.replay import motion_of
-from tuning.sweeps.store import Store, kept_part
+from tuning.sweeps.store import Store
 
 TYPICAL = 6  # number of scenarios with plots besides the worst, at equal distances in the order of errors
 ESTIMATE = ("key", "value", "unit", "std", "low", "high", "prior")  # fields of an estimate in its plot
-IDENTIFIER = re.compile(r'<g id="[^"]*"')
-LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
 
 class Drawing(NamedTuple):
@@ -84,7 +78,7 @@ def _nominal_in_space(subject: LoadedGains) -> Drawing:
 def map_drawing(document: MapDocument) -> Drawing:
     """Draw the stability map of a document."""
     title = f"{document.mechanism}, compensation: {document.compensator}"
-    figure = map_picture(_map_of(document), title, np.inf if document.limit is None else document.limit)
+    figure = map_plot(_map_of(document), title, np.inf if document.limit is None else document.limit)
     says = f"Restitution error over {document.x.key} and {document.y.key}"
     return Drawing(as_svg(figure), says, f"{says}, under gains that stay the same.")
 
@@ -97,25 +91,37 @@ def estimates_drawing(document: Identification) -> Drawing:
     return Drawing(as_svg(compare(entries)), says, f"{says}.")
 
 
+def monitor_drawing(document: Monitoring) -> Drawing:
+    """Draw all metrics over the number of the contact."""
+    numbers = [contact.contact for contact in document.contacts]
+    metrics = {name: _columns(document, name) for name, *_ in FIGURES}
+    figure = monitor_plot(document.mechanism, numbers, metrics, document.since)
+    says = "Figures of every contact over its number, with their predicted range"
+    return Drawing(as_svg(figure), says, f"{says}, 95 % of contacts of the rig of the file.")
+
+
+def _columns(document: Monitoring, name: str) -> np.ndarray:
+    """Return value, predicted standard deviation, and z of a metric, (3, contacts); NaN if unknown."""
+    rows = []
+    for contact in document.contacts:
+        metric = contact.figures.get(name)
+        rows.append((None,) * 3 if metric is None else (metric.value, metric.predicted_std, metric.z))
+    return np.array(rows, float).reshape(-1, 3).T
+
+
 def sweep_drawings(
     store: Store, worst: Sequence[WorstScenario], say: Callable[[str], None]
 ) -> tuple[Drawing, list[Trace]]:
     """Draw the errors of scenarios as points, and the runs of the worst and of some others."""
     sweep = build_sweep(store.manifest)
-    plan = regions = None
-    for part in range(store.manifest.parts):
-        rows = kept_part(store, part)
-        if rows is None:
-            break
-        plan = plan or make_plan(store.manifest, sweep.mechanism, rows)
-        regions = add_rows(plan, regions or empty_regions(plan), rows)
+    plan, regions = read_regions(store, sweep.mechanism)
     assert plan is not None and regions is not None
     points = regions.points
     texts = {entry.index: _ended(entry.outcome, entry.worst_error, entry.worst_contact) for entry in worst}
     for position in _typical(points):
         texts.setdefault(int(points.index[position]), f"|e - e*| at most {points.size[position]:.4g}")
     name = sweep.mechanism.name
-    figure = _points_figure(name, plan.per_scenario, points, store.manifest.limit, list(texts))
+    figure = linked_scenarios(name, plan.per_scenario, points, store.manifest.limit, list(texts))
     caption = "Scenarios of the sweep. A ringed one leads to its trace below."
     drawing = Drawing(as_svg(figure, texts), "Worst error of scenarios over the inputs drawn", caption)
     traces = []
@@ -127,64 +133,6 @@ def sweep_drawings(
         )
         traces.append(Trace(index, text, run_drawing))
     return drawing, traces
-
-
-@matplotlib.style.context("default")
-def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
-    """Return a figure as an SVG element; the link to a scenario has its text in `points`."""
-    content = io.StringIO()
-    FigureCanvasSVG(figure)
-    # A fixed salt makes equal figures give equal elements, with names that depend on their content.
-    with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
-        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
-    svg = content.getvalue()
-    svg = IDENTIFIER.sub("<g", svg[svg.index("<svg") :])
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
-
-    def link(match: re.Match[str]) -> str:
-        index = int(match[1])
-        label = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
-        return f'<a href="#scenario-{index}" aria-label="{label}"><title>{label}</title>'
-
-    return LINK.sub(link, svg).replace("xlink:href", "href")
-
-
-@matplotlib.style.context("default")
-def _points_figure(
-    name: str, inputs: Sequence[Any], points: Points, limit: float | None, linked: Sequence[int]
-) -> Figure:
-    """Draw the worst error of scenarios over each input, with rings around the linked scenarios."""
-    number = max(1, len(inputs))
-    figure = new_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
-    panels: Any = figure.subplots(1, number, squeeze=False)[0]
-    positions = {int(index): column for column, index in enumerate(points.index)}
-    rings_at = [positions[index] for index in linked if index in positions]
-    finite = points.size[np.isfinite(points.size) & (points.size > 0)]
-    high = 1.5 * max([*finite, limit or 0.0, 1e-6])
-    errors = np.clip(np.where(np.isfinite(points.size), points.size, high), 1e-4 * high, None)
-    for column, axes in enumerate(panels):
-        across = points.inputs[column] if inputs else points.index
-        for mask, label, colour, marker in (
-            (~points.failed, "not failed", SKY, "."), (points.failed, "failed", VERMILION, "x"),
-        ):  # fmt: skip
-            if np.any(mask):
-                axes.plot(across[mask], errors[mask], linestyle="none", marker=marker, markersize=3,
-                          color=colour, label=label, rasterized=True)  # fmt: skip
-        rings = axes.scatter(across[rings_at], errors[rings_at], s=55, facecolors=(1, 1, 1, 0.6),
-                             edgecolors=BLACK, linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
-        rings.set_urls([f"#scenario-{int(points.index[position])}" for position in rings_at])
-        if limit:
-            axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
-        label = inputs[column].label if inputs else "scenario [1]"
-        axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
-        plain_ticks(axes.yaxis, *axes.get_ylim())
-        if inputs and inputs[column].logarithmic:
-            axes.set_xscale("log")
-            plain_ticks(axes.xaxis, *axes.get_xlim())
-        finish(axes, None)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
-    return figure
 
 
 def _typical(points: Points) -> list[int]:

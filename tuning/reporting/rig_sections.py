@@ -6,8 +6,7 @@ from jaxhil.errors import one_line
 from tuning.identification.monitor.figures import FIGURES
 from tuning.reporting.content import Section, Table, is_identified, is_of_another_file, number
 from tuning.reporting.documents import Estimate, MonitoredFigure
-from tuning.reporting.drawings import estimates_drawing
-from tuning.reporting.monitor_drawing import monitor_drawing
+from tuning.reporting.drawings import estimates_drawing, monitor_drawing
 from tuning.reporting.reading import Results
 
 MOST_ROWS = 60  # largest number of contacts in the table

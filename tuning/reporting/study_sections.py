@@ -22,7 +22,7 @@ TRANSPARENCY = (
 )
 
 
-def pictures(results: Results) -> int:
+def count_plots(results: Results) -> int:
     """Return the largest number of plots that a report may have."""
     scenarios = 0 if results.sweep is None or results.axes == 6 else len(results.sweep.worst) + TYPICAL + 1
     return (results.subject is not None) + scenarios + (results.map is not None)

@@ -16,6 +16,7 @@ from jaxhil.simulation.metrics import OK, STATUS_NAMES
 from tuning.statistics.quantiles import BINS, EDGES, binned_estimate
 from tuning.sweeps.columns import STATUSES, Slot, input_names, slots, unit_of
 from tuning.sweeps.manifest import Manifest
+from tuning.sweeps.store import Store, kept_part
 from tuning.sweeps.tally import error_sizes
 
 Rows = Mapping[str, np.ndarray]
@@ -91,6 +92,21 @@ class Regions(NamedTuple):
     @property
     def failed(self) -> int:
         return int(np.sum(self.failures))
+
+
+def read_regions(store: Store, mechanism: AnyMechanism) -> tuple[Plan | None, Regions | None]:
+    """Return the statistics of the parts before the first missing one; None if that is the first.
+
+    One part is read at a time.
+    """
+    plan = regions = None
+    for part in range(store.manifest.parts):
+        rows = kept_part(store, part)
+        if rows is None:
+            break
+        plan = plan or make_plan(store.manifest, mechanism, rows)
+        regions = add_rows(plan, regions or empty_regions(plan), rows)
+    return plan, regions
 
 
 def make_plan(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> Plan:

@@ -1,14 +1,12 @@
-"""Replay of one scenario of a store, identical to the bit, with a plot of its motion."""
+"""Replay of one scenario of a store, identical to the bit, and its motion at every tick."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.contact_plot import contact_plot
 from jaxhil.simulation.motion import Piece, scenario_motion
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
 from tuning.sweeps.draws import drawn_scenarios
@@ -38,15 +36,6 @@ def replay(store: Store, index: int) -> Replay:
     sweep = build_sweep(store.manifest)
     again = run_chunk(sweep, index, 1)
     return Replay(sweep, stored, again, same_rows(stored, again))
-
-
-def picture_of(sweep: Sweep, index: int, title: str) -> Figure:
-    """Plot the scenario's motion at every tick, for one axis or six."""
-    if sweep.model.axes == 1:
-        return contact_plot(motion_of(sweep, index), title, sensors="rig")
-    from tuning.pictures.six_axes import six_axes_plot
-
-    return six_axes_plot(recorded(sweep, index), title)
 
 
 def motion_of(sweep: Sweep, index: int) -> list[Piece]:

@@ -31,7 +31,7 @@ from tuning.sweeps.manifest import NAME, Manifest, differences, encode, other_co
 from tuning.sweeps.parts import decode_part, encode_part
 
 PARTS = "parts"
-PICTURES = ("errors.png", "failures.png", "convergence.png")  # plots made from the rows
+PLOTS = ("errors.png", "failures.png", "convergence.png")  # plots made from the rows
 STUDIES = "studies"
 VERDICT = "verdict.json"
 LOCK = ".lock"

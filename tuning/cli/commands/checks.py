@@ -14,7 +14,7 @@ from typing import Any
 
 from jaxhil.errors import InputError, one_line, shown
 from jaxhil.files import follow, open_plain, remove_stale, writing
-from tuning.cli.options import PICTURES
+from tuning.cli.options import PLOT_SUFFIXES
 
 # Names that Windows reserves for devices, with any ending; results may be copied to such a system.
 DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)
@@ -22,10 +22,12 @@ LONGEST_NAME = 120  # bytes of a folder's name; file systems allow 255, some too
 MOST_NAMES = 3  # largest number of names in a message
 
 
-def picture(path: str) -> None:
+def check_plot(path: str) -> None:
     """Check that a plot can be written to `path`; create its parent folders."""
-    if Path(path).suffix.lower() not in PICTURES:
-        raise InputError(f"--plot: found {shown(path)}, allowed a name that ends in {', '.join(PICTURES)}")
+    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
+        raise InputError(
+            f"--plot: found {shown(path)}, allowed a name that ends in {', '.join(PLOT_SUFFIXES)}"
+        )
     file(path)
 
 
@@ -67,14 +69,14 @@ def _is_permitted(character: str) -> bool:
 
 
 def own_results(
-    document: Path, mark: str, pictures: Sequence[str], mechanisms: Collection[str] = ()
+    document: Path, mark: str, plots: Sequence[str], mechanisms: Collection[str] = ()
 ) -> dict[str, Any]:
     """Check that the files to be replaced come from an earlier run, and return the earlier document.
 
     Args:
         document: path of the document, a JSON object.
         mark: key that an earlier document has.
-        pictures: file names of the plots beside the document.
+        plots: file names of the plots beside the document.
         mechanisms: names of the mechanisms that the document may be about; empty for any.
 
     Returns:
@@ -85,7 +87,7 @@ def own_results(
     """
     with writing(document):
         os.fsencode(document)  # raises an error if the locale cannot encode the path
-    names = [name for name in (document.name, *pictures) if os.path.lexists(document.parent / name)]
+    names = [name for name in (document.name, *plots) if os.path.lexists(document.parent / name)]
     earlier = _read(document)
     if names and mark not in earlier:
         where = one_line(str(document.parent / names[0]))

@@ -14,7 +14,7 @@ from tuning.cli.commands.resuming import pieces_in, say_of_pieces
 from tuning.cli.options import Compare
 from tuning.front_door.compare import board, check_names, compare_each
 
-PICTURES = ("errors.png", "honesty.png")
+PLOTS = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
@@ -28,7 +28,7 @@ def run(options: Compare) -> int:
     folder = Path(options.output)
     checks.output(folder)
     names = [entry.mechanism.name for entry in loaded]
-    checks.own_results(folder / "compare.json", "mechanisms", PICTURES, names)
+    checks.own_results(folder / "compare.json", "mechanisms", PLOTS, names)
     prepare()
     from tuning.benchmark.study import Failed
     from tuning.transparency.pushes import PUSHES
@@ -104,10 +104,10 @@ def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dic
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
     """Draw the plots of errors and transparency."""
     from jaxhil.simulation.contact_plot import save
-    from tuning.benchmark.plots import errors_plot, transparency_plot
+    from tuning.plots.comparison import errors_plot, transparency_plot
 
     figures = errors_plot(names, ordered, options.limit), transparency_plot(names, ordered)
-    for name, figure in zip(PICTURES, figures, strict=True):
+    for name, figure in zip(PLOTS, figures, strict=True):
         save(figure, Path(options.output) / name)
 
 
@@ -141,6 +141,6 @@ def _print(
         "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
         "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",
         "than the 95 % intervals.",
-        f"wrote {options.output}/compare.json" + (" and pictures" if names else ""),
+        f"wrote {options.output}/compare.json" + (" and plots" if names else ""),
         "",
     )

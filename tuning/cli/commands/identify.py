@@ -23,7 +23,7 @@ from tuning.identification.records import UNNAMED, Campaign
 SCHEMA = "jaxhil/identification/1"
 MOST_ORDER = 4
 MECHANISM, DOCUMENT = "mechanism.toml", "identification.json"
-PICTURES = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
+PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
 
 def run(options: Identify) -> int:
@@ -44,7 +44,7 @@ def run(options: Identify) -> int:
     folder = Path(options.output)
     checks.output(folder)
     name = UNNAMED if prior is None else prior.name
-    earlier = checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PICTURES), [name])
+    earlier = checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PLOTS), [name])
     from tuning.identification.bootstrap import FITS
     from tuning.identification.estimate import STAGES, Options, identify
 
@@ -171,10 +171,10 @@ def _check(options: Identify, logs: list[Path]) -> int:
 def _draw(result, document: dict[str, Any], folder: Path) -> None:
     """Draw the plots, and delete those of an earlier run that this run does not draw."""
     from jaxhil.simulation.contact_plot import save
-    from tuning.identification import pictures
+    from tuning.plots.identification import draw
 
-    figures = pictures.draw(result, document["estimates"])
-    for name in PICTURES:
+    figures = draw(result, document["estimates"])
+    for name in PLOTS:
         with writing(folder / name):
             if name in figures:
                 save(figures[name], folder / name)
@@ -323,9 +323,7 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
         for pair in document["confounded"]
     ]
     wrote = (
-        []
-        if folder is None
-        else [f"Wrote {folder / MECHANISM}, {folder / DOCUMENT} and pictures beside them"]
+        [] if folder is None else [f"Wrote {folder / MECHANISM}, {folder / DOCUMENT} and plots beside them"]
     )
     terminal.emit(*items, f"{document['reason']}.", *wrote)
 

@@ -12,7 +12,7 @@ from tuning.cli.commands import checks
 from tuning.cli.commands.choice import chosen, named
 from tuning.cli.options_report import Map
 from tuning.front_door import meaning
-from tuning.front_door.map import DOCUMENT, PICTURE, MapOptions, map
+from tuning.front_door.map import DOCUMENT, PLOT, MapOptions, map
 from tuning.front_door.options import check_options
 
 
@@ -24,7 +24,7 @@ def run(options: Map) -> int:
     checks.output(target)
     prepare()
     mechanism, compensator, gains = chosen(options, mechanism)
-    checks.own_results(target / DOCUMENT, "theory", [PICTURE], [mechanism.name])
+    checks.own_results(target / DOCUMENT, "theory", [PLOT], [mechanism.name])
     settings = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
     stability_map = map(
         mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **settings
@@ -34,7 +34,7 @@ def run(options: Map) -> int:
         terminal.emit_json(stability_map.document)
     else:
         terminal.emit(*_lines(stability_map.document))
-        terminal.emit_line(f"Wrote {one_line(str(target / DOCUMENT))} and {PICTURE}")
+        terminal.emit_line(f"Wrote {one_line(str(target / DOCUMENT))} and {PLOT}")
     return 0
 
 

@@ -19,10 +19,10 @@ def run(options: Replay) -> int:
     """Run the scenario and print its contacts; return 0 if all numbers equal the stored ones, else 1."""
     arguments.integers(0, index=options.index)
     if options.plot is not None:
-        checks.picture(options.plot)
+        checks.check_plot(options.plot)
     prepare()
     from tuning.sweeps.manifest import unlike_here
-    from tuning.sweeps.replay import picture_of, replay
+    from tuning.sweeps.replay import replay
     from tuning.sweeps.store import read_store
 
     store = read_store(Path(options.store))
@@ -31,9 +31,10 @@ def run(options: Replay) -> int:
     document["unlike"] = unlike_here(store.manifest)
     if options.plot is not None:
         from jaxhil.simulation.contact_plot import save
+        from tuning.plots.scenarios import scenario_plot
 
         title = f"{document['mechanism']}, scenario {options.index} of {store.folder.resolve().name}"
-        save(picture_of(result.sweep, options.index, title), follow(options.plot))
+        save(scenario_plot(result.sweep, options.index, title), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(document)

@@ -24,7 +24,7 @@ def run(options: RigOptions) -> int:
     arguments.integers(0, seed=options.seed)
     _check_injection(options)
     if options.plot is not None:
-        checks.picture(options.plot)
+        checks.check_plot(options.plot)
     gains = arguments.readable_gain_file(options.path)
     document, mechanism = load(gains)
     check_bundle_code(Path(options.path), document["compensator"])
@@ -63,7 +63,7 @@ def run(options: RigOptions) -> int:
     result = judge(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
         from jaxhil.simulation.contact_plot import save
-        from tuning.rig.plot import latency_plot
+        from tuning.plots.latency import latency_plot
 
         title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
         save(latency_plot(session, title, period), follow(options.plot))

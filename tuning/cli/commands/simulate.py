@@ -25,7 +25,7 @@ def run(options: Simulate) -> int:
     arguments.limit(options.limit)
     arguments.integers(0, seed=options.seed)
     if options.plot is not None:
-        checks.picture(options.plot)
+        checks.check_plot(options.plot)
     if options.log is not None:
         checks.file(options.log)
     mechanism = named_any(options)

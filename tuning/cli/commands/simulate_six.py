@@ -120,14 +120,14 @@ def _write(options: Simulate, result: "SixAxisRun") -> None:
     if options.plot is not None:
         from jaxhil.files import follow, writing
         from jaxhil.simulation.contact_plot import save
-        from tuning.pictures.six_axes import six_axes_plot
+        from tuning.plots.six_axes import six_axes_plot
 
         with writing(options.plot):
             save(six_axes_plot(result.ticks, title), follow(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.animate is not None:
         from jaxhil.files import follow, writing
-        from tuning.pictures.animation import animate
+        from tuning.plots.animation import animate
 
         with writing(options.animate):
             animate(result.ticks, title, follow(options.animate))

@@ -23,7 +23,7 @@ from tuning.front_door.tuned_gains import TunedGains
 if TYPE_CHECKING:
     from tuning.caches.pieces import Pieces
 
-PICTURES = ("errors.png", "contact.png", "loss.png", "pareto.png")
+PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW = "overview.png"
 MOST_DRAWN = 4  # largest number of mechanisms with plots each; more mechanisms share one plot
 
@@ -88,7 +88,7 @@ def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
     checks.output(output)
     for mechanism in mechanisms:
         path = output / folder_name(mechanism.name) / "gains.json"
-        earlier = checks.own_results(path, "compensator", PICTURES, [mechanism.name])
+        earlier = checks.own_results(path, "compensator", PLOTS, [mechanism.name])
         if earlier and earlier.get("mechanism") != to_builtins(mechanism):
             name = shown(mechanism.name)
             terminal.warn([f"{one_line(str(path))}: replaced: it is of another mechanism of the name {name}"])
@@ -205,7 +205,7 @@ def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], 
     """Print the table of all mechanisms, and draw one common plot if they have no plots each."""
     if not drawn:
         from jaxhil.simulation.contact_plot import save
-        from tuning.pictures.plots import overview_plot
+        from tuning.plots.tuning_results import overview_plot
 
         save(overview_plot(results, options.limit), Path(options.output) / OVERVIEW)
     if not options.json:
@@ -288,7 +288,7 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
     from jaxhil.laws.compensators import literature_gains
     from jaxhil.simulation.motion import prepare_motion
     from tuning.gains.tune import uncompensated
-    from tuning.pictures import plots  # noqa: F401
+    from tuning.plots import tuning_results  # noqa: F401
 
     gains = literature_gains(mechanism, compensator)
     prepare_motion(mechanism, {"before": uncompensated(compensator, gains), "tuned": (compensator, gains)})
@@ -304,7 +304,7 @@ def _draw(result, options: Tune, folder: Path) -> list[str]:
     from jaxhil.simulation.contact_plot import contact_plot, save
     from jaxhil.simulation.motion import nominal_motion
     from tuning.gains.tune import uncompensated
-    from tuning.pictures.plots import errors_plot, loss_plot, two_errors_plot
+    from tuning.plots.tuning_results import errors_plot, loss_plot, two_errors_plot
 
     name, compensator = result.mechanism.name, options.compensator
     if isinstance(result.mechanism, Mechanism):

@@ -85,7 +85,7 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
 def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
     """Write a gain file for each point and the plot of all, and return the entry for `--json`."""
     from jaxhil.simulation.contact_plot import save
-    from tuning.pictures.plots import front_plot
+    from tuning.plots.tuning_results import front_plot
 
     front, result, entries = points[0].front, points[0].tuned.found, []
     for number, point in enumerate(points, start=1):

@@ -9,13 +9,13 @@ from matplotlib.colors import LinearSegmentedColormap, SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from jaxhil.errors import one_line
 from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, SKY, VERMILION, finish, new_figure
-from tuning.reporting.map_axes import MapAxis
-from tuning.reporting.map_grid import Map
-from tuning.sweeps.pictures import plain_ticks
+from tuning.plots.parts import set_scale
+from tuning.stability_map.axes import MapAxis
+from tuning.stability_map.grid import Map
 from tuning.sweeps.regions import NAMES, UNITS
 
 STEPS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
@@ -25,7 +25,7 @@ PALE = "#F7CF85"  # orange on which black lines are visible
 
 
 @matplotlib.style.context("default")
-def map_picture(stability_map: Map, title: str, limit: float) -> Figure:
+def map_plot(stability_map: Map, title: str, limit: float) -> Figure:
     """Draw the signed error in colours with contours, those of theory, and the nominal point with margins."""
     figure = new_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
@@ -43,11 +43,7 @@ def map_picture(stability_map: Map, title: str, limit: float) -> Figure:
         # A key is text, not a formula.
         label = f"{NAMES.get(axis.key, one_line(axis.key, 60))} [{one_line(_unit(axis), 20)}]"
         plot_axis.set_label_text(label.replace("$", r"\$"))
-        if axis.logarithmic:
-            (axes.set_xscale if plot_axis is axes.xaxis else axes.set_yscale)("log")
-            plain_ticks(plot_axis, low, high)
-        else:
-            plot_axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
+        set_scale(plot_axis, low, high, axis.logarithmic)
         (axes.set_xlim if plot_axis is axes.xaxis else axes.set_ylim)(low, high)
     finish(axes, None)
     axes.grid(False)

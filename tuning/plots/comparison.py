@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib.style
 import numpy as np
-from matplotlib.figure import Figure as Picture
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from jaxhil.simulation.contact_plot import BLACK, GREEN, LABELS, STYLES, finish, new_figure
+from jaxhil.simulation.contact_plot import BLACK, GREEN, LABELS, STYLES, finish, legend_below, new_figure
 from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
 from tuning.benchmark.tables import best
-from tuning.pictures.plots import MARKERS
+from tuning.plots.parts import MARKERS, name_rows
 
 COLUMNS = 4  # largest number of panels side by side
 TRANSPARENCY = {
@@ -22,7 +22,7 @@ TRANSPARENCY = {
 
 
 @matplotlib.style.context("default")
-def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Picture:
+def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Figure:
     """Plot the rms error of every law with its interval, one panel per mechanism."""
     keys = _keys(names, found)
     laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
@@ -30,8 +30,8 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
     down = -(-len(names) // across)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
     size = (2.2 + 2.6 * across, 1.2 + height * down)
-    picture = new_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
-    panels = picture.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+    figure = new_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
+    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
         by_law = {result.law: result for result in found[name]}
         for key, offset in zip(keys, _offsets(len(keys)), strict=True):
@@ -56,28 +56,25 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
         finish(panel, None)
     for panel in list(panels.flat)[len(names) :]:
         panel.set_visible(False)
-    first = panels[0, 0]
-    first.set_ylim(len(laws) - 0.5, -0.5)
     for panel in panels[:, 0]:
-        panel.set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
-    picture.subplots_adjust(left=1.6 / size[0], hspace=0.42 / height, wspace=0.08)
+        name_rows(panel, laws)
+    figure.subplots_adjust(left=1.6 / size[0], hspace=0.42 / height, wspace=0.08)
     for panel in list(panels.flat)[max(0, len(names) - across) : len(names)]:
         panel.set_xlabel("rms of |e - e*| [%]")
         panel.tick_params(labelbottom=True)
-    handles, labels = first.get_legend_handles_labels()
-    picture.legend(handles, labels, loc="lower center", ncols=4, frameon=False, fontsize=9)
-    return picture
+    legend_below(figure, panels[0, 0], 4)
+    return figure
 
 
 @matplotlib.style.context("default")
-def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Picture:
+def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Figure:
     """Plot transparency, slope and peak force of every law with its best gains, one point per mechanism."""
     laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
     size = (12.0, 1.75 + 0.34 * len(laws))
     gains = "Tuned gains" if TUNED in _keys(names, found) else "The literature's gains"
-    picture = new_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
-    panels = picture.subplots(1, len(TRANSPARENCY), sharey=True)
-    picture.subplots_adjust(left=1.6 / size[0], wspace=0.08)
+    figure = new_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
+    panels = figure.subplots(1, len(TRANSPARENCY), sharey=True)
+    figure.subplots_adjust(left=1.6 / size[0], wspace=0.08)
     for panel, (key, title) in zip(panels, TRANSPARENCY.items(), strict=True):
         low, high = (0.3, 100.0) if key == "peak" else (-1.0, 2.5)
         for row, law in enumerate(laws):
@@ -96,11 +93,9 @@ def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigu
             panel.set_xscale("log")
         panel.set_xlabel(title, fontsize=9)
         finish(panel, None)
-    panels[0].set_yticks(range(len(laws)), [law.replace("_", " ") for law in laws], fontsize=8)
-    panels[0].set_ylim(len(laws) - 0.5, -0.5)
-    handles, labels = panels[0].get_legend_handles_labels()
-    picture.legend(handles, labels, loc="lower center", ncols=2, frameon=False, fontsize=9)
-    return picture
+    name_rows(panels[0], laws)
+    legend_below(figure, panels[0], 2)
+    return figure
 
 
 def _keys(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> list[str]:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import jaxhil as package
-from tuning.cli.commands.identify import PICTURES, _entry
+from tuning.cli.commands.identify import PLOTS, _entry
 from tuning.identification.estimate import Options, identify
-from tuning.identification.pictures import bode, compare, contacts, delay, draw, residuals
+from tuning.plots.identification import bode, compare, contacts, delay, draw, residuals
 
 
 @pytest.fixture(scope="module")
@@ -68,5 +68,5 @@ def test_identification_plots_are_reproducible(identified, tmp_path):
     for again in ("one", "other"):
         for name, figure in draw(identified, entries).items():
             save(figure, tmp_path / again / name)
-    for name in PICTURES:
+    for name in PLOTS:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()

@@ -1,7 +1,4 @@
-"""Plots of an identification: fit of the model to the logs, and changes relative to the prior.
-
-The plots use the units and colours of the plots of a run (`jaxhil.simulation.contact_plot`).
-"""
+"""Plots of an identification: fit of the model to the logs, and changes relative to the prior."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERM
 from tuning.identification.contact import ContactFit
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.result import Identification
+from tuning.plots.parts import WIDE, legend_above
 
 DOTS: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
-WIDE = 1.96  # standard deviations of a 95 % interval
 TOUCHES = 3  # contacts that are plotted over time
 COLOURS = (BLUE, ORANGE, GREEN)
 LAGS, EARLIER, LATER = 25, -20, 100  # rows, ranges of the residuals' correlations
@@ -201,7 +198,7 @@ def compare(entries: Sequence[Mapping[str, Any]]) -> Figure:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     finish(axes, None)
     if plain:
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=8, frameon=False)
+        legend_above(axes, 2)
     return figure
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure
 from jaxhil.sixdof.recording import Recorded
-from tuning.pictures.outlines import Line, outlines, rotation_matrix
+from tuning.plots.outlines import Line, outlines, rotation_matrix
 
 AXES = ("x", "y", "z")
 COLOURS = (BLUE, VERMILION, GREEN)

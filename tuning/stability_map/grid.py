@@ -20,9 +20,9 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.caches.cluster import Piece, on_workers
 from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
 from tuning.caches.worker import setting
-from tuning.reporting.closed_forms import ClosedForms, closed_forms
-from tuning.reporting.contact_growth import Growth, cost, growth, no_growth, spectral_radii
-from tuning.reporting.map_axes import MapAxis, draws
+from tuning.stability_map.axes import MapAxis, draws
+from tuning.stability_map.closed_forms import ClosedForms, closed_forms
+from tuning.stability_map.contact_growth import Growth, cost, growth, no_growth, spectral_radii
 
 LINE = 201  # points of each line through the nominal point
 PART = 2048  # largest number of runs computed at a time

@@ -13,13 +13,15 @@ from jaxhil.simulation.contact_plot import save
 from jaxhil.simulation.gain_file import check_document
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
+from tuning.plots.scenarios import UNENDED, failure_region
+from tuning.plots.sweep import convergence, error_map
 from tuning.statistics.intervals import binomial_interval, replicate_interval
 from tuning.statistics.quantiles import EDGES
-from tuning.sweeps import pictures, regions
+from tuning.sweeps import regions
 from tuning.sweeps.chunks import build_sweep, run_chunk
 from tuning.sweeps.columns import OUTCOMES, STATUSES
 from tuning.sweeps.regions import add_rows, empty_regions, make_plan, quantile
-from tuning.sweeps.store import PICTURES
+from tuning.sweeps.store import PLOTS
 
 NUMBER = 96
 LOST = {
@@ -165,7 +167,7 @@ def test_convergence_plot_ends_at_the_verdict(swept):
     made, mechanism, rows = swept
     plan = make_plan(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    figure = pictures.convergence(plan, result, made, "name")
+    figure = convergence(plan, result, made, "name")
     axes = figure.axes[0]
     drawn = {line.get_label(): line.get_data() for line in axes.lines}
     (number,), (share,) = [
@@ -190,7 +192,7 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     rows = {**rows, "failed": np.zeros(NUMBER, bool)}
     plan = make_plan(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    axes = pictures.convergence(plan, result, made, "name", acceptable).axes[0]
+    axes = convergence(plan, result, made, "name", acceptable).axes[0]
     last = float(binomial_interval(0, NUMBER).high)
     low, high = axes.get_ylim()
     assert low < 0.9 * last and last < 0.9 * high
@@ -204,7 +206,7 @@ def test_sweep_plots_ignore_the_callers_settings(usual, tmp_path):
     result = accumulated(plan, rows, [(0, NUMBER)])
 
     def drawn(name):
-        figures = [draw(plan, result, made, "n") for draw in (pictures.error_map, pictures.failure_region)]
+        figures = [draw(plan, result, made, "n") for draw in (error_map, failure_region)]
         paths = [tmp_path / f"{name}-{index}.png" for index in range(2)]
         for figure, path in zip(figures, paths, strict=True):
             save(figure, path)
@@ -239,8 +241,8 @@ def test_every_axis_is_labelled_with_its_unit(request, name, limit):
     plan = make_plan(made, mechanism, rows)
     assert len(plan.per_contact) == (1 if name == "phases" else 2)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    drawn = [draw(plan, result, made, name) for draw in (pictures.error_map, pictures.failure_region)]
-    for figure in (*drawn, pictures.convergence(plan, result, made, name, 0.1)):
+    drawn = [draw(plan, result, made, name) for draw in (error_map, failure_region)]
+    for figure in (*drawn, convergence(plan, result, made, name, 0.1)):
         FigureCanvasAgg(figure).draw()
         named = [axes for axes in figure.axes if axes.axison]
         assert named
@@ -256,7 +258,7 @@ def test_colour_scale_is_labelled_at_both_ends(usual, limit):
     made, mechanism, rows = usual
     made = msgspec.structs.replace(made, limit=limit)
     plan = make_plan(made, mechanism, rows)
-    figure = pictures.error_map(plan, accumulated(plan, rows, [(0, NUMBER)]), made, "usual")
+    figure = error_map(plan, accumulated(plan, rows, [(0, NUMBER)]), made, "usual")
     FigureCanvasAgg(figure).draw()
     (bar,) = (axes for axes in figure.axes if "not exceeded by 95 %" in axes.get_ylabel())
     ticks = bar.get_yticks()
@@ -272,10 +274,10 @@ def test_legend_counts_failures_by_kind(lost, few_points):
     endless = int(np.sum(result.points.failed & np.isinf(result.points.size)))
     failed, of = int(np.sum(result.points.failed)), int(np.sum(rows["failed"]))
     assert 0 < endless < failed < of
-    (legend,) = pictures.failure_region(plan, result, made, "lost").legends
+    (legend,) = failure_region(plan, result, made, "lost").legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert f"failed, every contact ended ({failed - endless} of the first {failed} of {of})" in labels
-    assert f"{pictures.UNENDED} ({endless} of the first {failed} of {of})" in labels
+    assert f"{UNENDED} ({endless} of the first {failed} of {of})" in labels
 
 
 def test_sweep_command_writes_plots_and_resumes_over_them(tmp_path, capsys):
@@ -284,11 +286,11 @@ def test_sweep_command_writes_plots_and_resumes_over_them(tmp_path, capsys):
     command = ["sweep", str(gains), "--scenarios", "70", "--chunk", "64", "-o", str(store), "--json"]
     main(command)
     result = json.loads(capsys.readouterr().out)
-    assert result["plots"] == [str(store / name) for name in PICTURES]
-    before = [path.read_bytes() for path in map(store.joinpath, PICTURES)]
-    (store / PICTURES[0]).unlink()
+    assert result["plots"] == [str(store / name) for name in PLOTS]
+    before = [path.read_bytes() for path in map(store.joinpath, PLOTS)]
+    (store / PLOTS[0]).unlink()
     (store / "parts" / "part-000001.parquet").unlink()
     main([*command, "--resume"])
     assert json.loads(capsys.readouterr().out)["failed"] == result["failed"]
-    assert [path.read_bytes() for path in map(store.joinpath, PICTURES)] == before
+    assert [path.read_bytes() for path in map(store.joinpath, PLOTS)] == before
     assert main(command) == 2 and "--resume" in capsys.readouterr().err

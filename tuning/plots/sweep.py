@@ -3,7 +3,6 @@
 They are made from the rows and written into the store's folder after its parts.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from jaxhil.files import writing
 from jaxhil.simulation.contact_plot import (
@@ -29,13 +28,14 @@ from jaxhil.simulation.contact_plot import (
     new_figure,
     save,
 )
+from tuning.plots.parts import draw_limit, legend_above, plain_ticks
+from tuning.plots.scenarios import failure_region, name_axis
 from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
 from tuning.sweeps.manifest import Manifest, loaded_gains
-from tuning.sweeps.regions import Input, Plan, Points, Regions, add_rows, empty_regions, make_plan, quantile
-from tuning.sweeps.store import PICTURES, Store, kept_part
+from tuning.sweeps.regions import Input, Plan, Regions, quantile, read_regions
+from tuning.sweeps.store import PLOTS, Store
 
 FEW = 20  # least number of contacts of a cell with a 95th percentile
-FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
 # Terms for errors and contacts that replace those of one axis in six-axis plots.
 IN_SPACE = {
     "|e - e*|": "|error|",
@@ -57,13 +57,7 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
     One part is read at a time. `acceptable` is a failure probability [1] that the convergence plot shows.
     """
     manifest, mechanism = store.manifest, loaded_gains(store.manifest).mechanism
-    plan = regions = None
-    for part in range(manifest.parts):
-        rows = kept_part(store, part)
-        if rows is None:
-            break
-        plan = plan or make_plan(manifest, mechanism, rows)
-        regions = add_rows(plan, regions or empty_regions(plan), rows)
+    plan, regions = read_regions(store, mechanism)
     if plan is None or regions is None:
         return {}
     drawn = (
@@ -74,7 +68,7 @@ def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figur
     if manifest.axes == 6:
         for figure in drawn:
             _rename_for_six_axes(figure)
-    return dict(zip(PICTURES, drawn, strict=True))
+    return dict(zip(PLOTS, drawn, strict=True))
 
 
 def _rename_for_six_axes(figure: Figure) -> None:
@@ -87,7 +81,7 @@ def _rename_for_six_axes(figure: Figure) -> None:
         text.set_text(label)
 
 
-def write_pictures(store: Store, acceptable: float | None = None) -> list[str]:
+def write_plots(store: Store, acceptable: float | None = None) -> list[str]:
     """Draw and write the plots; return their paths. Raise `InputError` if one cannot be written."""
     paths = []
     for name, figure in draw_store(store, acceptable).items():
@@ -109,53 +103,13 @@ def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Fi
     if not plan.per_contact:
         finish(grid[0, 0], None)
         return figure
-    first, limit = plan.per_contact[0], _drawn_limit(manifest)
+    first, limit = plan.per_contact[0], manifest.limit or None
     _draw_profile(grid[0, 0], first, plan.cells, regions.sizes, limit)
     if two:
         _draw_map(figure, grid[1, 0], grid[1, 1], plan, regions.sizes, limit)
         grid[0, 0].set_xlim(grid[1, 0].get_xlim())
         grid[0, 0].tick_params(labelbottom=False)
     grid[-1, 0].set_xlabel(first.label)
-    return figure
-
-
-@matplotlib.style.context("default")
-def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
-    """Plot scenarios as points, failed or not, over both inputs, and the worst error over each input."""
-    number = len(plan.per_scenario)
-    points, limit = regions.points, _drawn_limit(manifest)
-    size = (13, 4.9) if number == 2 else (7, 5.3)
-    title = f"{name}: {regions.failed} of {regions.scenarios} scenarios failed"
-    figure = new_figure(size, title, below=1.0 if number == 2 else 1.4)
-    figure.subplots_adjust(wspace=0.32)
-    panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
-    if number == 2:
-        _draw_points(panels[0], points.inputs[0], points.inputs[1], points.failed, points.size)
-        _name_axis(panels[0].xaxis, plan.per_scenario[0], points.inputs[0])
-        _name_axis(panels[0].yaxis, plan.per_scenario[1], points.inputs[1])
-    finite = points.size[np.isfinite(points.size) & (points.size > 0)]
-    values = [*finite, *([limit] if limit else [])] or [1.0]
-    low, high = min(values) / 1.5, max(values) * 1.5
-    # Very small errors would take most of the axis without being informative.
-    low = max(low, 1e-4 * high)
-    for index, quantity in enumerate(plan.per_scenario):
-        axes = panels[index - number]
-        shown = np.clip(np.where(np.isfinite(points.size), points.size, high), low, None)
-        _draw_points(axes, points.inputs[index], shown, points.failed, points.size)
-        if limit:
-            axes.axhline(
-                limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}", zorder=4
-            )
-        _name_axis(axes.xaxis, quantity, points.inputs[index])
-        axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
-        plain_ticks(axes.yaxis, low, high)
-    for axes in panels:
-        finish(axes, None)
-    handles, labels = panels[-1].get_legend_handles_labels()
-    columns = (2 if UNENDED in labels else 4) if number == 2 else (1 if UNENDED in labels else 2)
-    labels = [_counted(label, points, regions) for label in labels]
-    style: dict[str, Any] = {"fontsize": 9, "frameon": False, "markerscale": 2}
-    figure.legend(handles, labels, loc="lower center", ncols=columns, **style)
     return figure
 
 
@@ -210,18 +164,6 @@ def convergence(
     return figure
 
 
-def plain_ticks(axis: Axis, low: float, high: float) -> None:
-    """Set enough ticks on a logarithmic axis to read off values, with plain numbers as labels."""
-    decades = np.log10(high / low)
-    factors = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
-    if decades < 0.9:
-        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
-    else:
-        axis.set_major_locator(LogLocator(subs=factors))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
 def _draw_profile(axes: Axes, quantity: Input, cells: int, sizes: np.ndarray, limit: float | None) -> None:
     """Draw quantiles of |e - e*| over one input."""
     counts = sizes.reshape(cells, -1, sizes.shape[-1]).sum(axis=1)
@@ -235,13 +177,12 @@ def _draw_profile(axes: Axes, quantity: Input, cells: int, sizes: np.ndarray, li
         share = np.sum(counts[:, -1]) / np.sum(counts)
         axes.plot([], [], " ", label=f"({100 * share:.2g} % did not end)")
     axes.set_yscale("log")
-    if limit:
-        axes.axhline(limit, color=BLACK, linewidth=1.5, linestyle="--", label=f"limit {limit:g}")
-    _name_axis(axes.xaxis, quantity)
+    draw_limit(axes.axhline, limit, 1.5)
+    name_axis(axes.xaxis, quantity)
     axes.set(xlabel="", ylabel="|e - e*| not exceeded by [1]")
     plain_ticks(axes.yaxis, *axes.get_ylim())
     finish(axes, None)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, fontsize=8, frameon=False)
+    legend_above(axes, 5)
 
 
 def _draw_map(
@@ -277,46 +218,14 @@ def _draw_map(
     _bar_ticks(bar.yaxis, low, high)
     if limit:
         bar.axhline(limit, color=BLACK, linewidth=1.5)
-    _name_axis(axes.xaxis, first)
-    _name_axis(axes.yaxis, second)
+    name_axis(axes.xaxis, first)
+    name_axis(axes.yaxis, second)
     handles = [Patch(color="0.8", label=f"fewer than {FEW} contacts")] if np.any(np.isnan(values)) else []
     if unended:
         handles.append(Patch(color=BLACK, label="more than 5 % did not end"))
     if handles:
         # The legend is below the axes, whose whole area is covered with cells.
         figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=2)
-
-
-def _draw_points(
-    axes: Axes, across: np.ndarray, up: np.ndarray, failed: np.ndarray, size: np.ndarray
-) -> None:
-    """Draw scenarios as points whose marker shows whether they failed and whether all contacts ended."""
-    ended = np.isfinite(size)
-    for which, label, colour, marker, width in (
-        (~failed, "not failed", SKY, "o", 2.0),
-        (failed & ended, FAILED, VERMILION, "x", 3.5),
-        (failed & ~ended, UNENDED, BLACK, "^", 3.5),
-    ):
-        if np.any(which):
-            style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": width}
-            style |= {"markeredgewidth": 0.8 if marker == "x" else 0, "rasterized": True}
-            axes.plot(across[which], up[which], color=colour, label=label, **style)
-
-
-def _counted(label: str, points: Points, regions: Regions) -> str:
-    """Return a label of points with their number and, if only some are drawn, the total."""
-    shown, total = int(np.sum(points.failed)), regions.failed
-    unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
-    if label in (FAILED, UNENDED) and unended:
-        part = "" if shown == total else f" of the first {shown} of {total}"
-        if label == FAILED:
-            return f"failed, every contact ended ({shown - unended}{part})"
-        return f"{label} ({unended}{part})"
-    if label == "not failed":
-        shown, total = len(points.failed) - shown, regions.scenarios - total
-    elif label != FAILED:
-        return label
-    return f"{label} ({total})" if shown == total else f"{label} (the first {shown} of {total})"
 
 
 def _bar_ticks(axis: Axis, low: float, high: float) -> None:
@@ -341,26 +250,3 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
         axes.set_yscale("log")
         axes.set_ylim(least / 3, min(1.0, 3 * top))
         plain_ticks(axes.yaxis, least / 3, 3 * top)
-
-
-def _name_axis(axis: Axis, quantity: Input, values: Sequence[float] | np.ndarray = ()) -> None:
-    """Set label, scale and limits of an input's axis, which also covers `values` and their markers."""
-    axis.set_label_text(quantity.label)
-    low, high = float(np.min(values, initial=quantity.low)), float(np.max(values, initial=quantity.high))
-    axes, across = axis.axes, axis is axis.axes.xaxis
-    scale: Any = axes.set_xscale if across else axes.set_yscale
-    limits: Any = axes.set_xlim if across else axes.set_ylim
-    if quantity.logarithmic:
-        scale("log")
-        plain_ticks(axis, low, high)
-    else:
-        axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
-    margin = 0.02 if len(values) else 0.0
-    ends = np.log([low, high]) if quantity.logarithmic else np.array([low, high])
-    ends = ends + margin * (ends[1] - ends[0]) * np.array([-1, 1])
-    limits(*(np.exp(ends) if quantity.logarithmic else ends))
-
-
-def _drawn_limit(manifest: Manifest) -> float | None:
-    """Return the limit; None if it is 0, which a logarithmic axis cannot show."""
-    return manifest.limit if manifest.limit else None

@@ -1,6 +1,6 @@
-"""Plots of tuning results, in the units and colours of `jaxhil.simulation.contact_plot`."""
+"""Plots of tuning results: errors before and after, the solver's starts, Pareto fronts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib.style
@@ -24,8 +24,7 @@ from jaxhil.simulation.contact_plot import (
 from tuning.gains.objective import Objective
 from tuning.gains.pareto import Front
 from tuning.gains.tune import TuneResult
-
-MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
+from tuning.plots.parts import MARKERS, draw_limit, legend_above
 
 
 @matplotlib.style.context("default")
@@ -37,38 +36,18 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
     left, right = figure.subplots(1, 2)
     # A limit of 0 or infinity cannot be drawn on a logarithmic axis.
     has_limit = 0 < limit < np.inf
-    sizes: list[float] = [limit] if has_limit else []
+    _draw_shares(left, result.outcomes, limit)
     for name, outcome in result.outcomes.items():
-        size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
-        if not len(size):
+        if not np.any(outcome.good):
             continue
-        colour, line, width = STYLES[name]
-        total = int(np.sum(outcome.wanted))
-        # Contacts that did not end count as larger than any error and raise the whole curve.
-        share = (np.arange(1, len(size) + 1) + total - len(size)) / total
-        left.step(
-            size, share, where="post", color=colour, linestyle=line, linewidth=width, label=LABELS[name]
-        )
-        sizes += [float(size[0]), float(np.percentile(size, 2))]
         frequency = outcome.reference_peak_force / outcome.metrics.approach_velocity / (2 * np.pi)
         frequency = frequency / result.scenarios.equivalent_mass
-        right.plot(
-            frequency[outcome.good],
-            outcome.error[outcome.good],
-            linestyle="none",
-            marker=MARKERS[name],
-            markersize=2.5,
-            alpha=0.6,
-            color=colour,
-            markeredgewidth=0,
-            label=LABELS[name],
-            rasterized=True,
-        )
+        style: dict[str, Any] = {"linestyle": "none", "marker": MARKERS[name], "markersize": 2.5}
+        style |= {"alpha": 0.6, "markeredgewidth": 0, "rasterized": True}
+        points = frequency[outcome.good], outcome.error[outcome.good]
+        right.plot(*points, color=STYLES[name][0], label=LABELS[name], **style)
     if has_limit:
-        left.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
         right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
-    positive = [value for value in sizes if value > 0] or [1.0]
-    left.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
     left.set(xlabel="size of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
     right.axhline(0, color=BLACK, linewidth=0.6)
     right.set_yscale("symlog", linthresh=limit if has_limit else 0.01)
@@ -76,9 +55,8 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
     finish(left, "lower left")
     finish(right, None)
     if right.get_legend_handles_labels()[0]:
-        # The legend is above the axes, because there are points everywhere inside.
-        style: dict[str, Any] = {"fontsize": 8, "frameon": False, "markerscale": 2.5, "columnspacing": 1.2}
-        legend = right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, **style)
+        # There are points everywhere inside the axes.
+        legend = legend_above(right, 4, markerscale=2.5, columnspacing=1.2)
         for handle in legend.legend_handles:
             if handle is not None:
                 handle.set_alpha(1 if handle.get_label() in LABELS.values() else 0.3)
@@ -90,27 +68,31 @@ def two_errors_plot(result: TuneResult, limit: float) -> Figure:
     """Plot the distributions of the energy and twist errors of six axes, before and after tuning."""
     figure = new_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
     shown = {"energy_error": "size of the energy error [1]", "twist_error": "twist error [1]"}
+    by_error = rig_model(result.mechanism).by_error
     for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
-        sizes: list[float] = [limit] if 0 < limit < np.inf else []
-        for name, outcome in result.outcomes.items():
-            part = rig_model(result.mechanism).by_error(outcome)[error]
-            size = np.sort(np.abs(part.error[part.good]))[::-1]
-            if not len(size):
-                continue
-            colour, line, width = STYLES[name]
-            total = int(np.sum(part.wanted))
-            # Episodes that did not end count as larger than any error and raise the whole curve.
-            share = (np.arange(1, len(size) + 1) + total - len(size)) / total
-            style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
-            axes.step(size, share, where="post", label=LABELS[name], **style)
-            sizes += [float(size[0]), float(np.percentile(size, 2))]
-        if 0 < limit < np.inf:
-            axes.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
-        positive = [value for value in sizes if value > 0] or [1.0]
-        axes.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
+        _draw_shares(axes, {name: by_error(each)[error] for name, each in result.outcomes.items()}, limit)
         axes.set(xlabel=label, ylabel="share of episodes with a larger error [1]")
         finish(axes, "lower left")
     return figure
+
+
+def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
+    """Plot the share of contacts with an error larger than each size, by gains, and the limit."""
+    sizes: list[float] = [limit] if 0 < limit < np.inf else []
+    for name, outcome in outcomes.items():
+        size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
+        if not len(size):
+            continue
+        colour, line, width = STYLES[name]
+        total = int(np.sum(outcome.wanted))
+        # Contacts that did not end count as larger than any error and raise the whole curve.
+        share = (np.arange(1, len(size) + 1) + total - len(size)) / total
+        style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
+        axes.step(size, share, where="post", label=LABELS[name], **style)
+        sizes += [float(size[0]), float(np.percentile(size, 2))]
+    draw_limit(axes.axvline, limit)
+    positive = [value for value in sizes if value > 0] or [1.0]
+    axes.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
 
 
 @matplotlib.style.context("default")
@@ -158,12 +140,11 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
         rms = [result.figures[name].rms for result in results]
         style = {"linestyle": "none", "marker": MARKERS[name], "color": STYLES[name][0], "markersize": 5}
         axes.plot(rms, rows, label=LABELS[name], **style)
-    if 0 < limit < np.inf:
-        axes.axvline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
+    draw_limit(axes.axvline, limit)
     axes.set_yticks(rows, [one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8)
     axes.set(xscale="log", xlabel="rms of the restitution error e - e* [1]", ylim=(len(results) - 0.5, -0.5))
     finish(axes, None)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8, frameon=False)
+    legend_above(axes, 4)
     return figure
 
 
@@ -187,8 +168,7 @@ def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
             values = [point.cost for point in points], [point.error for point in points]
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": size}
             axes.plot(*values, color=edge, markerfacecolor=face, label=label, zorder=3, **style)
-    if 0 < limit < np.inf:
-        axes.axhline(limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {limit:g}")
+    draw_limit(axes.axhline, limit)
     numbers: dict[tuple[float, float], list[str]] = {}  # equal points share one label
     for number, point in enumerate(front.points, start=1):
         numbers.setdefault(point.place, []).append(str(number))

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from jaxhil.files import write_whole
 from jaxhil.simulation.contact_plot import BLUE, new_figure
 from jaxhil.sixdof.recording import Recorded
-from tuning.pictures.outlines import Line, outlines, rotation_matrix
-from tuning.pictures.six_axes import AXES, VIEWS, origin_of, rotation_of, window
+from tuning.plots.outlines import Line, outlines, rotation_matrix
+from tuning.plots.six_axes import AXES, VIEWS, origin_of, rotation_of, window
 
 FRAMES, RATE = 60, 12  # number of frames, and frames per second
 ROUND = 3.0  # margin around the contact, relative to the motion

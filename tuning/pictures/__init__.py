@@ -1,1 +1,0 @@
-"""Plots of tuning results and of six-axis runs."""

@@ -1,0 +1,82 @@
+"""Parts that several plots share: limits, legends, logarithmic axes, and SVG elements for a page."""
+
+import html
+import io
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from jaxhil.simulation.contact_plot import BLACK
+
+WIDE = 1.96  # half width of a 95 % interval [standard deviations]
+MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
+IDENTIFIER = re.compile(r'<g id="[^"]*"')
+LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
+
+
+def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2, **style: Any) -> None:
+    """Draw the limit with `Axes.axvline` or `Axes.axhline`; 0 and infinity have no place on a log axis."""
+    if limit is not None and 0 < limit < np.inf:
+        line(limit, color=BLACK, linewidth=width, linestyle="--", label=f"limit {limit:g}", **style)
+
+
+def legend_above(axes: Axes, columns: int, **style: Any) -> Any:
+    """Draw the legend above the axes, which have no space for it inside."""
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    return axes.legend(ncols=columns, fontsize=8, frameon=False, **place, **style)
+
+
+def name_rows(axes: Axes, names: list[str]) -> None:
+    """Label the rows of a plot, from above, with the names of compensators."""
+    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+
+
+def set_scale(axis: Axis, low: float, high: float, logarithmic: bool) -> None:
+    """Set the scale of an input's axis and its ticks, for values from `low` to `high`."""
+    if logarithmic:
+        (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
+        plain_ticks(axis, low, high)
+    else:
+        axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
+
+
+def plain_ticks(axis: Axis, low: float, high: float) -> None:
+    """Set enough ticks on a logarithmic axis to read off values, with plain numbers as labels."""
+    decades = np.log10(high / low)
+    factors = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
+    if decades < 0.9:
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
+    else:
+        axis.set_major_locator(LogLocator(subs=factors))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+@matplotlib.style.context("default")
+def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
+    """Return a figure as an SVG element; the link to a scenario has its text in `points`."""
+    content = io.StringIO()
+    FigureCanvasSVG(figure)
+    # A fixed salt makes equal figures give equal elements, with names that depend on their content.
+    with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
+        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
+    svg = content.getvalue()
+    svg = IDENTIFIER.sub("<g", svg[svg.index("<svg") :])
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
+
+    def link(match: re.Match[str]) -> str:
+        index = int(match[1])
+        label = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
+        return f'<a href="#scenario-{index}" aria-label="{label}"><title>{label}</title>'
+
+    return LINK.sub(link, svg).replace("xlink:href", "href")

@@ -1,0 +1,154 @@
+"""Plots of a sweep's scenarios: failed and worst ones over the inputs, and the motion of one."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+
+from jaxhil.simulation.contact_plot import (
+    BLACK,
+    SKY,
+    VERMILION,
+    contact_plot,
+    finish,
+    legend_below,
+    new_figure,
+)
+from tuning.plots.parts import draw_limit, plain_ticks, set_scale
+from tuning.sweeps.chunks import Sweep
+from tuning.sweeps.manifest import Manifest
+from tuning.sweeps.regions import Input, Plan, Points, Regions
+from tuning.sweeps.replay import motion_of, recorded
+
+FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
+
+
+def scenario_plot(sweep: Sweep, index: int, title: str) -> Figure:
+    """Plot the scenario's motion at every tick, for one axis or six."""
+    if sweep.model.axes == 1:
+        return contact_plot(motion_of(sweep, index), title, sensors="rig")
+    from tuning.plots.six_axes import six_axes_plot
+
+    return six_axes_plot(recorded(sweep, index), title)
+
+
+@matplotlib.style.context("default")
+def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
+    """Plot scenarios as points, failed or not, over both inputs, and the worst error over each input."""
+    number = len(plan.per_scenario)
+    points, limit = regions.points, manifest.limit or None
+    size = (13, 4.9) if number == 2 else (7, 5.3)
+    title = f"{name}: {regions.failed} of {regions.scenarios} scenarios failed"
+    figure = new_figure(size, title, below=1.0 if number == 2 else 1.4)
+    figure.subplots_adjust(wspace=0.32)
+    panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
+    if number == 2:
+        _draw_points(panels[0], points.inputs[0], points.inputs[1], points.failed, points.size)
+        name_axis(panels[0].xaxis, plan.per_scenario[0], points.inputs[0])
+        name_axis(panels[0].yaxis, plan.per_scenario[1], points.inputs[1])
+    finite = points.size[np.isfinite(points.size) & (points.size > 0)]
+    values = [*finite, *([limit] if limit else [])] or [1.0]
+    low, high = min(values) / 1.5, max(values) * 1.5
+    # Very small errors would take most of the axis without being informative.
+    low = max(low, 1e-4 * high)
+    for index, quantity in enumerate(plan.per_scenario):
+        axes = panels[index - number]
+        shown = np.clip(np.where(np.isfinite(points.size), points.size, high), low, None)
+        _draw_points(axes, points.inputs[index], shown, points.failed, points.size)
+        draw_limit(axes.axhline, limit, 1.5, zorder=4)
+        name_axis(axes.xaxis, quantity, points.inputs[index])
+        axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
+        plain_ticks(axes.yaxis, low, high)
+    for axes in panels:
+        finish(axes, None)
+    handles, labels = panels[-1].get_legend_handles_labels()
+    columns = (2 if UNENDED in labels else 4) if number == 2 else (1 if UNENDED in labels else 2)
+    labels = [_counted(label, points, regions) for label in labels]
+    style: dict[str, Any] = {"fontsize": 9, "frameon": False, "markerscale": 2}
+    figure.legend(handles, labels, loc="lower center", ncols=columns, **style)
+    return figure
+
+
+@matplotlib.style.context("default")
+def linked_scenarios(
+    name: str, inputs: Sequence[Any], points: Points, limit: float | None, linked: Sequence[int]
+) -> Figure:
+    """Draw the worst error of scenarios over each input, with rings around the linked scenarios."""
+    number = max(1, len(inputs))
+    figure = new_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
+    panels: Any = figure.subplots(1, number, squeeze=False)[0]
+    positions = {int(index): column for column, index in enumerate(points.index)}
+    rings_at = [positions[index] for index in linked if index in positions]
+    finite = points.size[np.isfinite(points.size) & (points.size > 0)]
+    high = 1.5 * max([*finite, limit or 0.0, 1e-6])
+    errors = np.clip(np.where(np.isfinite(points.size), points.size, high), 1e-4 * high, None)
+    for column, axes in enumerate(panels):
+        across = points.inputs[column] if inputs else points.index
+        for mask, label, colour, marker in (
+            (~points.failed, "not failed", SKY, "."), (points.failed, "failed", VERMILION, "x"),
+        ):  # fmt: skip
+            if np.any(mask):
+                axes.plot(across[mask], errors[mask], linestyle="none", marker=marker, markersize=3,
+                          color=colour, label=label, rasterized=True)  # fmt: skip
+        rings = axes.scatter(across[rings_at], errors[rings_at], s=55, facecolors=(1, 1, 1, 0.6),
+                             edgecolors=BLACK, linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
+        rings.set_urls([f"#scenario-{int(points.index[position])}" for position in rings_at])
+        draw_limit(axes.axhline, limit, 1.5)
+        label = inputs[column].label if inputs else "scenario [1]"
+        axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
+        plain_ticks(axes.yaxis, *axes.get_ylim())
+        if inputs and inputs[column].logarithmic:
+            axes.set_xscale("log")
+            plain_ticks(axes.xaxis, *axes.get_xlim())
+        finish(axes, None)
+    legend_below(figure, panels[0])
+    return figure
+
+
+def _draw_points(
+    axes: Axes, across: np.ndarray, up: np.ndarray, failed: np.ndarray, size: np.ndarray
+) -> None:
+    """Draw scenarios as points whose marker shows whether they failed and whether all contacts ended."""
+    ended = np.isfinite(size)
+    for which, label, colour, marker, width in (
+        (~failed, "not failed", SKY, "o", 2.0),
+        (failed & ended, FAILED, VERMILION, "x", 3.5),
+        (failed & ~ended, UNENDED, BLACK, "^", 3.5),
+    ):
+        if np.any(which):
+            style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": width}
+            style |= {"markeredgewidth": 0.8 if marker == "x" else 0, "rasterized": True}
+            axes.plot(across[which], up[which], color=colour, label=label, **style)
+
+
+def _counted(label: str, points: Points, regions: Regions) -> str:
+    """Return a label of points with their number and, if only some are drawn, the total."""
+    shown, total = int(np.sum(points.failed)), regions.failed
+    unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
+    if label in (FAILED, UNENDED) and unended:
+        part = "" if shown == total else f" of the first {shown} of {total}"
+        if label == FAILED:
+            return f"failed, every contact ended ({shown - unended}{part})"
+        return f"{label} ({unended}{part})"
+    if label == "not failed":
+        shown, total = len(points.failed) - shown, regions.scenarios - total
+    elif label != FAILED:
+        return label
+    return f"{label} ({total})" if shown == total else f"{label} (the first {shown} of {total})"
+
+
+def name_axis(axis: Axis, quantity: Input, values: Sequence[float] | np.ndarray = ()) -> None:
+    """Set label, scale and limits of an input's axis, which also covers `values` and their markers."""
+    axis.set_label_text(quantity.label)
+    low, high = float(np.min(values, initial=quantity.low)), float(np.max(values, initial=quantity.high))
+    axes, across = axis.axes, axis is axis.axes.xaxis
+    limits: Any = axes.set_xlim if across else axes.set_ylim
+    set_scale(axis, low, high, quantity.logarithmic)
+    margin = 0.02 if len(values) else 0.0
+    ends = np.log([low, high]) if quantity.logarithmic else np.array([low, high])
+    ends = ends + margin * (ends[1] - ends[0]) * np.array([-1, 1])
+    limits(*(np.exp(ends) if quantity.logarithmic else ends))

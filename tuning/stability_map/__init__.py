@@ -1,0 +1,1 @@
+"""Stability maps: error over two keys, theory and growth, margins around the nominal point."""
