@@ -14,9 +14,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxhil.api import simulate
     from jaxhil.contact.base import ContactLaw
     from jaxhil.errors import InputError
-    from jaxhil.front_door import simulate
     from jaxhil.laws.simulation_base import Compensator, Gain
     from jaxhil.mechanism.loading import load
     from jaxhil.mechanism.structs import Mechanism
@@ -38,7 +38,7 @@ __all__ = [
     "simulate",
 ]
 
-_HOMES = {
+_MODULES = {
     "Compensator": "jaxhil.laws.simulation_base",
     "ContactLaw": "jaxhil.contact.base",
     "Gain": "jaxhil.laws.simulation_base",
@@ -47,7 +47,7 @@ _HOMES = {
     "jacobian": "jaxhil.simulation.jacobian",
     "load": "jaxhil.mechanism.loading",
     "register": "jaxhil.simulation.registration",
-    "simulate": "jaxhil.front_door",
+    "simulate": "jaxhil.api",
 }
 
 
@@ -56,9 +56,9 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("jaxhil")
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'jaxhil' has no attribute {name!r}")
-    value = getattr(import_module(_HOMES[name]), name)
+    value = getattr(import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 

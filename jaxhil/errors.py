@@ -6,14 +6,14 @@ names the place, the value found there and the allowed values.
 
 from __future__ import annotations
 
-__all__ = ["InputError", "one_line", "shown"]
+__all__ = ["InputError", "format_value", "to_one_line"]
 
 
 class InputError(ValueError):
-    """Error for unusable input, with a message of one line: ``FILE: key.path: found X, allowed Y``."""
+    """Error for unusable input, with a message of one line: ``FILE: key.path: found X, expected Y``."""
 
 
-def one_line(text: str, limit: int | None = None) -> str:
+def to_one_line(text: str, limit: int | None = None) -> str:
     """Return `text` with every unprintable character escaped, cut to `limit` characters."""
     escaped = "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode()
@@ -24,7 +24,7 @@ def one_line(text: str, limit: int | None = None) -> str:
     return escaped
 
 
-def shown(value: object, limit: int = 60) -> str:
+def format_value(value: object, limit: int = 60) -> str:
     """Return a printable description of a value for a message, at most `limit` characters."""
     if value is None:
         return "nothing"
@@ -37,7 +37,7 @@ def shown(value: object, limit: int = 60) -> str:
         # Cutting before the escaping as well limits the work for a long text.
         value = value[: limit + 1]
     try:
-        return one_line(repr(value), limit)
+        return to_one_line(repr(value), limit)
     except RecursionError:
         return "a deeply nested list"
     except ValueError:

@@ -19,20 +19,20 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, format_value, to_one_line
 
-TEMPORARY = ".tmp"  # suffix of the temporary name under which a file is first written
-SEAL = 65  # number of bytes before the content of a sealed file
+TEMPORARY_SUFFIX = ".tmp"  # suffix of the temporary name under which a file is first written
+CHECKSUM_LENGTH = 65  # number of bytes before the content of a sealed file
 
-_WORKING_FOLDER, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
-_PLAIN = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_THIS_PROCESS = secrets.token_hex(4)  # a process number alone is not unique, since it is used again
-_TEMPORARY_NAME = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY)}")
-_numbers = count()
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+_OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_PROCESS_TOKEN = secrets.token_hex(4)  # a process number alone is not unique, since it is used again
+_TEMPORARY_NAME_PATTERN = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY_SUFFIX)}")
+_name_counter = count()
 
 
 @contextmanager
-def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+def report_write_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Raise `InputError` if the code in the context cannot write to `path`."""
     try:
         yield
@@ -40,14 +40,16 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
         if isinstance(error, InputError):
             raise
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(os.fspath(path))}: cannot be written: {one_line(reason, 100)}") from None
+        raise InputError(
+            f"{to_one_line(os.fspath(path))}: cannot be written: {to_one_line(reason, 100)}"
+        ) from None
 
 
-def as_path(path: object) -> Path:
+def to_path(path: object) -> Path:
     """Return a caller's argument as a `Path`. Raise `InputError` if it is not a path."""
     if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
         return Path(path)
-    raise InputError(f"path: found {shown(path)}, allowed a path")
+    raise InputError(f"path: found {format_value(path)}, expected a path")
 
 
 def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
@@ -55,20 +57,20 @@ def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
 
     Raise `InputError` if the file cannot be written.
     """
-    target = as_path(path)
+    target = to_path(path)
     rows = zip(*columns.values(), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows), ""]
-    with writing(target):
-        write_whole(follow(target), "\n".join(lines).encode("ascii"))
+    with report_write_errors(target):
+        write_atomically(resolve_output_path(target), "\n".join(lines).encode("ascii"))
 
 
-def write_whole(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
+def write_atomically(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
     """Write a file atomically; a `lasting` file survives a power cut once this function has returned.
 
     Raise OSError if the file cannot be written, or if `path` exists and is not a regular file.
     """
     with suppress(FileNotFoundError):
-        _check_plain(os.lstat(path).st_mode)
+        _check_regular(os.lstat(path).st_mode)
     temporary = path.with_name(temporary_name())
     with open(temporary, "xb") as file:
         try:
@@ -93,7 +95,7 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
     Raise FileExistsError if `path` exists, or another OSError if the file cannot be written.
     """
     temporary = path.with_name(temporary_name())
-    write_whole(temporary, content)
+    write_atomically(temporary, content)
     try:
         os.link(temporary, path)
     except OSError as error:
@@ -107,27 +109,31 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_sealed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """Write the content after its seal with `write_whole`; the seal reveals any later damage."""
+def write_checksummed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
+    """Write the content after its seal with `write_atomically`; the seal reveals any later damage."""
     seal = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
-    write_whole(path, seal + bytes(content), lasting)
+    write_atomically(path, seal + bytes(content), lasting)
 
 
-def read_sealed(path: Path) -> bytes | None:
-    """Return the content that `write_sealed` wrote, or None if the file is missing or differs by any bit."""
+def read_checksummed(path: Path) -> bytes | None:
+    """Return what `write_checksummed` wrote, or None if the file is missing or differs by any bit."""
     try:
-        with open_plain(path) as file:
+        with open_regular(path) as file:
             sealed = file.read()
     except (OSError, ValueError):
         return None
-    content = sealed[SEAL:]
-    return content if sealed[:SEAL] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n" else None
+    content = sealed[CHECKSUM_LENGTH:]
+    return (
+        content
+        if sealed[:CHECKSUM_LENGTH] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
+        else None
+    )
 
 
-def open_plain(path: str | os.PathLike[str]) -> BinaryIO:
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a regular file for reading. Raise OSError at once for a link, a pipe or a device."""
-    _check_plain(os.lstat(path).st_mode)
-    return _open_checked(path, _PLAIN)
+    _check_regular(os.lstat(path).st_mode)
+    return _open_checked(path, _OPEN_FLAGS)
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
@@ -135,15 +141,15 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
     mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
-    _check_plain(mode)
-    return _open_checked(path, _PLAIN & ~os.O_NOFOLLOW)
+    _check_regular(mode)
+    return _open_checked(path, _OPEN_FLAGS & ~os.O_NOFOLLOW)
 
 
 def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
     """Open a file for reading. Raise OSError unless the open file is a regular one."""
     descriptor = os.open(path, flags)
     try:
-        _check_plain(os.fstat(descriptor).st_mode)
+        _check_regular(os.fstat(descriptor).st_mode)
         return open(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -151,33 +157,33 @@ def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
 
 
 @contextmanager
-def lock(path: Path) -> Iterator[None]:
+def lock_file(path: Path) -> Iterator[None]:
     """Hold an exclusive lock on a file. Raise BlockingIOError if it is locked, or another OSError."""
     import fcntl
 
     with suppress(FileNotFoundError):
-        _check_plain(os.lstat(path).st_mode)
+        _check_regular(os.lstat(path).st_mode)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     try:
-        _check_plain(os.fstat(descriptor).st_mode)
+        _check_regular(os.fstat(descriptor).st_mode)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
         os.close(descriptor)
 
 
-def follow(path: str | os.PathLike[str]) -> Path:
+def resolve_output_path(path: str | os.PathLike[str]) -> Path:
     """Return the file to which a user's output path leads; links are followed.
 
     Raise OSError if the file exists and is not a regular one.
     """
     target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     with suppress(FileNotFoundError):
-        _check_plain(os.lstat(target).st_mode)
+        _check_regular(os.lstat(target).st_mode)
     return target
 
 
-def exchange(one: Path, other: Path) -> None:
+def exchange_names(one: Path, other: Path) -> None:
     """Exchange the names of two files or folders atomically.
 
     Raise OSError; its number is ENOSYS or EINVAL if the system does not support the exchange.
@@ -187,7 +193,7 @@ def exchange(one: Path, other: Path) -> None:
     except (AttributeError, OSError, TypeError):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
     rename.argtypes = ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint
-    if rename(_WORKING_FOLDER, os.fsencode(one), _WORKING_FOLDER, os.fsencode(other), _EXCHANGE) != 0:
+    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) != 0:
         reason = ctypes.get_errno()
         raise OSError(reason, os.strerror(reason), os.fspath(other))
 
@@ -198,15 +204,15 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True)
     mode = os.lstat(folder).st_mode
     if not stat.S_ISDIR(mode):
-        raise OSError(errno.EEXIST, f"found {_kind(mode)}, allowed a folder", os.fspath(folder))
+        raise OSError(errno.EEXIST, f"found {_describe_kind(mode)}, expected a folder", os.fspath(folder))
 
 
 def remove_stale(folder: Path) -> None:
     """Remove the temporary files and folders of processes that no longer run. Raise OSError."""
     with os.scandir(folder) as entries:
         for entry in entries:
-            name = _TEMPORARY_NAME.fullmatch(entry.name)
-            if not name or _is_writing(int(name[1]), name[2]):
+            name = _TEMPORARY_NAME_PATTERN.fullmatch(entry.name)
+            if not name or _is_process_running(int(name[1]), name[2]):
                 continue
             if entry.is_file(follow_symlinks=False):
                 with suppress(FileNotFoundError):
@@ -217,12 +223,12 @@ def remove_stale(folder: Path) -> None:
 
 def is_temporary(name: str) -> bool:
     """Return whether a name is one of `temporary_name`."""
-    return _TEMPORARY_NAME.fullmatch(name) is not None
+    return _TEMPORARY_NAME_PATTERN.fullmatch(name) is not None
 
 
 def temporary_name() -> str:
     """Return a new name for a file or folder that this process has not finished writing."""
-    return f".jaxhil-{os.getpid()}-{_THIS_PROCESS}-{next(_numbers)}{TEMPORARY}"
+    return f".jaxhil-{os.getpid()}-{_PROCESS_TOKEN}-{next(_name_counter)}{TEMPORARY_SUFFIX}"
 
 
 def sync_folder(folder: Path) -> None:
@@ -234,10 +240,10 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _is_writing(process: int, token: str) -> bool:
+def _is_process_running(process: int, token: str) -> bool:
     """Return whether the process that made a temporary name still runs."""
     if process == os.getpid():
-        return token == _THIS_PROCESS
+        return token == _PROCESS_TOKEN
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -247,13 +253,13 @@ def _is_writing(process: int, token: str) -> bool:
     return True
 
 
-def _check_plain(mode: int) -> None:
+def _check_regular(mode: int) -> None:
     """Raise OSError unless `mode` is that of a regular file."""
     if not stat.S_ISREG(mode):
-        raise OSError(errno.EEXIST, f"found {_kind(mode)}, allowed a plain file")
+        raise OSError(errno.EEXIST, f"found {_describe_kind(mode)}, expected a plain file")
 
 
-def _kind(mode: int) -> str:
+def _describe_kind(mode: int) -> str:
     """Return the kind of file, in words, that `mode` states."""
     kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFREG: "a file"}
     return kinds.get(stat.S_IFMT(mode), "a device")

@@ -6,7 +6,7 @@ from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.one_axis import ONE_AXIS
 
 
-def rig_model(mechanism: AnyMechanism) -> RigModel:
+def choose_rig_model(mechanism: AnyMechanism) -> RigModel:
     """Return the rig model for a mechanism; six-axis code is imported only if needed.
 
     Example:

@@ -5,8 +5,8 @@ import campaigns
 import numpy as np
 from msgspec.structs import replace
 
-from jaxhil.mechanism.file import from_builtins, to_builtins
-from jaxhil.simulation.building import build_loop
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 
@@ -37,7 +37,7 @@ def prior(name):
     It has no damping, and no delay, lag or dead zone of the force sensor."""
     sensor = {"delay": KINDS[name].rig["position_sensor"].get("delay", 0.0)}
     simulator = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.004}
-    return from_builtins({
+    return from_plain_data({
         "schema": "jaxhil/mechanism/1", "name": "prior", "bodies": {"equivalent_mass": 350.0},
         "approach": {"velocity": 0.006},
         "contact": {"law": "kelvin_voigt", "stiffness": [124355.0]},
@@ -48,11 +48,11 @@ def prior(name):
 def truth(name):
     """Return the rig as a mechanism file has it, without noise and dead zone."""
     kind = KINDS[name]
-    raw = to_builtins(prior(name))
+    raw = to_plain_data(prior(name))
     raw["contact"] = {**kind.contact}
     sensor = {key: one for key, one in kind.rig["force_sensor"].items() if key in ("delay", "time_constant")}
     raw["rig"] |= {"simulator": {**kind.rig["simulator"]}, "force_sensor": sensor}
-    return from_builtins(raw, name)
+    return from_plain_data(raw, name)
 
 
 def numbers(mechanism, position_delay):

@@ -40,8 +40,8 @@ def small_files() -> dict[str, bytes]:
 
 def signed(files: dict[str, bytes], gain_document: dict[str, Any]) -> dict[str, bytes]:
     """The files with a manifest that fits them."""
-    rest = {name: content for name, content in files.items() if name != selftest.MANIFEST}
-    return {**rest, selftest.MANIFEST: manifest_text(rest, gain_document)}
+    rest = {name: content for name, content in files.items() if name != selftest.MANIFEST_FILE}
+    return {**rest, selftest.MANIFEST_FILE: manifest_text(rest, gain_document)}
 
 
 def run_selftest(folder, *arguments: str) -> tuple[bool, str]:

@@ -22,8 +22,8 @@ from jaxhil.rig.bounds import CONTROL_PERIODS
 from jaxhil.rig.filters import DelayLine
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.rig.law_status import STATUSES
-from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete
-from tuning.bundle.c99 import FLAGS, c99_texts
+from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete_limits
+from tuning.bundle.c99 import COMPILER_FLAGS, generate_c99
 
 COMPILER = shutil.which("cc")
 DRIVER = Path(__file__).with_name("c99_driver.c")
@@ -150,7 +150,7 @@ def _pointer(values: np.ndarray):
 def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
     """The controller's files and the driver in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    texts = c99_texts(document)
+    texts = generate_c99(document)
     for name, text in texts.items():
         (folder / name).write_text(text)
     # Where a division or a square root may fail, the law's step has an error flag.
@@ -163,7 +163,7 @@ def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
 
 def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
     """`source` in `folder`, compiled as the contract says."""
-    command = [str(COMPILER), *FLAGS, *options, source, "-o", output, "-lm"]
+    command = [str(COMPILER), *COMPILER_FLAGS, *options, source, "-o", output, "-lm"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
@@ -186,7 +186,7 @@ def long_document(law: str) -> dict[str, Any]:
 @functools.cache
 def delays(law: str) -> frozenset[str]:
     """The gains and limits that a line of the controller in C delays by."""
-    header = c99_texts(gain_document(law))["jaxhil_controller.h"]
+    header = generate_c99(gain_document(law))["jaxhil_controller.h"]
     return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
 
 
@@ -231,7 +231,7 @@ def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: floa
         if specification.admits(value):
             limits[name] = value
     try:
-        return complete(limits)
+        return complete_limits(limits)
     except ValueError:
         return NO_LIMITS
 
@@ -300,7 +300,7 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
             value *= 0.125
         limits[name] = -value if name.endswith("_lowest") else value
     try:
-        limits = complete(limits)
+        limits = complete_limits(limits)
     except ValueError:
         limits = NO_LIMITS
     clearance = float(rng.choice([math.inf, 1.0, 2.0, 4.0])) * period

@@ -4,7 +4,7 @@ import campaigns
 import numpy as np
 from oracle_contact import Law
 
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_plain_data
 
 
 def mechanism(name, **changed):
@@ -19,7 +19,7 @@ def mechanism(name, **changed):
     bodies, approach = {"equivalent_mass": kind.mass}, {"velocity": 0.006, "contacts": 1}
     approach["contacts"] = len(kind.contact["stiffness"])
     whole = {"schema": "jaxhil/mechanism/1", "name": name, "bodies": bodies, "approach": approach}
-    return from_builtins({**whole, "contact": tables["contact"], "rig": rig}, name)
+    return from_plain_data({**whole, "contact": tables["contact"], "rig": rig}, name)
 
 
 def commanded(name, what, command, seed, noise=True):

@@ -16,7 +16,7 @@ from oracle_motion import simulator_matrices
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from tuning.identification.records import Campaign, Run, Timing
+from tuning.identification.records import Campaign, CampaignTiming, LoggedRun
 
 SPEEDS = tuple(np.repeat([0.003, 0.006, 0.012], 5))
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -236,7 +236,7 @@ def campaign(name, seed, speeds=SPEEDS, seconds=60.0, rest=5.0, press=False) -> 
         runs += _touch_runs(kind, rng, speeds)
     if press:
         runs.append(_press_run(kind, rng))
-    timing = Timing(
+    timing = CampaignTiming(
         kind.rig["control_period"],
         kind.rig.get("command_hold", "linear"),
         kind.rig.get("command_latency", 0),
@@ -326,7 +326,7 @@ def _measured(kind, rng, actual):
 
 def _run(kind, what, command, measured, force):
     rows = len(command)
-    return Run(what, f"{what}.csv", np.arange(rows), kind.jitter, command, measured, force, None, None,
+    return LoggedRun(what, f"{what}.csv", np.arange(rows), kind.jitter, command, measured, force, None, None,
                np.ones(rows, bool), None, None)  # fmt: skip
 
 

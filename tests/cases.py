@@ -26,11 +26,11 @@ from lanes import (
 )
 from oracle import simulate
 
-from jaxhil.contact.laws import LAWS
-from jaxhil.laws.shared.estimates import force_delay
+from jaxhil.contact.laws import CONTACT_LAWS
+from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.rig import COMPENSATORS as RIG_COMPENSATORS
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
@@ -80,7 +80,7 @@ def form(case: Case) -> tuple[Any, ...]:
     if simulator[0] == "third_order":
         simulator = "transfer_function", 4
     return (
-        *(case.compensator, LAWS[contact.law], len(contact.depths), np.isfinite(contact.clearance)),
+        *(case.compensator, CONTACT_LAWS[contact.law], len(contact.depths), np.isfinite(contact.clearance)),
         *(simulator, rig.integrator, rig.command_hold, rig.command_latency),
     )
 

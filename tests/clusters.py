@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tuning.caches.cluster import connected
-from tuning.sweeps.cluster import parts_on
+from tuning.caches.cluster import connect_workers
+from tuning.sweeps.cluster_computers import build_chunk_computer
 
 ROOT = Path(__file__).parent.parent
 
@@ -82,8 +82,8 @@ def on_cluster(address):
     """Parts of a sweep computed by the workers of the scheduler at this address."""
 
     def run(sweep, parts):
-        with connected(address) as workers:
-            yield from parts_on(workers)(sweep, parts)
+        with connect_workers(address) as workers:
+            yield from build_chunk_computer(workers)(sweep, parts)
 
     return run
 

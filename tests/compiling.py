@@ -3,7 +3,7 @@
 A test's program runs once or twice: most of its time is the compiler's. With less optimisation that is half,
 for the same numbers but for their last bits, which are held to the same tolerances. Modules marked
 `users_options`, and the studies and benchmarks that are no part of the everyday suite, have the options of
-`jaxhil.simulation.environment`: where the last bits are what is tested, and where jax is held against the
+`jaxhil.simulation.jax_environment`: where the last bits are what is tested, and where jax is held against the
 rig's own controller.
 """
 
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import jax
 
-from jaxhil.simulation.environment import ONCE, known_options
+from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 
 # Of one program, given to `jax.jit`: more than can be switched for all that a module compiles.
-QUICK = known_options(ONCE)
+QUICK = supported_options(SINGLE_RUN_OPTIONS)
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

@@ -6,11 +6,19 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxhil.simulation.environment import CACHE, cache_folder, flags, prepare, settings
+from jaxhil.simulation.jax_environment import (
+    CACHE_VARIABLE,
+    build_jax_variables,
+    build_xla_flags,
+    cache_folder,
+    prepare_jax,
+)
 
 # Two devices wherever the tests run, and otherwise what users have.
-os.environ["XLA_FLAGS"] = flags(os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2"))
-os.environ["NPROC"] = settings(os.environ)["NPROC"]
+os.environ["XLA_FLAGS"] = build_xla_flags(
+    os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+)
+os.environ["NPROC"] = build_jax_variables(os.environ)["NPROC"]
 
 import hypothesis
 import jax
@@ -21,8 +29,8 @@ from compiling import compile_quickly, forget_oldest
 # Compiled programs are kept: for the next run, for other workers, for kernels and commands that tests start.
 FOLDER = "tests"
 if (_cache := cache_folder()) is not None and _cache.name != FOLDER:
-    os.environ[CACHE] = str(_cache / FOLDER)
-prepare()
+    os.environ[CACHE_VARIABLE] = str(_cache / FOLDER)
+prepare_jax()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -66,10 +74,10 @@ def pytest_collection_modifyitems(items):
 def _laws_of_the_package_alone():
     """What a module registers is gone when it is done."""
     import jaxhil.rig
-    from jaxhil.contact.laws import LAWS
+    from jaxhil.contact.laws import CONTACT_LAWS
     from jaxhil.laws.compensators import COMPENSATORS
 
-    tables = (COMPENSATORS, LAWS, jaxhil.rig.COMPENSATORS)
+    tables = (COMPENSATORS, CONTACT_LAWS, jaxhil.rig.COMPENSATORS)
     before = [dict(table) for table in tables]
     yield
     for table, entries in zip(tables, before, strict=True):
@@ -80,9 +88,9 @@ def _laws_of_the_package_alone():
 @pytest.fixture(scope="session", autouse=True)
 def _traced():
     """What is tested is traced, its shapes checked, and not run as a process before compiled it."""
-    from jaxhil.simulation import kept_programs
+    from jaxhil.simulation import cached_programs
 
-    kept_programs.compiled = lambda made_of, made, arguments, folder: made()
+    cached_programs.load_or_compile = lambda made_of, made, arguments, folder: made()
 
 
 @pytest.fixture(scope="module", autouse=True)

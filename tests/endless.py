@@ -16,9 +16,9 @@ from jax import lax
 from lanes import IDEAL, MASS, QUICK, mechanism, per_lane, spread, validated
 
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import build_rig_constants
-from jaxhil.simulation.rollout import start, stretch, stretch_length
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.rollout import run_segment, segment_length, start_rollout
 from jaxhil.simulation.tick import Tick
 
 OMEGA = 2 * pi * 3.0
@@ -45,7 +45,7 @@ def persistent(
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _begin(loop, gains, scenario):
     rig = build_rig_constants(loop, scenario)
-    return rig, start(loop, rig, gains, skip_flight=False)
+    return rig, start_rollout(loop, rig, gains, skip_flight=False)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
@@ -53,9 +53,9 @@ def _go_on(loop, gains, rig, run):
     """One chunk: longer ones take the more time a tick, the more they record."""
 
     def body(run, _):
-        return stretch(loop, rig, gains, run, record=True)
+        return run_segment(loop, rig, gains, run, record=True)
 
-    run, seen = lax.scan(body, run, None, length=CHUNK // stretch_length(loop))
+    run, seen = lax.scan(body, run, None, length=CHUNK // segment_length(loop))
     return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 
@@ -97,7 +97,7 @@ def spring(simulator: Mapping[str, Any] = IDEAL, period: float = 5e-4) -> Mechan
 
 
 def characteristic_root(equation: Callable[[complex], complex], start: complex = 1j * OMEGA) -> complex:
-    """The root [1/s] of a loop's characteristic equation next to `start`, by the secant method."""
+    """The root [1/s] of a loop's characteristic equation next to `start_rollout`, by the secant method."""
     before, root = start * (1 + 1e-3), start
     value_before = equation(before)
     for _ in range(50):

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Mechanism
 
 NUMBER = 64
@@ -92,7 +92,7 @@ def texts(number: int = NUMBER, seed: int = 0) -> dict[str, str]:
 
 def family(number: int = NUMBER, seed: int = 0) -> list[Mechanism]:
     """The mechanisms of `texts`, in their order."""
-    return [from_builtins(tomllib.loads(text), name) for name, text in texts(number, seed).items()]
+    return [from_plain_data(tomllib.loads(text), name) for name, text in texts(number, seed).items()]
 
 
 def write(folder: str | Path, number: int = NUMBER, seed: int = 0) -> list[Path]:

@@ -90,16 +90,16 @@ def without_times(value: Any) -> Any:
 
 def serve() -> None:
     """Read jobs from standard input, and write how each ended."""
-    from jaxhil.simulation.environment import prepare
+    from jaxhil.simulation.jax_environment import prepare_jax
 
-    prepare()
+    prepare_jax()
     import jax
     import matplotlib.backends.backend_agg  # noqa: F401
     import pyarrow.parquet  # noqa: F401
 
+    import tuning.api.sweep
     import tuning.bundle.bundle
     import tuning.cli.parser
-    import tuning.front_door.sweep
     import tuning.gains.tune_all
     import tuning.plots.sweep
     import tuning.plots.tuning_results

@@ -27,16 +27,16 @@ from c99_cases import (
 
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import digest
-from jaxhil.rig.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION, names
+from jaxhil.rig.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, LAW_IN_DOUBT, RESTITUTION, fault_names
 from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.metrics import OK
-from tuning.bundle.bundle import limits_section
+from tuning.bundle.bundle import build_limits_section
 from tuning.gain_file import build_document
 from tuning.statistics.intervals import binomial_interval
-from tuning.watchdog.calibration import WITHOUT_STORE, calibrate
-from tuning.watchdog.recorded import Chunk, Scenarios, recorded_chunks
+from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate
+from tuning.watchdog.recording import RecordedRuns, ScenarioSelection, record_selection
 
 FRESH = 20_000  # seed; limits are calibrated on draws of seed 0
 SEEN, CAUSE, TRIPPED = (RESULT.index(name) for name in ("seen", "cause", "tripped"))
@@ -125,7 +125,7 @@ class Counts:
 
 
 def _text(bits: int) -> str:
-    return ", ".join(names(bits)) or "nothing"
+    return ", ".join(fault_names(bits)) or "nothing"
 
 
 def _share(count: int, number: int) -> str:
@@ -138,11 +138,11 @@ def gains(parsed: Mechanism, values: dict[str, float], compensator: str = "respo
 
 
 def export(
-    loaded: LoadedGains, limit: float, folder: Path, scenarios: int = WITHOUT_STORE, lanes: int = 1024
+    loaded: LoadedGains, limit: float, folder: Path, scenarios: int = DEFAULT_DRAWS, lanes: int = 1024
 ) -> tuple[Exported, dict[str, Any]]:
     """The gains with limits calibrated on so many draws, compiled; the rates that calibration states."""
     limits, rates = calibrate(loaded, scenarios=scenarios, limit=limit, lanes=lanes)
-    document = {**loaded.document, "limits": limits_section(limits)}
+    document = {**loaded.document, "limits": build_limits_section(limits)}
     document["sha256"] = digest(document)
     gain_file = check_gain_document(document)
     sources = write_sources(folder / f"{limit}-{scenarios}", document)
@@ -153,7 +153,7 @@ def export(
     return Exported(f"limit {limit}, calibrated on {scenarios}", limit, batch, parameters, gain_file), rates
 
 
-def records(chunk: Chunk, parsed: Mechanism):
+def records(chunk: RecordedRuns, parsed: Mechanism):
     """Every lane of a chunk, as `Record`."""
     signals, period = chunk.signals, parsed.rig.control_period
     lengths = signals.live.sum(axis=0)
@@ -208,7 +208,7 @@ def counted(
 ) -> list[Counts]:
     """So many fresh scenarios through each of the controllers, a few of them through Python's as well."""
     counts = [Counts() for _ in exported]
-    for chunk in recorded_chunks(loaded, Scenarios("random", FRESH, number), lanes):
+    for chunk in record_selection(loaded, ScenarioSelection("random", FRESH, number), lanes):
         assert np.all(np.isfinite(chunk.contacts.error) == (chunk.contacts.status == OK))
         for lane, record in enumerate(records(chunk, loaded.mechanism)):
             for one, count in zip(exported, counts, strict=True):

@@ -4,7 +4,7 @@ import copy
 from typing import Any
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_plain_data
 from jaxhil.rig import digest
 
 MECHANISM: dict[str, Any] = {
@@ -43,7 +43,7 @@ _LEAD = {
 
 def _entries(compensator: str) -> dict[str, dict[str, Any]]:
     """Gains at the literature's values, and where that is 0 well within their bounds."""
-    mechanism = from_builtins(copy.deepcopy(MECHANISM), "documents")
+    mechanism = from_plain_data(copy.deepcopy(MECHANISM), "documents")
     entries = {}
     for gain in COMPENSATORS[compensator].gains:
         lower, upper = gain.lower(mechanism), gain.upper(mechanism)

@@ -14,12 +14,12 @@ from compiling import QUICK
 
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import Loop, build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK, Metrics
-from jaxhil.simulation.rollout import rollout, start, stretch, stretch_length, turn_over
+from jaxhil.simulation.rollout import begin_next_contacts, rollout, run_segment, segment_length, start_rollout
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tick import Tick
 
@@ -38,11 +38,11 @@ def run_record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tupl
     rig = build_rig_constants(loop, scenario)
 
     def body(run, _):
-        run, seen = stretch(loop, rig, gains, run, record=True)
-        return turn_over(loop, rig, gains, run, skip_flight=False), seen
+        run, seen = run_segment(loop, rig, gains, run, record=True)
+        return begin_next_contacts(loop, rig, gains, run, skip_flight=False), seen
 
-    stretches = -(-ticks // stretch_length(loop))
-    run, seen = jax.lax.scan(body, start(loop, rig, gains, skip_flight=False), None, length=stretches)
+    stretches = -(-ticks // segment_length(loop))
+    run, seen = jax.lax.scan(body, start_rollout(loop, rig, gains, skip_flight=False), None, length=stretches)
     return run.metrics, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), seen)
 
 
@@ -76,7 +76,7 @@ def mechanism(
 
 def validated(raw: Mapping[str, Any]) -> Mechanism:
     """The mechanism of plain data."""
-    return from_builtins(copy.deepcopy(dict(raw)), "case")
+    return from_plain_data(copy.deepcopy(dict(raw)), "case")
 
 
 def nominal_gains(mechanism: Mechanism, compensator: str, **values: float) -> dict[str, float]:

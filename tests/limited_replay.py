@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from jaxhil.rig import Controller, digest
 from jaxhil.simulation.gain_file import LoadedGains
-from tuning.watchdog.recorded import Signals
+from tuning.watchdog.recording import RecordedSignals
 
 
 class Tripped(NamedTuple):
@@ -25,7 +25,7 @@ def limited_controller(loaded: LoadedGains, limits: Mapping[str, Mapping[str, An
     return Controller.from_dict({**document, "sha256": digest(document)})
 
 
-def replay_lane(controller: Controller, signals: Signals, lane: int, mass: float) -> Tripped | None:
+def replay_lane(controller: Controller, signals: RecordedSignals, lane: int, mass: float) -> Tripped | None:
     """Feed one lane's record to the controller; None if it never trips.
 
     The numerical model's motion is the record's: it goes on as if nothing had tripped. At the end the next

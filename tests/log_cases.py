@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tuning.identification.logs.campaign import read_campaign
-from tuning.identification.logs.mapping import LogMapping, mapping_of
+from tuning.identification.logs.mapping import LogMapping, parse_mapping
 from tuning.identification.records import Campaign
 
 PERIOD, MASS, STIFFNESS, LAG = 1e-3, 350.0, 124e3, 6
@@ -71,7 +71,7 @@ def mapping(kind: str = "contact", timing: Any = (), text: Any = None, **channel
         "runs": [{"files": "*", "kind": kind}],
         **({} if text is None else {"text": text}),
     }
-    return mapping_of(raw, "map")
+    return parse_mapping(raw, "map")
 
 
 def read(path: Path, kind: str = "contact", **said: Any) -> Campaign:

@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import from_builtins, load
+from jaxhil.mechanism.file import from_plain_data, load
 
 # Every key of the schema, apart from those of other laws and models, and those that exclude each other.
 FULL = {
@@ -110,7 +110,7 @@ def changed(changes=(), base=FULL):
 def refusal(raw):
     """The message of a refused table: one printable line that names the source."""
     with pytest.raises(InputError) as caught:
-        from_builtins(raw, "some file")
+        from_plain_data(raw, "some file")
     message = str(caught.value)
     assert message.isprintable() and message.startswith("some file: ") and len(message) < 500
     return message

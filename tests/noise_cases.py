@@ -10,7 +10,7 @@ from lanes import QUICK
 from scipy.signal import bilinear, lfilter
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Constants
+from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 
 LONG = 4000  # ticks: every filter has died out
@@ -19,7 +19,7 @@ LONG = 4000  # ticks: every filter has died out
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _amplified(name, gains, period):
     def value(gains):
-        return COMPENSATORS[name].noise_amplification(gains, Constants(period, jnp.asarray(jnp.inf)))
+        return COMPENSATORS[name].noise_amplification(gains, KnownConstants(period, jnp.asarray(jnp.inf)))
 
     return value(gains), jax.jacfwd(value)(gains)
 

@@ -6,22 +6,22 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.file import to_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import Controller
 from jaxhil.rig.gain_file import GainFile
-from tuning.rig.contact_watch import ContactResult, ContactWatch
-from tuning.rig.hardware import RigTask
-from tuning.rig.plant import Plant
+from tuning.rig.contact_watch import ContactWatch, RigContact
+from tuning.rig.plant import RigHardware
+from tuning.rig.rig_task import RigTask
 from tuning.rig.udp_protocol import (
-    APPROACH,
+    APPROACH_TIME,
     PREPARE,
     READY,
     TICK,
-    Answer,
+    AnswerPacket,
     ControllerTask,
     NumericalModel,
-    Reading,
+    ReadingPacket,
 )
 
 ANY = st.floats(width=64)
@@ -36,15 +36,15 @@ def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float
 
 def closed_loop(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], seed: int = 0
-) -> tuple[list[ContactResult], dict[int, float]]:
+) -> tuple[list[RigContact], dict[int, float]]:
     """The mechanism's contacts as `jaxhil simulate` runs them, each entered at the speed of the rebound
     before; the largest shortfall [m] of the position command in each."""
     law, plant, watch = (
         controller(mechanism, compensator, gains),
-        Plant(mechanism, seed),
+        RigHardware(mechanism, seed),
         ContactWatch(mechanism),
     )
-    raw = to_builtins(mechanism)
+    raw = to_plain_data(mechanism)
     model, sensor = NumericalModel(raw), mechanism.rig.force_sensor
     zeroed = sensor.noise_std != 0 or sensor.bias != 0
     (position, velocity), results, shortfalls = model.start, [], {}
@@ -72,7 +72,7 @@ def closed_loop(
             break
         velocity = results[-1].restitution * results[-1].approach_velocity
         position = min(mechanism.rig.contact_plane, 0.0)
-        position -= velocity * (APPROACH + mechanism.approach.phase * mechanism.rig.control_period)
+        position -= velocity * (APPROACH_TIME + mechanism.approach.phase * mechanism.rig.control_period)
         law.next_contact()
     return results, shortfalls
 
@@ -84,13 +84,13 @@ def packets(
     delivered: Callable[[str, Any], list[Any]] = lambda way, packet: [packet],
     seed: int = 0,
     resets: bool = False,
-) -> tuple[RigTask, ControllerTask, list[Answer]]:
+) -> tuple[RigTask, ControllerTask, list[AnswerPacket]]:
     """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
     that tick instead of a packet `"there"` or `"back"`."""
-    rig, task = RigTask(mechanism, seed, resets=resets), ControllerTask(law, to_builtins(mechanism))
+    rig, task = RigTask(mechanism, seed, resets=resets), ControllerTask(law, to_plain_data(mechanism))
     answers = []
     for _ in range(ticks):
-        packet: Reading = rig.reading()
+        packet: ReadingPacket = rig.reading()
         for reading in delivered("there", packet):
             answer = task.answer(reading)
             if answer is not None:
@@ -109,12 +109,12 @@ def same(one, other):
 def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
     """What the rig sends of a tick."""
     sequence = tick + 10 if sequence is None else sequence
-    return Reading(event, sequence, run, tick, 0.001 * sequence, force, position, -1.0, 0.005)
+    return ReadingPacket(event, sequence, run, tick, 0.001 * sequence, force, position, -1.0, 0.005)
 
 
 def prepared(mechanism, **limits):
     """The controller's task, its law without compensation, ready for a run."""
     law = controller(mechanism, "none", {}, **limits)
-    task = ControllerTask(law, to_builtins(mechanism))
+    task = ControllerTask(law, to_plain_data(mechanism))
     assert task.answer(a_reading(0, 1, event=PREPARE)).flags == READY
     return task

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.contact.laws import KEYS, LAWS, ContactParameters
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, ContactParameters
+from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof.approach import begin
 from jaxhil.sixdof.bodies import build_body
 from jaxhil.sixdof.candidates import ChaserSpheres
@@ -54,7 +54,7 @@ def ideal_sensor(delay, **changes):
 def second_order(frequencies, dampings, delays):
     """A motion simulator of natural frequencies [Hz], damping ratios and delays [s], each (axes, *batch)."""
     frequency, same = 2 * np.pi * frequencies, jnp.ones_like(delays)
-    return MotionSimulator(
+    return MotionSimulatorBatch(
         jnp.stack([0 * same, frequency**2]),
         jnp.stack([same, 2 * dampings * frequency, frequency**2]),
         delays, jnp.inf * same, jnp.inf * same,
@@ -64,7 +64,7 @@ def second_order(frequencies, dampings, delays):
 def springs(stiffness, damping, exponent):
     """Parameters of a contact law, each (candidates, *batch)."""
     zero = jnp.zeros_like(stiffness)
-    own = {key.name: zero for key in KEYS.values()}
+    own = {key.name: zero for key in CONTACT_KEYS.values()}
     own |= {"exponent": exponent, "depths": zero[:1], "tension": zero > 1}
     return ContactParameters(stiffness, damping, **own)
 
@@ -89,4 +89,4 @@ def meeting(bodies, pose, twist, before):
 def spheres(centres, radii, shape, law, parameters, friction=None):
     """A group of spheres of the chaser, centres (3, candidates, *batch)."""
     candidates = ChaserSpheres(vector(centres), radii, shape)
-    return ContactGroup(candidates, LAWS[law], parameters, friction or Frictionless())
+    return ContactGroup(candidates, CONTACT_LAWS[law], parameters, friction or Frictionless())

@@ -7,7 +7,7 @@ from cases import SECOND_ORDER, mechanism, nominal_gains, validated
 
 from jaxhil.simulation.gain_file import check_document
 from tuning.gain_file import build_document
-from tuning.sweeps.manifest import Choices, Manifest, build_manifest
+from tuning.sweeps.manifest import Manifest, ManifestOptions, build_manifest
 
 UNCERTAIN = {
     "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
@@ -34,4 +34,4 @@ def case(
 def manifest(document: dict[str, Any] | None = None, scenarios: int = 100, **choices: Any) -> Manifest:
     """A sweep over `case()`, in chunks of 32."""
     loaded = check_document(document or case())
-    return build_manifest(loaded, Choices(scenarios, **{"chunk": 32, "limit": math.inf, **choices}))
+    return build_manifest(loaded, ManifestOptions(scenarios, **{"chunk": 32, "limit": math.inf, **choices}))

@@ -4,7 +4,7 @@ On the recorded ticks of every built-in mechanism and on a million random ticks,
 1e-11 of the command's range; those of compensators with a long recursion agree to 1e-9. Two groups are
 counted and compared separately:
 
-- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.replay`), and
+- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.runtime_replay`), and
 - lanes that magnify rounding: where successive regressors of the identification are nearly parallel, or gains
   make a prior's variance 1e15 times that of the noise, one unit in the last place of every operation moves
   the runtime's own command by as much as the two sides differ (Monte Carlo arithmetic: Parker, Pierce and
@@ -26,15 +26,15 @@ from hypothesis.extra import numpy as hnp
 from jax import lax
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Constants, Signals
+from jaxhil.laws.simulation_base import KnownConstants, Signals
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.gain_file import check_document
-from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
+from jaxhil.simulation.recording import LaneRecord, nominal_and_draws, record_lanes
 from tuning.gain_file import build_document
-from tuning.verification.replay import REPLAY_LIMIT, LaneReplay, replay
+from tuning.verification.runtime_replay import REPLAY_LIMIT, LaneReplay, replay_lane
 
 pytestmark = pytest.mark.users_options
 
@@ -57,7 +57,7 @@ class Readings(NamedTuple):
 
     signals: Signals
     gains: dict[str, np.ndarray]
-    constants: Constants
+    constants: KnownConstants
 
 
 class Count(NamedTuple):
@@ -101,7 +101,7 @@ def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) 
         constants = readings.constants
         period, clearance = float(constants.control_period[lane]), float(constants.clearance[lane])
         gain_file = GainFile(name, gains, period, clearance, UNLIMITED)
-        lanes.append(replay(Lane(signals, command[:end, lane], seen, False), gain_file))
+        lanes.append(replay_lane(LaneRecord(signals, command[:end, lane], seen, False), gain_file))
     return lanes
 
 
@@ -219,7 +219,7 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
     return Readings(
         Signals(force, position, velocity, measured, age.astype(np.int32)),
         {gain: np.array([lane[gain] for lane in gains]) for gain in gains[0]},
-        Constants(period, clearance),
+        KnownConstants(period, clearance),
     )
 
 
@@ -257,7 +257,7 @@ def test_runtime_and_jax_commands_agree_on_recorded_ticks(mechanism_name):
     _, lanes = record_lanes(loaded, batch)
     for index, lane in enumerate(lanes):
         gain_file = GainFile(law.name, gains, mechanism.rig.control_period, mechanism.contact.clearance)
-        seen = replay(lane, gain_file)
+        seen = replay_lane(lane, gain_file)
         assert seen.status == "ok" and seen.ticks > 100 and seen.parted is None, (index, seen)
         assert max(seen.difference, seen.near_difference) <= REPLAY_LIMIT, (index, seen)
     # Pad the readings to a common length and reuse them for every compensator with random gains.
@@ -273,7 +273,7 @@ def test_runtime_and_jax_commands_agree_on_recorded_ticks(mechanism_name):
     for name in COMPENSATORS:
         drawn = [random_gains(name, rng, mechanism) for _ in lanes]
         columns = {gain: np.array([lane[gain] for lane in drawn]) for gain in drawn[0]}
-        constants = Constants(batch.control_period, batch.clearance)
+        constants = KnownConstants(batch.control_period, batch.clearance)
         count = compare(name, Readings(signals, columns, constants), ticks)
         print(mechanism_name, name, count)
         assert count.ticks == count.compared == sum(ticks)
@@ -297,7 +297,7 @@ def test_runtime_and_jax_commands_agree_in_long_held_contact():
     force = np.where(position > 0, 1.2e5 * position + 200.0 * velocity, 0)
     age = np.repeat(np.arange(len(depth), dtype=np.int32)[:, None], 3, axis=1)
     signals = Signals(force, position, velocity, position - 1e-3 * velocity, age)
-    count = compare("response_error", Readings(signals, gains, Constants(period, np.full(3, np.inf))))
+    count = compare("response_error", Readings(signals, gains, KnownConstants(period, np.full(3, np.inf))))
     assert count.ticks == 3 * len(depth) and count.compared >= 0.99 * count.ticks and count.magnified == 0
 
 
@@ -318,7 +318,7 @@ def small_readings(draw):
     return Readings(
         Signals(*(leaf[:, None] for leaf in columns), age[:, None].astype(np.int32)),
         gains,
-        Constants(np.array([mechanism.rig.control_period]), np.array([clearance])),
+        KnownConstants(np.array([mechanism.rig.control_period]), np.array([clearance])),
     )
 
 

@@ -15,7 +15,7 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import builtin_names, load, suite_names
 from jaxhil.simulation.metrics import OK
 from tuning.statistics.intervals import binomial_interval
-from tuning.watchdog.recorded import Scenarios, recorded_chunks
+from tuning.watchdog.recording import ScenarioSelection, record_selection
 
 pytestmark = [
     pytest.mark.slow,
@@ -34,7 +34,7 @@ CASES = {
 
 def third(loaded):
     """Return an error that about a third of the runs exceed, to two digits."""
-    (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, LANES))
+    (chunk,) = record_selection(loaded, ScenarioSelection("random", 1, LANES))
     error = np.where(chunk.contacts.status == OK, np.abs(chunk.contacts.error), np.inf)
     return float(f"{np.quantile(np.max(error, axis=0), 2 / 3):.1e}")
 

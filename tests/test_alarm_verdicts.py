@@ -5,9 +5,9 @@ error that is detected.
 import numpy as np
 import pytest
 
-from tuning.statistics.intervals import binomial_interval, number_to_decide
-from tuning.watchdog.alarms import noticed_from
-from tuning.watchdog.verdict import ALLOWED, Allowed, judged
+from tuning.statistics.intervals import binomial_interval, estimate_deciding_scenarios
+from tuning.watchdog.alarms import find_detectable_error
+from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
 
 def rates(false, missed, held_out=1000):
@@ -33,7 +33,7 @@ def rates(false, missed, held_out=1000):
     ],
 )
 def test_alarm_verdict_follows_from_interval_bounds(false, missed, verdict, bad, unknown):
-    result = judged(rates(false, missed), ALLOWED, 2000)
+    result = add_verdict(rates(false, missed), DEFAULT_ALLOWED_RATES, 2000)
     assert result["verdict"] == verdict
     assert [text.split()[0] for text in result["reasons"]] == bad
     assert [text.split()[0] for text in result["unknown"]] == unknown
@@ -42,10 +42,10 @@ def test_alarm_verdict_follows_from_interval_bounds(false, missed, verdict, bad,
 
 def test_alarm_verdict_uses_rates_allowed_by_caller():
     result = rates((30, 100), (0, 200))
-    assert judged(result, Allowed(0.5, 0.02), 400)["verdict"] == "good"
-    assert judged(result, Allowed(0.1, 0.02), 400)["verdict"] == "bad"
-    assert judged(result, Allowed(0.3, 0.001), 400)["verdict"] == "unknown"
-    assert judged(result, Allowed(1.0, 1.0), 400)["verdict"] == "good"
+    assert add_verdict(result, AllowedAlarmRates(0.5, 0.02), 400)["verdict"] == "good"
+    assert add_verdict(result, AllowedAlarmRates(0.1, 0.02), 400)["verdict"] == "bad"
+    assert add_verdict(result, AllowedAlarmRates(0.3, 0.001), 400)["verdict"] == "unknown"
+    assert add_verdict(result, AllowedAlarmRates(1.0, 1.0), 400)["verdict"] == "good"
 
 
 @pytest.mark.parametrize(
@@ -58,14 +58,14 @@ def test_alarm_verdict_uses_rates_allowed_by_caller():
     ],
 )
 def test_unknown_alarm_verdict_states_sufficient_sweep_size(missed, words):
-    (text,) = judged(rates((0, 500), missed), ALLOWED, 2000)["unknown"]
-    assert text.endswith(f"allowed 0.02; {words}")
+    (text,) = add_verdict(rates((0, 500), missed), DEFAULT_ALLOWED_RATES, 2000)["unknown"]
+    assert text.endswith(f"limit 0.02; {words}")
 
 
 @pytest.mark.parametrize("allowed", [0.001, 0.02, 0.3])
 @pytest.mark.parametrize(("failures", "number"), [(0, 0), (0, 30), (1, 200), (3, 60), (40, 100)])
 def test_number_to_decide_is_smallest_sufficient_number(failures, number, allowed):
-    number_found = number_to_decide(failures, number, allowed)
+    number_found = estimate_deciding_scenarios(failures, number, allowed)
     share = failures / max(number, 1)
     assert number_found is not None
 
@@ -80,15 +80,15 @@ def test_number_to_decide_is_smallest_sufficient_number(failures, number, allowe
 def test_noticed_from_finds_smallest_error_detected_at_95_percent():
     rng = np.random.default_rng(0)
     error = rng.normal(0.0, 0.01, 4000)
-    result = noticed_from(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)
+    result = find_detectable_error(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)
     size = np.abs(error)
     within = size >= result["error"]
     assert 0.018 < result["error"] < 0.022 and result["contacts"] == np.sum(within)
     assert result["largest"] == np.max(size)
     noticed = np.abs(error) > 0.02
-    assert noticed_from(error, noticed)["error"] < 0.02
+    assert find_detectable_error(error, noticed)["error"] < 0.02
     # The next smaller error is not detected often enough.
-    result, order = noticed_from(error, noticed), np.sort(size)[::-1]
+    result, order = find_detectable_error(error, noticed), np.sort(size)[::-1]
     below = order[result["contacts"]]
     assert np.mean(noticed[size >= result["error"]]) >= 0.95 > np.mean(noticed[size >= below])
 
@@ -96,5 +96,5 @@ def test_noticed_from_finds_smallest_error_detected_at_95_percent():
 @pytest.mark.parametrize(("contacts", "noticed"), [(0, True), (19, True), (200, False)])
 def test_noticed_from_returns_none_without_evidence(contacts, noticed):
     error = np.linspace(0.0, 0.05, contacts)
-    result = noticed_from(error, np.full(contacts, noticed))
+    result = find_detectable_error(error, np.full(contacts, noticed))
     assert result == {"error": None, "contacts": 0, "largest": 0.05 if contacts else None}

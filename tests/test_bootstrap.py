@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from tuning.statistics.bootstrap import error_intervals
+from tuning.statistics.bootstrap import compute_error_intervals
 
 
 def heavy_tailed(generator, scenarios):
@@ -19,7 +19,7 @@ def test_bootstrap_rms_interval_has_stated_coverage():
     repeats, hits = 150, 0
     for _ in range(repeats):
         errors = heavy_tailed(generator, 300)
-        result = error_intervals(errors, np.ones(errors.shape, bool), resamples=299).rms
+        result = compute_error_intervals(errors, np.ones(errors.shape, bool), resamples=299).rms
         hits += result.low <= truth <= result.high
     # At a true coverage of 95 %, fewer hits have a probability of 0.001.
     assert hits >= binom.ppf(0.001, repeats, 0.95)
@@ -28,8 +28,8 @@ def test_bootstrap_rms_interval_has_stated_coverage():
 
 def test_bootstrap_resamples_whole_scenarios():
     errors = np.repeat(np.random.default_rng(2).standard_normal((1, 300)), 5, axis=0)
-    once = error_intervals(errors[:1], np.ones((1, 300), bool))
-    five = error_intervals(errors, np.ones((5, 300), bool))
+    once = compute_error_intervals(errors[:1], np.ones((1, 300), bool))
+    five = compute_error_intervals(errors, np.ones((5, 300), bool))
     np.testing.assert_allclose(five.rms, once.rms, rtol=1e-12)
     # Five times as many contacts move the 99th percentile between its neighbours only.
     np.testing.assert_allclose(five.p99, once.p99, rtol=0.06)
@@ -39,7 +39,7 @@ def test_bootstrap_intervals_match_plain_resampling():
     generator = np.random.default_rng(3)
     errors = heavy_tailed(generator, 200)
     good = generator.random(errors.shape) < 0.9
-    result = error_intervals(errors, good, resamples=4000)
+    result = compute_error_intervals(errors, good, resamples=4000)
     plain = []
     for _ in range(4000):
         drawn = generator.integers(0, 200, 200)
@@ -56,14 +56,14 @@ def test_bootstrap_intervals_match_plain_resampling():
 def test_bootstrap_interval_is_reproducible_from_seed():
     errors = heavy_tailed(np.random.default_rng(4), 100)
     good = np.ones(errors.shape, bool)
-    assert error_intervals(errors, good) == error_intervals(errors, good)
-    assert error_intervals(errors, good) != error_intervals(errors, good, seed=1)
+    assert compute_error_intervals(errors, good) == compute_error_intervals(errors, good)
+    assert compute_error_intervals(errors, good) != compute_error_intervals(errors, good, seed=1)
 
 
 @pytest.mark.parametrize("scenarios", [2, 511, 5000])
 def test_bootstrap_interval_contains_point_estimate(scenarios):
     errors = heavy_tailed(np.random.default_rng(5), scenarios)
-    result = error_intervals(errors, np.ones(errors.shape, bool), resamples=299)
+    result = compute_error_intervals(errors, np.ones(errors.shape, bool), resamples=299)
     assert result.rms.low < np.sqrt(np.mean(errors**2)) < result.rms.high
     assert result.p99.low <= np.percentile(np.abs(errors), 99) <= result.p99.high
 
@@ -72,11 +72,11 @@ def test_bootstrap_ignores_failed_contacts_and_returns_nan_without_data():
     errors = heavy_tailed(np.random.default_rng(6), 50)
     good = np.arange(50) < np.array([[30], [50], [0]])
     wild = np.where(good, errors, np.nan)
-    assert error_intervals(wild, good) == error_intervals(np.where(good, errors, 7), good)
-    assert np.isnan(error_intervals(wild, np.zeros_like(good))).all()
+    assert compute_error_intervals(wild, good) == compute_error_intervals(np.where(good, errors, 7), good)
+    assert np.isnan(compute_error_intervals(wild, np.zeros_like(good))).all()
     # One scenario alone has no spread to resample.
-    assert np.isnan(error_intervals(wild, good & (np.arange(50) == 3))).all()
+    assert np.isnan(compute_error_intervals(wild, good & (np.arange(50) == 3))).all()
 
 
 def test_bootstrap_interval_has_zero_width_for_equal_errors():
-    assert error_intervals(np.full((2, 30), -0.5), np.ones((2, 30), bool)).rms == (0.5, 0.5)
+    assert compute_error_intervals(np.full((2, 30), -0.5), np.ones((2, 30), bool)).rms == (0.5, 0.5)

@@ -18,10 +18,10 @@ from bundles import run_selftest, signed, small_files
 
 import tuning
 from jaxhil.errors import InputError
-from jaxhil.files import exchange
+from jaxhil.files import exchange_names
 from tuning.bundle import selftest
 from tuning.bundle.bundle import write_bundle
-from tuning.bundle.checking import check_bundle, check_code
+from tuning.bundle.checking import check_bundle, find_code_differences
 from tuning.bundle.checking import run_selftest as run_checked
 
 CODE = ("selftest.py", "jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py")
@@ -66,7 +66,7 @@ def document_of(files):
 def resealed(manifest):
     """Return the content of a manifest of any form, with checksums of itself that fit."""
     body = json.dumps(manifest, indent=1).encode().removesuffix(b"\n}")
-    return body + selftest.own_seal(body)
+    return body + selftest.build_manifest_seal(body)
 
 
 def entry(content, **changes):
@@ -84,7 +84,7 @@ def test_bundle_check_accepts_exported_bundle(files, folder):
     checked = check_bundle(placed(folder, files))
     assert (checked.reasons, checked.signature) == ([], "not signed")
     assert checked.files == files and checked.document == document_of(files)
-    assert check_code(folder, "phase_lead") == []
+    assert find_code_differences(folder, "phase_lead") == []
 
 
 @pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
@@ -97,7 +97,7 @@ def test_self_consistent_foreign_bundle_is_not_run(files, folder, tmp_path, name
     first, last = verdict.reasons
     assert first == f"{name}: is not what this version exports"
     assert last.startswith("nothing of it was run: it says that this version, jaxhil ")
-    assert (check_code(folder, "phase_lead") == []) is (name not in CODE)
+    assert (find_code_differences(folder, "phase_lead") == []) is (name not in CODE)
     assert not (tmp_path / "ran").exists()
 
 
@@ -109,7 +109,7 @@ def test_bundle_check_reports_missing_and_extra_files(files, folder):
         "sitecustomize.py: is no file that this version exports",
         "udp_controller.py: is not here",
     ]
-    assert check_code(folder, "phase_lead") == reasons
+    assert find_code_differences(folder, "phase_lead") == reasons
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_bundle_check_rejects_links_pipes_and_folders_without_waiting(files, fol
 
 
 def test_bundle_check_rejects_oversized_manifest_entries(files, folder):
-    many = {f"f{number}": entry(b"") for number in range(selftest.MOST_FILES + 1)}
+    many = {f"f{number}": entry(b"") for number in range(selftest.MAX_FILES + 1)}
     for others in (many, {"vast": entry(b"", bytes=1 << 60)}, {"odd": entry(b"", bytes=True)}):
         placed(folder, {**files, "manifest.json": resealed(plain_manifest(files, **others))})
         [reason] = check_bundle(folder).reasons
@@ -264,7 +264,9 @@ def test_write_bundle_replaces_only_an_unmodified_bundle(files, folder, tmp_path
     (secret / "thesis.txt").write_text("years of work")
 
     def refused():
-        with pytest.raises(InputError, match="allowed a new or empty folder, or a bundle as it was exported"):
+        with pytest.raises(
+            InputError, match="expected a new or empty folder, or a bundle as it was exported"
+        ):
             write_bundle(folder, files)
         assert (secret / "thesis.txt").read_text() == "years of work"
         assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]
@@ -295,9 +297,9 @@ def test_write_bundle_keeps_file_added_during_replacement(files, folder, monkeyp
     def late(new, target):
         if not (new / "thesis.txt").exists():
             (target / "thesis.txt").write_text("years of work")
-        exchange(new, target)
+        exchange_names(new, target)
 
-    monkeypatch.setattr("tuning.bundle.bundle.exchange", late)
+    monkeypatch.setattr("tuning.bundle.bundle.exchange_names", late)
     with pytest.raises(InputError, match=r"thesis\.txt: is no file of this bundle"):
         write_bundle(folder, {"manifest.json": b"another"})
     assert (folder / "thesis.txt").read_text() == "years of work"

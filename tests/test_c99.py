@@ -29,12 +29,12 @@ from hypothesis import strategies as st
 
 from jaxhil.rig import COMPENSATORS, GainFileError
 from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES
-from jaxhil.rig.faults import FAULTS, LAW_IN_DOUBT, names
+from jaxhil.rig.faults import FAULTS, LAW_IN_DOUBT, fault_names
 from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.rig.law_status import STATUS_NAMES, STATUSES
-from jaxhil.rig.limits import LIMITS, complete
-from tuning.bundle.c99 import c99_texts
-from tuning.bundle.c99_tables import UNUSABLE, decimal
+from jaxhil.rig.limits import LIMITS, complete_limits
+from tuning.bundle.c99 import generate_c99
+from tuning.bundle.c99_tables import UNUSABLE, format_double
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
@@ -61,7 +61,7 @@ def sanitized(tmp_path: Path, law: str) -> Path:
 
 
 def test_c99_faults_match_runtime(batch):
-    header = c99_texts(gain_document("none"))["jaxhil_controller.h"]
+    header = generate_c99(gain_document("none"))["jaxhil_controller.h"]
     bits = {
         name: int(bit, 16) for name, bit in re.findall(r"^    JAXHIL_(\w+) = (0x[0-9A-F]+)", header, re.M)
     }
@@ -72,7 +72,7 @@ def test_c99_faults_match_runtime(batch):
 
 
 def test_c99_statuses_match_runtime(batch):
-    header = c99_texts(gain_document("none"))["jaxhil_controller.h"]
+    header = generate_c99(gain_document("none"))["jaxhil_controller.h"]
     (listed,) = re.findall(r"enum \{\n([^}]*JAXHIL_UNSTATED[^}]*)\}", header)
     numbers = {name: int(number) for name, number in re.findall(r"^    JAXHIL_(\w+) = (\d+)", listed, re.M)}
     assert numbers == {status.name.upper(): status.number for status in STATUSES}
@@ -89,7 +89,7 @@ def test_c99_export_rejects_delay_that_runtime_rejects(delay):
     document = gain_document()
     document["gains"]["identification_delay"] |= {"value": delay, "upper": delay}
     with pytest.raises(GainFileError, match="delay"):
-        c99_texts(sign(document))
+        generate_c99(sign(document))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -111,7 +111,7 @@ def test_c99_decimal_constants_are_compiled_to_the_same_bits(tmp_path):
     rng = np.random.default_rng(2)
     values = rng.integers(0, 2**64, 5000, dtype=np.uint64).view(np.float64)
     values = np.concatenate([values[np.isfinite(values)], c99_cases.HOSTILE[:-1], np.arange(5.0)])
-    numbers = ",\n".join(decimal(float(value)) for value in values)
+    numbers = ",\n".join(format_double(float(value)) for value in values)
     (tmp_path / "numbers.c").write_text(
         f"#include <math.h>\nextern const double numbers[];\nconst double numbers[] = {{\n{numbers}}};\n"
     )
@@ -122,7 +122,7 @@ def test_c99_decimal_constants_are_compiled_to_the_same_bits(tmp_path):
 
 @given(value=st.floats(allow_nan=False))
 def test_decimal_writes_exact_floating_constant(value):
-    text = decimal(value)
+    text = format_double(value)
     assert math.isinf(value) or (re.fullmatch(r"-?\d+(\.\d+)?(e[-+]\d+)?", text) and set(text) & set(".e"))
     assert struct.pack("d", float(text.replace("INFINITY", "inf"))) == struct.pack("d", value)
 
@@ -180,7 +180,7 @@ def test_c99_admits_the_same_limits_as_python(batch):
         for value in (*c99_cases.HOSTILE.tolist(), *ends, *beyond, 0.01):
             allowed = specification.admits(value)
             try:
-                limits = complete({name: value})
+                limits = complete_limits({name: value})
             except ValueError:
                 allowed = False
                 limits = {**plain.limits, name: value}
@@ -201,7 +201,7 @@ def test_c99_rejects_the_same_conflicting_limits_as_python(low, high, batch):
     ):
         limits = dict(zip(names_of, (low, high), strict=True))
         try:
-            complete(limits)
+            complete_limits(limits)
             allowed = all(LIMITS[name].admits(value) for name, value in limits.items())
         except ValueError:
             allowed = False
@@ -224,7 +224,7 @@ def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
 
 
 def test_c99_retreat_across_the_whole_command_range_is_finite(batch):
-    gain_file = GainFile("none", {}, PERIOD, math.inf, complete({"deceleration": 1.0}))
+    gain_file = GainFile("none", {}, PERIOD, math.inf, complete_limits({"deceleration": 1.0}))
     rows = np.zeros((6, len(c99_cases.ROW)))
     rows[:2, 7] = 10.0, -10.0
     rows[3, 0] = c99_cases.STOP
@@ -248,7 +248,7 @@ def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
         drawn = drawn_gains(law, rng, hostile=False, period=PERIOD)
         gain_file = drawn if n % 2 else check_gain_document(gain_document(law))
         gains = gain_file.gains | ({"delay_spread": 0.002} if n % 3 == 1 else {})
-        limits = complete({"equivalent_mass": 350.0, "settling": 0.02})
+        limits = complete_limits({"equivalent_mass": 350.0, "settling": 0.02})
         clearance = math.inf if n % 4 else 1e-4
         gain_file = gain_file._replace(gains=gains, limits=limits, clearance=clearance)
         motion = rng.uniform(0, 6), rng.uniform(8, 60), 10 ** rng.uniform(-4.5, -2.7)
@@ -288,7 +288,7 @@ def test_c99_drawn_rows_reach_every_fault(batch):
         seen |= int(np.bitwise_or.reduce(results[:, c99_cases.RESULT.index("seen")].astype(int)))
         audited |= set(results[:, c99_cases.RESULT.index("expected")].tolist())
         identified |= set(results[:, c99_cases.RESULT.index("stiffness")].tolist())
-    assert names(seen) == [fault.name for fault in FAULTS if fault.bit != LAW_IN_DOUBT]
+    assert fault_names(seen) == [fault.name for fault in FAULTS if fault.bit != LAW_IN_DOUBT]
     assert len(audited) > 10 and len(identified) > 1000
 
 
@@ -310,7 +310,7 @@ def cases(draw):
     rows = draw(st.lists(number, min_size=1, max_size=20))
     chosen = draw(st.sets(st.sampled_from(list(LIMITS)), max_size=10))
     try:
-        limits = complete({name: draw(limit_values(law, name)) for name in sorted(chosen)})
+        limits = complete_limits({name: draw(limit_values(law, name)) for name in sorted(chosen)})
     except ValueError:
         reject()
     return GainFile(law, gains, PERIOD, clearance, limits), np.array(rows)

@@ -20,7 +20,7 @@ from jaxhil.errors import InputError
 from jaxhil.rig import COMPENSATORS, GainFileError
 from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.rig.registry import Compensator, GainSpecification
-from tuning.bundle.c99 import c99_texts
+from tuning.bundle.c99 import generate_c99
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
@@ -160,13 +160,13 @@ def test_c99_multiplication_and_addition_are_never_fused(compiler, tmp_path):
 
 
 def test_c99_sources_contain_only_code_the_compensator_needs():
-    texts = c99_texts(gain_document("phase_lead"))
+    texts = generate_c99(gain_document("phase_lead"))
     assert "jaxhil_lead_filter_step" in texts["jaxhil_controller.c"]
     assert "identification" not in texts["jaxhil_controller.c"]
     assert "IDENTIFICATION" not in texts["jaxhil_controller.h"]
     includes = set(re.findall(r"#include <(.*)>", texts["jaxhil_controller.h"]))
     assert includes <= {"float.h", "math.h", "stdbool.h", "stddef.h", "stdint.h"}
-    assert texts == c99_texts(gain_document("phase_lead"))
+    assert texts == generate_c99(gain_document("phase_lead"))
 
 
 class ToyLaw(Compensator):
@@ -219,11 +219,11 @@ def test_c99_user_registered_compensator_outside_subset_is_rejected(monkeypatch)
     line = inspect.getsourcelines(ToyLawWithText)[1] + 4
     expected = rf"^c99: toy: \S*test_c99_sources\.py:{line}: found sum\(\.\.\.\), expected [^\n]*$"
     with pytest.raises(InputError, match=expected):
-        c99_texts(toy_document(monkeypatch, ToyLawWithText))
+        generate_c99(toy_document(monkeypatch, ToyLawWithText))
 
 
 def test_c99_export_rejects_document_that_runtime_rejects():
     document = gain_document()
     document["gains"]["forgetting"]["value"] = 0.99
     with pytest.raises(GainFileError, match="sha256"):
-        c99_texts(document)
+        generate_c99(document)

@@ -239,7 +239,7 @@ def test_tune_rejects_unusable_start_gains(jaxhil, tuned, tmp_path):
     (tmp_path / "broken.json").write_text("{")
     start = ["tune", "rig-300kg", "-o", tmp_path / "out", "--start"]
     refused(jaxhil(*start, tuned), "--start", str(tuned)[:20], "phase_lead", "response_error")
-    refused(jaxhil(*start, tuned, "nowhere.json"), "allowed gains of response_error")
+    refused(jaxhil(*start, tuned, "nowhere.json"), "expected gains of response_error")
     refused(jaxhil(*start, tmp_path / "broken.json"), "broken.json")
     refused(jaxhil(*start, "nowhere.json"), "nowhere.json", "No such file")
     assert not (tmp_path / "out").exists()
@@ -249,7 +249,7 @@ def test_tune_rejects_unknown_objective_and_bad_weight(jaxhil, tmp_path):
     weights = ["--divergence-weight", "0"], ["--noise-weight", "-1"], ["--chatter-weight", "nan"]
     for wrong in (["--objective", "mean"], *weights):
         ran = jaxhil("tune", "-o", tmp_path, *wrong, *TINY)
-        assert ran.code == 2 and ran.err.count("\n") == 1 and "allowed" in ran.err
+        assert ran.code == 2 and ran.err.count("\n") == 1 and "expected" in ran.err
 
 
 def test_tune_rejects_folder_without_mechanism_files(jaxhil, tmp_path):

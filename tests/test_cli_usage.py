@@ -13,13 +13,13 @@ import pytest
 from conftest import Ran
 
 from jaxhil.mechanism.file import builtin_names, load, six_axis_names, suite_names
-from jaxhil.mechanism.json_schema import json_schema
-from jaxhil.simulation import environment
-from tuning.cli.commands.tune import folder_name, is_better
+from jaxhil.mechanism.json_schema import build_json_schema
+from jaxhil.simulation import jax_environment
+from tuning.api.sweep_options import DEFAULT_SOBOL_SCENARIOS
+from tuning.cli.commands.tune import is_better, make_folder_name
 from tuning.cli.options import DEFAULT_PLOT
-from tuning.cli.parser import complete_bare
-from tuning.front_door.sweep_options import DEFAULT_DRIVERS
-from tuning.gains.tune import ErrorFigures
+from tuning.cli.parser import complete_bare_options
+from tuning.gains.tune import ErrorMetrics
 
 
 def refused(ran, *words):
@@ -135,7 +135,7 @@ def test_mechanisms_command_lists_builtin_files(jaxhil):
     listed = jaxhil("mechanisms").out
     assert all(entry["source"][:20] in listed for entry in [*entries, *document["suites"]])
     assert str(Path(rig["path"]).parent) in "".join(listed.split("\n"))
-    assert jaxhil("mechanisms", "--schema").document == json_schema()
+    assert jaxhil("mechanisms", "--schema").document == build_json_schema()
 
 
 @pytest.mark.parametrize(
@@ -179,60 +179,70 @@ def test_cli_prints_version_and_shell_completion(jaxhil):
 
 
 def test_plot_option_without_value_gets_default_name():
-    assert complete_bare(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
-    assert complete_bare(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
-    assert complete_bare(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
+    assert complete_bare_options(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
+    assert complete_bare_options(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
+    assert complete_bare_options(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
 
 
 def test_study_options_without_value_get_default_number():
-    assert complete_bare(["--drivers", "64", "--rare", "0.02"]) == ["--drivers", "64", "--rare", "0.02"]
-    assert complete_bare(["--rare", "gains.json"]) == ["--rare", "0", "gains.json"]
-    assert complete_bare(["--drivers", "--rare"]) == ["--drivers", str(DEFAULT_DRIVERS), "--rare", "0"]
+    assert complete_bare_options(["--drivers", "64", "--rare", "0.02"]) == [
+        "--drivers",
+        "64",
+        "--rare",
+        "0.02",
+    ]
+    assert complete_bare_options(["--rare", "gains.json"]) == ["--rare", "0", "gains.json"]
+    assert complete_bare_options(["--drivers", "--rare"]) == [
+        "--drivers",
+        str(DEFAULT_SOBOL_SCENARIOS),
+        "--rare",
+        "0",
+    ]
 
 
 def test_folder_name_keeps_unicode_and_replaces_unsafe_names():
-    assert folder_name("rig-300kg") == "rig-300kg"
-    assert folder_name("../a b/c") == "a_b_c"
-    assert folder_name("..") == "mechanism"
+    assert make_folder_name("rig-300kg") == "rig-300kg"
+    assert make_folder_name("../a b/c") == "a_b_c"
+    assert make_folder_name("..") == "mechanism"
     for name in ("機構一", "стенд-2", "שלום", "हिन्दी", "é"):
-        assert folder_name(name) == name
-    assert folder_name("e\u0301") == "é"
-    assert folder_name("CON") != "CON" and folder_name("com1.rig") != "com1.rig"
-    long = [folder_name("機" * 90 + end) for end in "ab"]
+        assert make_folder_name(name) == name
+    assert make_folder_name("e\u0301") == "é"
+    assert make_folder_name("CON") != "CON" and make_folder_name("com1.rig") != "com1.rig"
+    long = [make_folder_name("機" * 90 + end) for end in "ab"]
     assert long[0] != long[1] and all(len(name.encode()) <= 120 for name in long)
 
 
 @hypothesis.given(hypothesis.strategies.text(min_size=1, max_size=100).filter(str.isprintable))
 def test_folder_name_is_a_single_safe_path_component(name):
-    folder = folder_name(name)
+    folder = make_folder_name(name)
     assert folder not in ("", ".", "..") and "/" not in folder and folder.isprintable()
     assert len(folder.encode()) <= 120 and not folder.startswith(".")
 
 
 def test_is_better_compares_failures_before_errors():
     def made(rms, failed):
-        return ErrorFigures(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
+        return ErrorMetrics(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
     assert is_better(made(0.1, 0), made(0.2, 0)) and not is_better(made(0.2, 0), made(0.1, 0))
     assert is_better(made(0.2, 0), made(0.1, 1)) and not is_better(made(float("nan"), 0), made(0.1, 0))
 
 
 def test_xla_flags_of_user_take_precedence(monkeypatch):
-    names = [flag.split("=")[0] for flag in environment.flags("").split()]
+    names = [flag.split("=")[0] for flag in jax_environment.build_xla_flags("").split()]
     assert names == [
         "--xla_force_host_platform_device_count",
         "--xla_backend_optimization_level",
         "--xla_backend_extra_options",
     ]
     user_flags = "--xla_backend_optimization_level=3 --xla_dump_to=x"
-    assert environment.flags(user_flags).startswith(user_flags)
-    assert environment.flags(user_flags).count("optimization_level") == 1
+    assert jax_environment.build_xla_flags(user_flags).startswith(user_flags)
+    assert jax_environment.build_xla_flags(user_flags).count("optimization_level") == 1
 
 
 def test_cache_folder_is_created_or_none_if_impossible(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "below"))
-    assert environment.cache_folder() is None
+    assert jax_environment.cache_folder() is None
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "new"))
-    assert environment.cache_folder() == tmp_path / "new"
+    assert jax_environment.cache_folder() == tmp_path / "new"
     assert (tmp_path / "new").is_dir()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
 from jaxhil.rig.gain_file import GainFile
-from jaxhil.rig.limits import NO_LIMITS, complete
+from jaxhil.rig.limits import NO_LIMITS, complete_limits
 
 OK = 0
 BRIDGED = {"missed_in_a_row": 3.0}
@@ -20,7 +20,7 @@ BRIDGED = {"missed_in_a_row": 3.0}
 
 def faults(times, period: float = 1e-3, events=None, **limits: float) -> list[int]:
     """Return the faults of ticks at these times [s], the same in C; after a trip, none."""
-    gain_file = GainFile("none", {}, period, math.inf, complete(limits) if limits else NO_LIMITS)
+    gain_file = GainFile("none", {}, period, math.inf, complete_limits(limits) if limits else NO_LIMITS)
     rows = np.zeros((len(times), len(ROW)))
     rows[:, ROW.index("time")] = times
     rows[:, ROW.index("timed")] = 1.0

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import c99_cases
 import pytest
 
-from jaxhil.codegen import Program, SubsetError
+from jaxhil.codegen import CProgram, SubsetError
 from jaxhil.rig.filters import DelayLine
 from jaxhil.rig.types import Positive
 
@@ -172,7 +172,7 @@ FUNCTIONS = (
 OF_INTS = (whole, product_of_ints, remainders_of_ints)
 
 
-def compiled(tmp_path, program: Program, more: str = "") -> ctypes.CDLL:
+def compiled(tmp_path, program: CProgram, more: str = "") -> ctypes.CDLL:
     """Return the program as a shared library, compiled as strictly as the controller."""
     output = program.output()
     text = f"{HEADER}#define T_LAG_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
@@ -190,7 +190,7 @@ def same(actual: float, expected: float) -> bool:
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
 def test_c99_function_equals_python_to_the_bit_or_fails_where_python_raises(function, tmp_path):
     guarded = caught(function)
-    program = Program("t_", public={guarded: "t_guarded"})
+    program = CProgram("t_", public={guarded: "t_guarded"})
     program.add(guarded)
     in_c = compiled(tmp_path, program).t_guarded
     in_c.restype, in_c.argtypes = ctypes.c_double, (ctypes.c_double, ctypes.c_double)
@@ -222,7 +222,7 @@ double step(double a, double b) {{
 @needs_compiler
 def test_c99_classes_records_and_lists_equal_python_to_the_bit(tmp_path):
     """Include state that a failed tick leaves half done."""
-    program = Program("t_")
+    program = CProgram("t_")
     program.add(Outer.__init__, Outer)
     program.add(Outer.step, Outer)
     library = compiled(tmp_path, program, f"bool begin(double);\ndouble step(double, double);\n{STATEFUL}")
@@ -303,7 +303,7 @@ class Sharing:
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
-    program = Program("t_")
+    program = CProgram("t_")
     with pytest.raises(SubsetError) as error:
         program.add(function, Sharing if function is Sharing.__init__ else None)
         program.output()
@@ -312,7 +312,7 @@ def test_construct_outside_c99_subset_is_rejected_with_file_and_line(function, l
 
 
 def test_c99_public_function_that_may_raise_is_rejected():
-    program = Program("t_", public={divide: "t_divide"})
+    program = CProgram("t_", public={divide: "t_divide"})
     program.add(divide)
     with pytest.raises(SubsetError, match=r"found a division whose divisor may be 0 within t_divide"):
         program.output()
@@ -324,14 +324,14 @@ def test_c99_divisors_that_cannot_be_zero_are_not_checked():
             return a / 3.0
         return a / b + a / (1.0 + b * b) + sqrt(a * a) / sqrt(b)
 
-    program = Program("t_", public={safe: "t_safe"})
+    program = CProgram("t_", public={safe: "t_safe"})
     program.add(safe)
     assert "error" not in program.output().definitions
 
 
 def test_c99_output_is_deterministic():
     def text() -> tuple[str, str]:
-        program = Program("t_")
+        program = CProgram("t_")
         program.add(Outer.__init__, Outer)
         program.add(Outer.step, Outer)
         return tuple(program.output())

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from lanes import IDEAL, SECOND_ORDER, as_arrays, mechanism, run_rollout, validated
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
-from jaxhil.simulation.outcome import compare_with_reference
+from jaxhil.simulation.outcome import compare_with_ideal
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.batches import join
-from tuning.gains.common_program import common_programs
+from tuning.batches import join_batches
+from tuning.gains.common_program import group_by_common_program
 
 SPREAD = {"contact.stiffness": {"distribution": "uniform", "factor": [0.5, 2.0]}}
 CONTACTS = {
@@ -49,9 +49,9 @@ GAINS, LANES = {"phase_lead": 0.005, "lead_filter": 0.001}, 4
 
 
 def test_common_program_includes_every_contact_law():
-    groups = common_programs(list(MEMBERS.values()))
+    groups = group_by_common_program(list(MEMBERS.values()))
     assert [len(group) for group, _ in groups] == [len(MEMBERS)]
-    assert set(groups[0][1].laws) == set(LAWS)
+    assert set(groups[0][1].laws) == set(CONTACT_LAWS)
 
 
 def test_common_program_keeps_two_surfaces_and_other_orders_separate():
@@ -62,23 +62,23 @@ def test_common_program_keeps_two_surfaces_and_other_orders_separate():
         mechanism({}, SECOND_ORDER, command_hold="zoh"),
         mechanism(CONTACTS["hardening"], contacts=2),
     ]
-    groups = [group for group, _ in common_programs([validated(raw) for raw in others])]
+    groups = [group for group, _ in group_by_common_program([validated(raw) for raw in others])]
     assert groups == [[0], [1], [2], [3], [4]]
 
 
 @pytest.mark.slow
 def test_common_program_gives_the_same_results_as_separate_programs():
     chosen = [MEMBERS[name] for name in ALONE]
-    [(_, common)] = common_programs(chosen)
+    [(_, common)] = group_by_common_program(chosen)
     scenarios = [build_scenarios(member, draw(member, LANES, 1), 1) for member in chosen]
     in_form = [common.scenarios(member, batch) for member, batch in zip(chosen, scenarios, strict=True)]
-    joined = join(in_form)
+    joined = join_batches(in_form)
     together = evaluate(common.loop(build_loop(MEMBERS["noisy"], "phase_lead", joined)), GAINS, joined)
     for index, (name, member, batch) in enumerate(zip(ALONE, chosen, scenarios, strict=True)):
         loop = build_loop(member, "phase_lead", batch)
         batch = jax.tree.map(jnp.asarray, batch)
         metrics = run_rollout(loop, as_arrays(GAINS), batch)
-        expected = compare_with_reference(loop, batch, metrics)
+        expected = compare_with_ideal(loop, batch, metrics)
         lanes = slice(index * LANES, (index + 1) * LANES)
         good = np.asarray(expected.good)
         assert np.all(good == expected.wanted) and np.any(good)
@@ -99,7 +99,7 @@ def test_common_program_with_cells_mixes_sensors_with_and_without_lag(exact):
     yielding = mechanism({"law": "elastoplastic", "unloading_ratio": 1.5}, SECOND_ORDER, period=1e-3)
     stiff = mechanism({"law": "kelvin_voigt", "stiffness": [5e6]}, SECOND_ORDER, period=1e-3)
     parsed = [validated(member) for member in (lagging, yielding, *([] if exact else [stiff]))]
-    ((_, common),) = common_programs(parsed)
+    ((_, common),) = group_by_common_program(parsed)
     assert "has_lag" in common.parts
     for member in parsed[:2]:
         scenarios = build_scenarios(member, {"approach.phase": np.arange(4) / 4}, 0)

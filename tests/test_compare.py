@@ -10,12 +10,18 @@ from math import inf, nan
 
 import pytest
 
-from jaxhil.simulation.contact_plot import save
+from jaxhil.simulation.contact_plot import save_figure
 from tuning import terminal
-from tuning.benchmark.cost import microseconds_per_tick
-from tuning.benchmark.study import LawFigures
-from tuning.benchmark.tables import HEADINGS, leaderboard, least, mechanism_table, winners
-from tuning.plots.comparison import errors_plot, transparency_plot
+from tuning.benchmark.comparison import LawMetrics
+from tuning.benchmark.computing_time import measure_tick_time
+from tuning.benchmark.tables import (
+    METRIC_HEADINGS,
+    build_leaderboard,
+    build_mechanism_table,
+    describe_least_errors,
+    find_winners,
+)
+from tuning.plots.comparison import plot_errors, plot_transparency
 from tuning.statistics.intervals import Estimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
@@ -60,13 +66,13 @@ def test_compare_command_is_reproducible_from_seed(tmp_path):
 
 
 def figures(rms, **others):
-    estimates = dict.fromkeys(HEADINGS, Estimate(1.0, 0.9, 1.1))
+    estimates = dict.fromkeys(METRIC_HEADINGS, Estimate(1.0, 0.9, 1.1))
     return {**estimates, "rms": Estimate(rms, 0.9 * rms, 1.1 * rms), **others}
 
 
 FOUND = [
-    LawFigures("none", "m", {"literature": {}}, {"literature": figures(0.5)}),
-    LawFigures(
+    LawMetrics("none", "m", {"literature": {}}, {"literature": figures(0.5)}),
+    LawMetrics(
         "phase_lead",
         "m",
         {"literature": {"phase_lead": 0.1}, "tuned": {"phase_lead": 0.2}},
@@ -76,34 +82,36 @@ FOUND = [
 
 
 def test_compare_tables_mark_the_best_compensator(capsys):
-    terminal.emit(mechanism_table("m", FOUND), leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]}))
+    terminal.emit(
+        build_mechanism_table("m", FOUND), build_leaderboard(["m", "n"], {"m": FOUND, "n": FOUND[:1]})
+    )
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if line.strip()]
     assert ["none", "50"] in [row[:2] for row in rows] and ["phase_lead", "40"] in [row[:2] for row in rows]
     # Tuned gains win by more than the intervals; a missing value is a dash.
     assert ["tuned", "10*", "100", "-"] in [row[:4] for row in rows]
     assert ["m", "50", "10*"] in rows and ["n", "50", "-"] in rows
-    assert winners(FOUND)["rms"] == "phase_lead" and winners(FOUND)["late"] is None
+    assert find_winners(FOUND)["rms"] == "phase_lead" and find_winners(FOUND)["late"] is None
 
 
 def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
     """Print whole lines wider than a page; the settings of a compensator do not compete with it."""
-    ours = LawFigures("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
-    many = [*FOUND, ours, *(LawFigures(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
-    better = [*FOUND, LawFigures("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
+    ours = LawMetrics("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
+    many = [*FOUND, ours, *(LawMetrics(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
+    better = [*FOUND, LawMetrics("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
     board = {"m": many, "n": better}
-    terminal.emit(leaderboard(["m", "n"], board), wrap=False)
+    terminal.emit(build_leaderboard(["m", "n"], board), wrap=False)
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["m", "50", "10", "5*", "6", *["50"] * 12] in rows
     assert ["n", "50", "10*", "20", "-", *["-"] * 12] in rows
-    assert least(["m", "n"], board) == "Least rms error: impulse_ledger (m); phase_lead (n)."
-    assert least(["m"], {"m": FOUND[:1]}) == ""
+    assert describe_least_errors(["m", "n"], board) == "Least rms error: impulse_ledger (m); phase_lead (n)."
+    assert describe_least_errors(["m"], {"m": FOUND[:1]}) == ""
 
 
 def test_compare_tables_omit_tuned_rows_without_tuning(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
-    result = [FOUND[0], LawFigures("impulse_ledger", "m", {}, both)]
-    terminal.emit(mechanism_table("m", result), leaderboard(["m"], {"m": result}))
+    result = [FOUND[0], LawMetrics("impulse_ledger", "m", {}, both)]
+    terminal.emit(build_mechanism_table("m", result), build_leaderboard(["m"], {"m": result}))
     out = capsys.readouterr().out
     assert "tuned" not in out and "  gentle  " in out
     assert out.count("with the literature's gains") == 2
@@ -111,13 +119,13 @@ def test_compare_tables_omit_tuned_rows_without_tuning(capsys):
 
 def test_compare_plots_are_written(tmp_path):
     both = {"m": FOUND, "n": FOUND}
-    save(errors_plot(["m", "n"], both, 0.01), tmp_path / "errors.png")
-    save(transparency_plot(["m", "n"], both), tmp_path / "honesty.png")
+    save_figure(plot_errors(["m", "n"], both, 0.01), tmp_path / "errors.png")
+    save_figure(plot_transparency(["m", "n"], both), tmp_path / "honesty.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
 
 
 def test_compare_cost_per_tick_is_a_positive_time():
-    assert 0 < microseconds_per_tick("phase_lead", literature("phase_lead"), 1e-3, inf, 0.005) < 1e3
+    assert 0 < measure_tick_time("phase_lead", literature("phase_lead"), 1e-3, inf, 0.005) < 1e3
 
 
 def literature(law):
@@ -130,12 +138,12 @@ def literature(law):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--compensators", "magic"], "--compensators: found 'magic', allowed none, dead_zone_observer"),
+        (["--compensators", "magic"], "--compensators: found 'magic', expected none, dead_zone_observer"),
         (["no-such-file"], "no-such-file"),
-        (["varying", "varying"], "name: found varying, allowed a name other than that of varying"),
-        (["--judged", "1"], "--judged: found 1, allowed an integer >= 2"),
-        (["--scenarios", "0"], "--scenarios: found 0, allowed an integer >= 1"),
-        (["--limit", "nan"], "--limit: found nan, allowed a number >= 0"),
+        (["varying", "varying"], "name: found varying, expected a name other than that of varying"),
+        (["--judged", "1"], "--judged: found 1, expected an integer >= 2"),
+        (["--scenarios", "0"], "--scenarios: found 0, expected an integer >= 1"),
+        (["--limit", "nan"], "--limit: found nan, expected a number >= 0"),
     ],
 )
 def test_compare_reports_unusable_input_in_one_line(jaxhil, arguments, message, tmp_path, monkeypatch):

@@ -33,9 +33,9 @@ def test_compare_gives_the_same_results_if_a_worker_is_killed(tmp_path, monkeypa
     here = tuning.compare(mechanisms, LAWS, **FEW)
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
-        from tuning.benchmark import study
+        from tuning.benchmark import comparison
 
-        killed_meanwhile(monkeypatch, study, cluster, first)
+        killed_meanwhile(monkeypatch, comparison, cluster, first)
         there = tuning.compare(mechanisms, LAWS, scheduler=cluster.address, **FEW)
         assert first.poll() is not None
     assert [figures(board) for board in there] == [figures(board) for board in here]

@@ -10,26 +10,26 @@ from continuous import delayed_restitution
 from jaxtyping import Array
 from lanes import IDEAL, QUICK, mechanism, validated
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.laws import compensators
 from jaxhil.laws.simulation_base import Compensator, Gain
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.benchmark.runs import build_scene, judge_gains
-from tuning.gains.common_program import common_programs
-from tuning.transparency.damping_perturbations import LARGEST_RATIO, perturb_damping
-from tuning.transparency.figures import (
-    CLOSER_TO_1,
+from tuning.benchmark.runs import build_scenario_set, evaluate_gains
+from tuning.gains.common_program import group_by_common_program
+from tuning.transparency.damping_perturbations import MAX_DAMPING_RATIO, perturb_damping
+from tuning.transparency.metrics import (
+    BEST_AT_ONE,
     Estimate,
-    distance,
-    resampled,
-    share,
-    slope,
-    transmitted,
-    winner,
+    bootstrap_metric,
+    compute_distance_from_best,
+    estimate_share,
+    find_winner,
+    fit_slope,
+    fit_transmission,
 )
 
 LIMIT, SEED, LANES = 0.01, 3, 16
@@ -38,9 +38,9 @@ SPREAD = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.
 
 def judged(raw, law, gains=None, number=LANES):
     parsed = validated({**raw, "uncertainty": SPREAD})
-    [(_, form)] = common_programs([parsed])
-    scene = build_scene(parsed, form, number, SEED)
-    return judge_gains(scene, law, gains or {}, LIMIT, SEED)
+    [(_, form)] = group_by_common_program([parsed])
+    scene = build_scenario_set(parsed, form, number, SEED)
+    return evaluate_gains(scene, law, gains or {}, LIMIT, SEED)
 
 
 def test_ideal_rig_has_zero_error_and_full_transparency():
@@ -125,24 +125,24 @@ def test_damping_perturbations_span_a_third_of_the_speed(name):
     lossy = []
     for member, values in ((parsed, draws), (twin, twin_draws)):
         batch = build_scenarios(member, values)
-        assert build_loop(member, "none", batch).law == LAWS[member.contact.law]
+        assert build_loop(member, "none", batch).law == CONTACT_LAWS[member.contact.law]
         contact = type(batch.contact)(
             *(jnp.asarray(leaf)[0] if leaf is not None else None for leaf in batch.contact)
         )
         mass, velocity = jnp.asarray(batch.equivalent_mass), jnp.asarray(batch.velocity)
-        of_law = jax.jit(LAWS[member.contact.law].reference, compiler_options=QUICK)
+        of_law = jax.jit(CONTACT_LAWS[member.contact.law].reference, compiler_options=QUICK)
         lossy.append(np.asarray(of_law(contact, mass, velocity).restitution))
     before, after = lossy
     lost = 1 - after / before
     assert np.all(lost >= -1e-9) and np.min(lost) < 0.02
-    assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * LARGEST_RATIO))
+    assert 0.2 < np.max(lost) < 1.3 * (1 - np.exp(-np.pi * MAX_DAMPING_RATIO))
 
 
 def test_transparency_and_slope_are_least_squares_estimates():
     true = np.array([0.01, -0.02, 0.03])
-    assert transmitted(0.4 * true, true) == pytest.approx(0.4)
+    assert fit_transmission(0.4 * true, true) == pytest.approx(0.4)
     reference = np.array([0.5, 0.7, 0.9])
-    assert slope(0.2 + 0.8 * reference, reference) == pytest.approx(0.8)
+    assert fit_slope(0.2 + 0.8 * reference, reference) == pytest.approx(0.8)
 
 
 def test_comparison_intervals_have_stated_coverage():
@@ -150,28 +150,30 @@ def test_comparison_intervals_have_stated_coverage():
     hits, every = 0, np.ones((1, 60), bool)
     for seed in range(200):
         sample = rng.normal(1.0, 1.0, 60)
-        result = resampled(lambda values: np.mean(values, axis=-1), seed, every, sample[None])
+        result = bootstrap_metric(lambda values: np.mean(values, axis=-1), seed, every, sample[None])
         hits += result.low <= 1.0 <= result.high
     # Binomial(200, 0.95) is below 181 with probability 0.3 %.
     assert 181 <= hits <= 200
-    none = share(np.zeros(100, bool))
+    none = estimate_share(np.zeros(100, bool))
     assert none.value == 0 and none.low == 0 and none.high == pytest.approx(1 - 0.025 ** (1 / 100))
 
 
 def test_winner_requires_separated_intervals():
     figures = {"a": Estimate(0.1, 0.09, 0.11), "b": Estimate(0.2, 0.12, 0.3), "c": Estimate(0.15, 0.105, 0.2)}
-    assert winner("rms", figures) is None
-    assert winner("rms", {name: figures[name] for name in "ab"}) == "a"
-    assert winner("rms", {"a": figures["a"]}) is None
+    assert find_winner("rms", figures) is None
+    assert find_winner("rms", {name: figures[name] for name in "ab"}) == "a"
+    assert find_winner("rms", {"a": figures["a"]}) is None
     # A compensator with unfinished contacts has no interval; it does not win and does not block a winner.
-    assert winner("rms", {"a": figures["a"], "b": figures["b"], "d": Estimate(0.01, np.nan, np.nan)}) == "a"
+    assert (
+        find_winner("rms", {"a": figures["a"], "b": figures["b"], "d": Estimate(0.01, np.nan, np.nan)}) == "a"
+    )
 
 
 def test_transparency_distance_is_measured_from_1():
-    assert set(CLOSER_TO_1) == {"early", "late", "slope"}
-    assert distance("early", Estimate(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
-    assert distance("slope", Estimate(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
-    assert distance("rms", Estimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
+    assert set(BEST_AT_ONE) == {"early", "late", "slope"}
+    assert compute_distance_from_best("early", Estimate(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
+    assert compute_distance_from_best("slope", Estimate(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
+    assert compute_distance_from_best("rms", Estimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
 
 
 def test_comparison_resamples_scenarios_with_all_their_contacts():
@@ -182,7 +184,7 @@ def test_comparison_resamples_scenarios_with_all_their_contacts():
     def mean(values):
         return np.nanmean(values, axis=-1)
 
-    once = resampled(mean, 0, good[:1], sample[None])
-    assert resampled(mean, 0, good, np.tile(sample, (4, 1))) == pytest.approx(once, rel=1e-12)
+    once = bootstrap_metric(mean, 0, good[:1], sample[None])
+    assert bootstrap_metric(mean, 0, good, np.tile(sample, (4, 1))) == pytest.approx(once, rel=1e-12)
     good[1:] = False
-    assert resampled(mean, 0, good, np.tile(1e3 * sample, (4, 1)) * [[1e-3], [1], [1], [1]]) == once
+    assert bootstrap_metric(mean, 0, good, np.tile(1e3 * sample, (4, 1)) * [[1e-3], [1], [1], [1]]) == once

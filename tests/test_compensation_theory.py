@@ -26,7 +26,7 @@ from lanes import (
 from jaxhil.laws.phase_lead.simulation import PhaseLead
 from jaxhil.laws.response_error.simulation import ResponseError
 from jaxhil.laws.simulation_base import Compensator
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 
 PHASES = (np.arange(8) + 0.5) / 8
 

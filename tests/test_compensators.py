@@ -16,8 +16,8 @@ from gain_documents import GAINS, gain_document, sign
 from lanes import QUICK
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.shared import estimates as known
-from jaxhil.laws.simulation_base import Compensator, Constants, Signals
+from jaxhil.laws.shared import nominal_values as known
+from jaxhil.laws.simulation_base import Compensator, KnownConstants, Signals
 from jaxhil.mechanism.file import load
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.rig import Controller, GainFileError
@@ -85,7 +85,7 @@ def readings(shape=(), clearance=math.inf):
     velocity = 40 * 3e-4 * size * np.cos(40 * time - 0.3)
     age = np.broadcast_to((np.arange(TICKS) % 120).reshape(time.shape), velocity.shape)
     signals = Signals(force, motion(0.0), velocity, motion(0.0063), age.astype(np.int32))
-    constants = Constants(np.full(shape, PERIOD), np.full(shape, clearance))
+    constants = KnownConstants(np.full(shape, PERIOD), np.full(shape, clearance))
     return jax.tree.map(jnp.asarray, (signals, constants))
 
 
@@ -277,7 +277,7 @@ def test_compensator_noise_amplification_matches_prediction(name):
     """Add white noise to the force readings of a contact held still."""
     ticks, gains = 40_000, {gain: entry["value"] for gain, entry in GAINS[name].items()}
     law = COMPENSATORS[name]
-    constants = Constants(jnp.asarray(PERIOD), jnp.asarray(math.inf))
+    constants = KnownConstants(jnp.asarray(PERIOD), jnp.asarray(math.inf))
     predicted = float(law.noise_amplification(some_gains(name), constants))
     controller = ON_THE_RIG[name](gains, PERIOD, math.inf)
     noise = np.random.default_rng(5).standard_normal(ticks)

@@ -10,8 +10,8 @@ import pytest
 from compiling import programs_of
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxhil.files import read_sealed
-from jaxhil.simulation.compile_cache import ENDING, keep_sealed
+from jaxhil.files import read_checksummed
+from jaxhil.simulation.compile_cache import EXECUTABLE_SUFFIX, use_checksummed_cache
 
 VALUE = 1.75
 
@@ -20,7 +20,7 @@ VALUE = 1.75
 def folder(tmp_path):
     """Let jax cache compiled programs in this folder only."""
     before = jax.config.jax_compilation_cache_dir
-    assert keep_sealed(tmp_path)
+    assert use_checksummed_cache(tmp_path)
     compilation_cache.reset_cache()
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     yield tmp_path
@@ -51,15 +51,15 @@ def check_flips(folder, number, seed):
     whole = file.read_bytes()
     for bit in np.random.default_rng(seed).integers(0, 8 * len(whole), number):
         file.write_bytes(flipped(whole, bit))
-        assert read_sealed(file) is None
+        assert read_checksummed(file) is None
         assert compute() == expected
-        assert read_sealed(file) is not None
+        assert read_checksummed(file) is not None
 
 
 def test_compile_cache_stores_and_reuses_checksummed_programs(folder):
     expected = compute()
     files = {path: path.stat().st_ino for path in folder.iterdir()}
-    assert files and all(path.name.endswith(ENDING) and read_sealed(path) for path in files)
+    assert files and all(path.name.endswith(EXECUTABLE_SUFFIX) and read_checksummed(path) for path in files)
     made = programs_of("kept_sum")
     assert compute() == expected and programs_of("kept_sum") == made + 1
     # The program was read, not compiled and written again.
@@ -81,7 +81,7 @@ def test_compile_cache_rejects_every_flipped_bit(folder):
     whole = file.read_bytes()
     for bit in np.random.default_rng(2).integers(0, 8 * len(whole), 1000):
         file.write_bytes(flipped(whole, bit))
-        assert read_sealed(file) is None
+        assert read_checksummed(file) is None
 
 
 @pytest.mark.parametrize("there", ["link", "pipe", "cut"])
@@ -105,4 +105,4 @@ def test_compile_cache_ignores_links_pipes_and_truncated_files(folder, tmp_path_
 
 def test_compile_cache_is_disabled_without_jax_interface(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "jax._src.compilation_cache_interface", None)
-    assert not keep_sealed(tmp_path)
+    assert not use_checksummed_cache(tmp_path)

@@ -21,21 +21,21 @@ from rig_lock_step import closed_loop, controller
 
 import jaxhil
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Constants
-from jaxhil.mechanism.file import builtin_names, to_builtins
+from jaxhil.laws.simulation_base import KnownConstants
+from jaxhil.mechanism.file import builtin_names, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.gain_file import check_document
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import white_noise
-from jaxhil.simulation.watch import LONGEST_FADING, build_rules
-from tuning.bundle.bundle import limits_section
+from jaxhil.simulation.watch import MAX_DECAY_WAIT, build_end_conditions
+from tuning.bundle.bundle import build_limits_section
 from tuning.gain_file import build_document
 from tuning.gains.tasks import build_task
 from tuning.rig.contact_watch import ContactWatch
-from tuning.rig.plant import Plant
+from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import NumericalModel
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import calibrate
@@ -77,7 +77,7 @@ TUNED = {
 def amplification(name: str, gains: dict[str, float], period: float) -> float:
     """Return by how much a compensator amplifies the sensor's noise."""
     leaves = {key: jnp.asarray(value) for key, value in gains.items()}
-    return float(COMPENSATORS[name].noise_amplification(leaves, Constants(jnp.asarray(period), jnp.inf)))
+    return float(COMPENSATORS[name].noise_amplification(leaves, KnownConstants(jnp.asarray(period), jnp.inf)))
 
 
 def loud_gains(parsed: Mechanism, name: str) -> dict[str, float]:
@@ -106,7 +106,7 @@ def restitutions(parsed: Mechanism, name: str, gains: dict[str, float], seeds: i
 
 def with_noise(parsed: Mechanism, std: float) -> Mechanism:
     """Return the mechanism with this force sensor noise [N]."""
-    raw = to_builtins(parsed)
+    raw = to_plain_data(parsed)
     raw["rig"]["force_sensor"]["noise_std"] = std
     return validated(raw)
 
@@ -131,7 +131,7 @@ def check_means(parsed: Mechanism, name: str, shares: tuple[float, ...], seeds: 
         if abs(np.mean(over) - free) <= BIAS + 3 * np.std(over) / math.sqrt(seeds):
             continue
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jaxhil.simulation.watch.LONGEST_FADING", 10 * LONGEST_FADING)
+            patch.setattr("jaxhil.simulation.watch.MAX_DECAY_WAIT", 10 * MAX_DECAY_WAIT)
             (later,) = restitutions(noisy, name, gains, seeds, jax.jit(rollout, static_argnums=0))[:1]
         assert abs(np.mean(later - over)) <= BIAS + 3 * np.std(later - over) / math.sqrt(seeds), (name, share)
 
@@ -160,12 +160,12 @@ def test_contact_end_is_declared_after_the_whole_impulse(name):
 
 def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: float) -> tuple[float, float]:
     """Return the first contact's restitution, and that after another `factor` times the longest wait."""
-    law, plant, watch = controller(parsed, name, gains), Plant(parsed), ContactWatch(parsed)
-    model = NumericalModel(to_builtins(parsed))
+    law, plant, watch = controller(parsed, name, gains), RigHardware(parsed), ContactWatch(parsed)
+    model = NumericalModel(to_plain_data(parsed))
     position, velocity = model.start
     model.place(position, velocity)
     plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
-    result, left = None, math.ceil(factor * LONGEST_FADING / parsed.rig.control_period)
+    result, left = None, math.ceil(factor * MAX_DECAY_WAIT / parsed.rig.control_period)
     while left > 0:
         reading, measured = plant.read()
         force = law.step(reading, model.position, model.velocity, measured)
@@ -210,7 +210,7 @@ def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
     parsed = heavy(noise_std=1.0)
     document = exported(parsed, nominal_gains(parsed, "response_error", **TUNED))
     result = calibrate(check_document(document), scenarios=1024, limit=0.02)
-    document["limits"] = limits_section(result.limits)
+    document["limits"] = build_limits_section(result.limits)
     runs = run_in_c(tmp_path, parsed, sign(document), 1000, 60)
     alarms = int(np.count_nonzero(runs[:, 2]))
     stated = result.rates["false_alarms"]
@@ -223,7 +223,7 @@ def test_tuning_time_limit_includes_wait_for_noisy_contact_end():
     noisy, free = (
         build_task(heavy(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit for std in (1.0, 0.0)
     )
-    np.testing.assert_allclose(noisy - free, LONGEST_FADING)
+    np.testing.assert_allclose(noisy - free, MAX_DECAY_WAIT)
 
 
 def exported(parsed: Mechanism, gains: dict[str, float]) -> dict[str, Any]:
@@ -243,11 +243,11 @@ def run_in_c(folder, parsed: Mechanism, document: dict[str, Any], seeds: int, mo
     write_sources(folder, document)
     (folder / "noisy_plant.c").write_text(PLANT.read_text())
     program = compiled(folder, "noisy_plant.c", "rig", "-O2")
-    waits = build_rules(scenario)
+    waits = build_end_conditions(scenario)
     numbers = (
         *(parsed.bodies.mass, parsed.approach.velocity, contact.stiffness[0], contact.damping[0]),
         *(rig.simulator.natural_frequency, rig.simulator.damping_ratio, rig.simulator.delay, sensor.delay),
-        *(rig.command_latency, parsed.approach.phase, float(waits.patience[0]) + more),
+        *(rig.command_latency, parsed.approach.phase, float(waits.max_quiet[0]) + more),
     )
     ran = subprocess.run(
         [program, *(repr(float(number)) for number in numbers), folder / "noise"],

@@ -8,8 +8,15 @@ import pytest
 from lanes import QUICK, join, mechanism, run_rollout, spread, validated
 from oracle import simulate
 
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.cells import FASTEST_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole, join_counts
+from jaxhil.simulation.cells import (
+    MAX_POLE,
+    NO_CELLS,
+    CellCounts,
+    count_cells,
+    fastest_pole,
+    merge_cell_counts,
+)
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
@@ -138,7 +145,7 @@ def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, fre
     np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=4e-3)
 
 
-@pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, FASTEST_POLE])
+@pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, MAX_POLE])
 @pytest.mark.parametrize("lag", [0.0, 1e-9, 0.01, 0.3, 5.0])
 def test_cells_are_at_most_one_radian_and_one_time_constant_long(fastest, lag):
     counts = count_cells(fastest, np.array([lag]))
@@ -152,11 +159,11 @@ def test_cells_are_at_most_one_radian_and_one_time_constant_long(fastest, lag):
 
 def test_joined_cell_counts_cover_every_member():
     whole, windowed, plain = CellCounts(0, 16, 16), CellCounts(2, 64, 8), CellCounts(4, 0, 8)
-    assert join_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
-    assert join_counts([NO_CELLS, plain]) == plain
-    assert join_counts([whole, CellCounts(0, 4, 8)]) == whole
-    assert join_counts([whole, plain]) == CellCounts(16, 64, 16)
-    assert join_counts([windowed, plain]) == CellCounts(4, 64, 8)
+    assert merge_cell_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
+    assert merge_cell_counts([NO_CELLS, plain]) == plain
+    assert merge_cell_counts([whole, CellCounts(0, 4, 8)]) == whole
+    assert merge_cell_counts([whole, plain]) == CellCounts(16, 64, 16)
+    assert merge_cell_counts([windowed, plain]) == CellCounts(4, 64, 8)
 
 
 def test_fastest_pole_is_found_for_every_order():

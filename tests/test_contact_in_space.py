@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxhil.contact.laws import LAWS, ContactParameters
+from jaxhil.contact.laws import CONTACT_LAWS, ContactParameters
 from jaxhil.sixdof.bodies import (
     angular_momentum,
     build_body,
@@ -137,7 +137,7 @@ def group(law="regularised"):
     }
     return ContactGroup(
         ChaserSpheres(both("spheres"), jnp.asarray(same["radius"]), Plane(points, both("normals"))),
-        LAWS["hunt_crossley"],
+        CONTACT_LAWS["hunt_crossley"],
         parameters,
         frictions[law],
     )
@@ -292,10 +292,10 @@ def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
     pair, states, contact, step = prepared()
     parameters = contact.parameters._replace(unloading_ratio=jnp.full((2, len(LANES)), 4.0))
     same = [jnp.full((2, len(LANES)), value) for value in (0.2, 1e6, 10.0)]
-    yields = ContactGroup(contact.candidates, LAWS["elastoplastic"], parameters, Bristle(*same))
+    yields = ContactGroup(contact.candidates, CONTACT_LAWS["elastoplastic"], parameters, Bristle(*same))
     slack = Cavity(contact.candidates.centre, jnp.full((2, len(LANES)), 5.0))
     tether = ChaserSpheres(contact.candidates.centre, jnp.zeros((2, len(LANES))), slack)
-    tethered = ContactGroup(tether, LAWS["hunt_crossley"], contact.parameters, Frictionless())
+    tethered = ContactGroup(tether, CONTACT_LAWS["hunt_crossley"], contact.parameters, Frictionless())
     space = Space(pair, (yields, tethered), ())
     flight, _ = jax.jit(follow, static_argnums=3)(space, states, step, STEPS, step)
     final = flight.states

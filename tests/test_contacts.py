@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from lanes import IDEAL, MASS, QUICK, VELOCITY, first_contact, grid, mechanism, spread, validated
 
-from jaxhil.contact.laws import LAWS, ContactParameters, two_sided
-from jaxhil.contact.reference import hunt_crossley
-from jaxhil.contact.reference_motion import integrate_contact
+from jaxhil.contact.ideal_contact import ideal_hunt_crossley
+from jaxhil.contact.ideal_contact_motion import integrate_contact
+from jaxhil.contact.laws import CONTACT_LAWS, ContactParameters, compute_two_sided_force
 
 STIFFNESS, LANES = 124355.0, 6
 PERIODS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
@@ -29,7 +29,7 @@ def contact(**values):
 
 def reference(name, **values):
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
-    run = jax.jit(LAWS[name].reference, compiler_options=QUICK)
+    run = jax.jit(CONTACT_LAWS[name].reference, compiler_options=QUICK)
     return run(contact(**values), mass, velocity)
 
 
@@ -46,13 +46,15 @@ def test_hardening_undamped_matches_closed_form():
     np.testing.assert_allclose(result.duration[-1], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-8)
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if name != "piecewise_linear"])
+@pytest.mark.parametrize("name", [name for name in CONTACT_LAWS if name != "piecewise_linear"])
 def test_single_surface_equals_two_surfaces_infinitely_apart(name):
-    law, parameters = LAWS[name], contact(damping=260.0, preload=3.0, friction=2.0)
+    law, parameters = CONTACT_LAWS[name], contact(damping=260.0, preload=3.0, friction=2.0)
     position, velocity = np.array([-1e-3, -0.0, 1e-5, 2e-4, 2e-4, np.nan]), np.array([1, -1, 2, -3, 0, 1e-3])
     state = law.init(jnp.asarray(position))
     single, double = (
-        two_sided(law, parameters, state, jnp.asarray(position), jnp.asarray(velocity), clearance)
+        compute_two_sided_force(
+            law, parameters, state, jnp.asarray(position), jnp.asarray(velocity), clearance
+        )
         for clearance in (None, jnp.full(LANES, jnp.inf))
     )
     jax.tree.map(np.testing.assert_array_equal, single, double)
@@ -64,7 +66,7 @@ def test_depth_damped_equals_hunt_crossley_for_equal_parameters(exponent, dampin
     stiffness = 1e7 if exponent > 1 else STIFFNESS
     result = reference("depth_damped", stiffness=stiffness, exponent=exponent, damping=damping)
     parameters = MASS, stiffness, exponent, damping / (1.5 * 2e-4 * stiffness), VELOCITY
-    expected = jax.jit(hunt_crossley, compiler_options=QUICK)(
+    expected = jax.jit(ideal_hunt_crossley, compiler_options=QUICK)(
         *(np.full(LANES, value) for value in parameters)
     )
     for got, wanted in zip(result, expected, strict=True):
@@ -76,7 +78,7 @@ def test_elastoplastic_closed_form_matches_integration():
     result = reference("elastoplastic", unloading_ratio=ratio)
     np.testing.assert_allclose(result.restitution, ratio**-0.5, rtol=1e-15)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
-    law = LAWS["elastoplastic"]
+    law = CONTACT_LAWS["elastoplastic"]
     run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
     for got, wanted in zip(run(contact(unloading_ratio=ratio), mass, velocity)[:3], result, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
@@ -101,7 +103,7 @@ def test_preloaded_closed_form_matches_integration():
     np.testing.assert_allclose(result.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
     np.testing.assert_allclose(result.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
-    law = LAWS["preloaded"]
+    law = CONTACT_LAWS["preloaded"]
     run = jax.jit(partial(integrate_contact, law), compiler_options=QUICK)
     integrated = run(contact(preload=preload, friction=friction), mass, velocity)[:3]
     for got, wanted in zip(integrated, result, strict=True):
@@ -111,7 +113,7 @@ def test_preloaded_closed_form_matches_integration():
 
 
 def test_elastoplastic_loads_unloads_reloads_and_resets():
-    law, parameters = LAWS["elastoplastic"], contact(unloading_ratio=2.0)
+    law, parameters = CONTACT_LAWS["elastoplastic"], contact(unloading_ratio=2.0)
     state, forces = law.init(jnp.zeros(LANES)), []
     depths = np.array([1.0, 3.0, 2.0, 1.6, 1.0, 2.5, 4.0, 3.0, 0.0, 1.0])
     for depth in depths:
@@ -125,7 +127,7 @@ def test_integrated_reference_derivatives_match_finite_differences():
     values = {"damping": np.linspace(50.0, 900.0, LANES)}
 
     for name in ("hardening", "depth_damped"):
-        law = LAWS[name]
+        law = CONTACT_LAWS[name]
         parameters = contact(**values, stiffness=1e7 if name == "depth_damped" else STIFFNESS)
 
         def function(scales, parameters, law=law):

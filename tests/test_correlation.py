@@ -6,9 +6,16 @@ from mechanism_table import FULL
 from scipy import special, stats
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.correlation import certain, correlated_groups
-from jaxhil.mechanism.file import from_builtins, load, to_builtins
-from jaxhil.mechanism.uncertainty import at_points, dimensions, draw, extremes, quantiles, quasi_random
+from jaxhil.mechanism.correlation import find_correlated_groups, fix_at_nominal
+from jaxhil.mechanism.file import from_plain_data, load, to_plain_data
+from jaxhil.mechanism.uncertainty import (
+    compute_quantiles,
+    count_dimensions,
+    draw,
+    draw_at_points,
+    draw_extremes,
+    draw_quasi_random,
+)
 
 DELAY, DAMPING, SPEED = "rig.force_sensor.delay", "contact.damping", "approach.velocity"
 FREQUENCY, STIFFNESS = "rig.simulator.natural_frequency", "contact.stiffness"
@@ -24,9 +31,9 @@ MATRIX = [[1.0], [0.0, 1.0], [0.98, 0.1, 1.0], [0.0, 0.0, 0.0, 1.0]]
 
 
 def mechanism(keys=KEYS, matrix=MATRIX, changes=(), unset=()):
-    raw = to_builtins(load("varying").mechanism) | {"uncertainty": UNCERTAIN}
+    raw = to_plain_data(load("varying").mechanism) | {"uncertainty": UNCERTAIN}
     table = {} if keys is None else {"correlation": {"keys": keys, "matrix": matrix}}
-    return from_builtins(raw | table, "some file", changes, unset)
+    return from_plain_data(raw | table, "some file", changes, unset)
 
 
 def normals(values, parsed):
@@ -41,7 +48,7 @@ def normals(values, parsed):
     }
 
 
-@pytest.mark.parametrize("draws", [draw, quasi_random])
+@pytest.mark.parametrize("draws", [draw, draw_quasi_random])
 def test_correlated_draws_keep_marginals_and_have_stated_correlation(draws):
     parsed, number = mechanism(), 4096
     behind = normals(draws(parsed, number, 5), parsed)
@@ -93,27 +100,29 @@ def test_correlated_draw_depends_only_on_its_group_and_index():
 def test_correlation_leaves_quantiles_and_extremes_unchanged():
     opposed = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [-0.98, 1.0]])
     apart = mechanism(keys=None)
-    for key, ends in extremes(opposed).items():
-        np.testing.assert_array_equal(ends, extremes(apart)[key])
-    points = np.repeat([[0.001], [0.5], [0.999]], sum(dimensions(apart).values()), axis=1)
-    for key, values in quantiles(opposed, points).items():
-        np.testing.assert_array_equal(values, at_points(apart, points)[key])
-    damping = at_points(opposed, points)[DAMPING][:, 0]
+    for key, ends in draw_extremes(opposed).items():
+        np.testing.assert_array_equal(ends, draw_extremes(apart)[key])
+    points = np.repeat([[0.001], [0.5], [0.999]], sum(count_dimensions(apart).values()), axis=1)
+    for key, values in compute_quantiles(opposed, points).items():
+        np.testing.assert_array_equal(values, draw_at_points(apart, points)[key])
+    damping = draw_at_points(opposed, points)[DAMPING][:, 0]
     np.testing.assert_allclose(
         (damping - apart.contact.damping[0]) / 12.0,
         special.ndtri(points[:, 0]) * (np.sqrt(1 - 0.98**2) - 0.98),
         atol=1e-9,
     )
     # This holds even for a coordinate at an end of the box.
-    box = at_points(mechanism(), np.array([np.zeros(points.shape[1]), np.full(points.shape[1], 1 - 2**-53)]))
+    box = draw_at_points(
+        mechanism(), np.array([np.zeros(points.shape[1]), np.full(points.shape[1], 1 - 2**-53)])
+    )
     assert all(np.all(np.isfinite(values)) for values in box.values())
 
 
 def test_correlation_matrix_holds_for_each_independent_list_entry():
     apart = {key: UNCERTAIN[key] | {"independent": True} for key in (STIFFNESS, DAMPING)}
-    raw = to_builtins(load("varying", {"contact.damping": [260.0, 390.0]}).mechanism)
+    raw = to_plain_data(load("varying", {"contact.damping": [260.0, 390.0]}).mechanism)
     table = {"keys": [STIFFNESS, DELAY, DAMPING], "matrix": [[1.0], [0.6, 1.0], [0.5, -0.3, 1.0]]}
-    parsed = from_builtins(raw | {"uncertainty": UNCERTAIN | apart, "correlation": table}, "some file")
+    parsed = from_plain_data(raw | {"uncertainty": UNCERTAIN | apart, "correlation": table}, "some file")
     number = 4096
     values = draw(parsed, number, 0)
     stiffness, damping = np.log(values[STIFFNESS] / parsed.contact.stiffness), values[DAMPING]
@@ -141,23 +150,23 @@ def test_correlation_matrix_holds_for_each_independent_list_entry():
 
 
 def test_correlated_groups_are_connected_components():
-    assert correlated_groups(mechanism()) == [(DELAY, STIFFNESS, DAMPING), (FREQUENCY,)]
-    assert correlated_groups(mechanism(keys=None)) == []
+    assert find_correlated_groups(mechanism()) == [(DELAY, STIFFNESS, DAMPING), (FREQUENCY,)]
+    assert find_correlated_groups(mechanism(keys=None)) == []
 
 
 def test_unset_removes_keys_from_correlation_table():
     left = mechanism(unset=[f"uncertainty.'{STIFFNESS}'"])
     assert left.correlation.keys == [DELAY, DAMPING, FREQUENCY]
     assert left.correlation.matrix == [[1.0], [0.98, 1.0], [0.0, 0.0, 1.0]]
-    assert to_builtins(left) == to_builtins(certain(mechanism(), [STIFFNESS]))
+    assert to_plain_data(left) == to_plain_data(fix_at_nominal(mechanism(), [STIFFNESS]))
     assert mechanism(unset=["contact.damping"]).correlation.keys == [DELAY, STIFFNESS, FREQUENCY]
     for none in (
         mechanism(unset=["uncertainty"]),
         mechanism(unset=["correlation"]),
-        certain(mechanism(), KEYS),
+        fix_at_nominal(mechanism(), KEYS),
     ):
         assert none.correlation is None
-    assert from_builtins(to_builtins(left), "again") == left
+    assert from_plain_data(to_plain_data(left), "again") == left
 
 
 @pytest.mark.parametrize(
@@ -166,33 +175,33 @@ def test_unset_removes_keys_from_correlation_table():
         (
             [DELAY, "contact.dampin"],
             [[1], [0, 1]],
-            "keys[1]: found 'contact.dampin', allowed a key of [uncert",
+            "keys[1]: found 'contact.dampin', expected a key of [uncert",
         ),
         (
             [DELAY, "rig.simulator.delay"],
             [[1], [0, 1]],
-            "keys[1]: found 'rig.simulator.delay', allowed a key",
+            "keys[1]: found 'rig.simulator.delay', expected a key",
         ),
-        ([DELAY, DELAY], [[1], [0, 1]], f"keys[1]: found '{DELAY}' once more, allowed each key once"),
+        ([DELAY, DELAY], [[1], [0, 1]], f"keys[1]: found '{DELAY}' once more, expected each key once"),
         ([], [], "correlation.keys: found a list of 0 entries"),
         ("a", [[1]], "correlation.keys: found 'a'"),
-        ([DELAY, SPEED], [[1]], "matrix: found 1 rows, allowed 2, one a key"),
+        ([DELAY, SPEED], [[1]], "matrix: found 1 rows, expected 2, one a key"),
         (
             [DELAY, SPEED],
             [[1], [0.1]],
-            "matrix[1]: found 1 entries, allowed 2: the matrix up to its diagonal",
+            "matrix[1]: found 1 entries, expected 2: the matrix up to its diagonal",
         ),
-        ([DELAY, SPEED], [[1, 0], [0, 1]], "matrix[0]: found 2 entries, allowed 1"),
-        ([DELAY, SPEED], [[1], [0, 0.9]], "matrix[1][1]: found 0.9, allowed 1 on the diagonal"),
-        ([DELAY, SPEED], [[1], [1.5, 1]], "matrix[1][0]: found 1.5, allowed a number from -1 to 1"),
+        ([DELAY, SPEED], [[1, 0], [0, 1]], "matrix[0]: found 2 entries, expected 1"),
+        ([DELAY, SPEED], [[1], [0, 0.9]], "matrix[1][1]: found 0.9, expected 1 on the diagonal"),
+        ([DELAY, SPEED], [[1], [1.5, 1]], "matrix[1][0]: found 1.5, expected a number from -1 to 1"),
         ([DELAY, SPEED], [[1], [float("nan"), 1]], "matrix[1][0]: found nan"),
         ([DELAY, SPEED], [[1], [1, 1]], "matrix: found a least eigenvalue of"),
-        ([DELAY, SPEED, DAMPING], [[1], [0.9, 1], [0.9, -0.9, 1]], "allowed a positive definite matrix"),
+        ([DELAY, SPEED, DAMPING], [[1], [0.9, 1], [0.9, -0.9, 1]], "expected a positive definite matrix"),
     ],
 )
 def test_unusable_correlation_table_is_rejected(keys, matrix, reason):
     raw = FULL | {"uncertainty": UNCERTAIN, "correlation": {"keys": keys, "matrix": matrix}}
     with pytest.raises(InputError) as caught:
-        from_builtins(raw, "some file")
+        from_plain_data(raw, "some file")
     assert str(caught.value).startswith("some file: correlation.") and reason in str(caught.value)
     assert str(caught.value).isprintable()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.optimisation.derivative_free import mirror, polish, search_globally
+from tuning.optimisation.derivative_free import polish, reflect_into_box, search_globally
 
 
 def rosenbrock(points):
@@ -143,4 +143,6 @@ def test_global_search_keeps_budget_and_one_call_shape():
 
 
 def test_mirror_maps_points_into_unit_box():
-    np.testing.assert_allclose(mirror(np.array([-0.2, 0.3, 1.2, 2.1, -1.4])), [0.2, 0.3, 0.8, 0.1, 0.6])
+    np.testing.assert_allclose(
+        reflect_into_box(np.array([-0.2, 0.3, 1.2, 2.1, -1.4])), [0.2, 0.3, 0.8, 0.1, 0.6]
+    )

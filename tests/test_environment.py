@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from jaxhil.simulation import environment
-from jaxhil.simulation.environment import ROLLOUT, known_options, on_half_the_cores
+from jaxhil.simulation import jax_environment
+from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, supported_options, use_half_the_cores
 
 
 def test_compiler_options_unknown_to_xla_are_omitted():
     unknown = {"xla_cpu_no_such_option": 1}
-    assert known_options({**ROLLOUT, **unknown}) == ROLLOUT
-    assert known_options(unknown) == {}
+    assert supported_options({**ROLLOUT_OPTIONS, **unknown}) == ROLLOUT_OPTIONS
+    assert supported_options(unknown) == {}
     # With the unknown option, compilation fails.
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.jit(lambda x: x + 1, compiler_options=unknown)(np.ones(3))
@@ -22,8 +22,8 @@ def test_compiler_options_unknown_to_xla_are_omitted():
 def test_llvm_option_is_set_only_for_versions_that_know_it(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     for version, expected in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
-        monkeypatch.setattr(environment, "version", lambda name, version=version: version)
-        assert (environment.WHOLE in environment.flags("")) == expected
+        monkeypatch.setattr(jax_environment, "version", lambda name, version=version: version)
+        assert (jax_environment.FULL_UNROLL_OPTION in jax_environment.build_xla_flags("")) == expected
 
 
 AFFINITY = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system cannot be told")
@@ -34,7 +34,7 @@ def test_half_the_cores_are_released_after_use():
     usable = os.sched_getaffinity(0)
     halves = []
     for half in (0, 1):
-        with pytest.raises(ZeroDivisionError), on_half_the_cores(half):
+        with pytest.raises(ZeroDivisionError), use_half_the_cores(half):
             halves.append(os.sched_getaffinity(0))
             raise ZeroDivisionError
         assert os.sched_getaffinity(0) == usable
@@ -48,5 +48,5 @@ def test_all_cores_are_used_if_affinity_is_forbidden(monkeypatch):
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setaffinity", forbidden)
-    with on_half_the_cores(0):
+    with use_half_the_cores(0):
         pass

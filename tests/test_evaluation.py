@@ -12,12 +12,12 @@ from compiling import programs_of
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.environment import DEVICES
-from jaxhil.simulation.evaluation import TILE
+from jaxhil.simulation.evaluation import TILE_SIZE
+from jaxhil.simulation.jax_environment import DEVICE_COUNT_FLAG
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gains.tune import neutral_gains
+from tuning.gains.tune import neutralise_gains
 
 pytestmark = pytest.mark.users_options
 
@@ -66,7 +66,7 @@ def test_evaluation_with_gains_per_lane_equals_common_gains():
 def test_neutral_gains_equal_no_compensation(compensator):
     loop, gains, scenarios = setting(compensator)
     plain, _, _ = setting("none")
-    neutral = evaluate(loop, neutral_gains(compensator, gains), scenarios)
+    neutral = evaluate(loop, neutralise_gains(compensator, gains), scenarios)
     none = evaluate(plain, {}, scenarios)
     np.testing.assert_allclose(neutral.error[none.wanted], none.error[none.wanted], rtol=1e-10, atol=1e-12)
 
@@ -106,7 +106,8 @@ def tiled(scenarios):
 
     lanes = jax.tree.map(in_turn, dealt)
     return (
-        row.reshape(-1, TILE) for row in (ONE_AXIS.whole_delays(lanes), ONE_AXIS.expected_duration(lanes))
+        row.reshape(-1, TILE_SIZE)
+        for row in (ONE_AXIS.whole_delays(lanes), ONE_AXIS.expected_duration(lanes))
     )
 
 
@@ -137,7 +138,7 @@ DIGEST = """
 import hashlib, os, sys
 if sys.argv[1] == "1" and hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-from jaxhil.simulation.environment import prepare
+from jaxhil.simulation.jax_environment import prepare
 prepare()
 import jax
 from test_evaluation import evaluate, setting
@@ -150,7 +151,7 @@ print(jax.device_count(), hashlib.sha256(content).hexdigest())
 def test_evaluation_of_a_lane_keeps_its_bits_on_any_number_of_cores():
     digests = {}
     for cores in 1, 2, 3:
-        flags = "" if cores == 1 else f"{DEVICES}={cores}"
+        flags = "" if cores == 1 else f"{DEVICE_COUNT_FLAG}={cores}"
         process_environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, "-c", DIGEST, str(cores)]
         ran = subprocess.run(command, env=process_environment, capture_output=True, text=True, check=True)

@@ -13,12 +13,18 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from jaxhil.errors import InputError
-from jaxhil.files import TEMPORARY
+from jaxhil.files import TEMPORARY_SUFFIX
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.faults import FAULTS
 from jaxhil.simulation.gain_file import load_gain_file
-from tuning.bundle.bundle import build_bundle, check_mechanism, check_target, with_limits, write_bundle
+from tuning.bundle.bundle import (
+    build_bundle,
+    check_bundle_folder,
+    check_same_mechanism,
+    replace_limits,
+    write_bundle,
+)
 from tuning.bundle.checking import check_bundle
 from tuning.bundle.checking import run_selftest as run_selftest_alone
 from tuning.bundle.readme import readme_text
@@ -96,7 +102,7 @@ def test_export_command_writes_signed_bundle_that_verifies(jaxhil, gains, tmp_pa
     ran = jaxhil("verify", folder, "--key", public, "--json")
     assert ran.code == 1 and ran.document["signature"] == "not signed" and ran.document["self_test"] == []
     [reason] = ran.document["reasons"]
-    assert reason == "manifest.sig: found none, allowed the manifest's by the key given"
+    assert reason == "manifest.sig: found none, expected the manifest's by the key given"
 
 
 @pytest.mark.parametrize(
@@ -121,13 +127,13 @@ def test_export_is_reproducible_for_equal_gains_and_seed():
 
 def test_with_limits_signs_limits_and_stores_alarm_rates():
     made = document()
-    changed = with_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
+    changed = replace_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
     assert changed["limits"] == {
         "force_limit": {"value": 900.0, "unit": "N"},
         "velocity_limit": {"value": None, "unit": "m/s"},
     }
     assert changed["figures"]["watchdog"] == {"limit": 0.01} and changed["sha256"] != made["sha256"]
-    assert with_limits(made, None) == made
+    assert replace_limits(made, None) == made
 
 
 def test_export_rejects_controller_that_differs_from_simulation(jaxhil, gains, tmp_path, monkeypatch):
@@ -181,7 +187,7 @@ def test_export_verdict_is_bad_if_watchdog_stops_good_runs(jaxhil, gains, tmp_pa
     ran = jaxhil(*command, "--set", "restitution_margin=0")
     assert ran.code == 1 and "\nBad: false alarms: 95 % interval " in ran.out and "\nGood" not in ran.out
     page = (folder / "summary.html").read_text()
-    assert "<b>Bad: false alarms: 95 % interval " in page and ", allowed 0.01)" in page
+    assert "<b>Bad: false alarms: 95 % interval " in page and ", limit 0.01)" in page
 
 
 @pytest.mark.parametrize(
@@ -221,14 +227,14 @@ def test_export_leaves_foreign_folder_untouched(jaxhil, gains, tmp_path):
     placed(folder)
     refused(jaxhil("export", gains, "-o", folder), "thesis.txt: is no file of this bundle")
     (folder / "thesis.txt").unlink()
-    check_target(folder)
+    check_bundle_folder(folder)
     for name in ("manifest.json", "README.md"):
         content = (folder / name).read_bytes()
         (folder / name).write_bytes(content + b"my notes")
-        refused(jaxhil("export", gains, "-o", folder), name, "allowed a new or empty folder, or a bundle as")
+        refused(jaxhil("export", gains, "-o", folder), name, "expected a new or empty folder, or a bundle as")
         assert (folder / name).read_bytes() == content + b"my notes"
         (folder / name).write_bytes(content)
-    check_target(folder)
+    check_bundle_folder(folder)
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -248,7 +254,7 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     with pytest.raises(ValueError, match="bundle: cannot be written: No space left"):
         write_bundle(folder, small_files())
     assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
-    assert [name for name in os.listdir(tmp_path) if name.endswith(TEMPORARY)] == []
+    assert [name for name in os.listdir(tmp_path) if name.endswith(TEMPORARY_SUFFIX)] == []
     monkeypatch.undo()
     move, moved = os.replace, []
 
@@ -262,7 +268,7 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     def cannot(*_):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr("tuning.bundle.bundle.exchange", cannot)
+    monkeypatch.setattr("tuning.bundle.bundle.exchange_names", cannot)
     monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_bundle(folder, small_files())
@@ -350,12 +356,12 @@ def test_bundle_readme_escapes_mechanism_name():
 def test_export_rejects_folder_with_bundle_of_another_mechanism(tmp_path):
     folder = placed(tmp_path / "bundle")
     before = (folder / "gains.json").read_bytes()
-    check_mechanism(folder, json.loads(before)["mechanism"]["name"])
-    check_mechanism(tmp_path / "none", "another")
+    check_same_mechanism(folder, json.loads(before)["mechanism"]["name"])
+    check_same_mechanism(tmp_path / "none", "another")
     with pytest.raises(
         InputError, match=r"bundle: found the bundle of mechanism .*, expected that of 'another'"
     ):
-        check_mechanism(folder, "another")
+        check_same_mechanism(folder, "another")
 
 
 def test_export_writers_write_the_files_of_their_format():

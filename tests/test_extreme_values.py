@@ -9,7 +9,7 @@ import pytest
 import jaxhil
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import numeric_keys
-from jaxhil.simulation.plausibility import check_run, meaning
+from jaxhil.simulation.plausibility import check_run, summarise_mechanism
 
 VALUES = "0 -0.0 1e-320 1e-300 1e-100 1e-9 1e9 1e100 1e300 1.7e308 nan inf".split()
 KEYS = [key for key in numeric_keys() if not key.startswith("uncertainty")]
@@ -68,8 +68,8 @@ def test_extreme_values_are_loaded_or_rejected_in_one_line(which, every):
                 message = str(refused)
                 assert message.startswith(f"{name}: ") and message.isprintable() and len(message) < 500
             else:
-                line = meaning(mechanism).line(name)
-                assert line.isprintable() and math.isfinite(meaning(mechanism).duration)
+                line = summarise_mechanism(mechanism).line(name)
+                assert line.isprintable() and math.isfinite(summarise_mechanism(mechanism).duration)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ import pytest
 from family import LAWS, NUMBER, RANGES, family, texts, write
 from lanes import QUICK
 
-from jaxhil.contact.laws import LAWS as CONTACT_LAWS
+from jaxhil.contact.ideal_contact import IdealContact
+from jaxhil.contact.laws import CONTACT_LAWS as CONTACT_LAWS
 from jaxhil.contact.laws import ContactParameters
-from jaxhil.contact.reference import Reference
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 
@@ -26,8 +26,8 @@ def members():
 
 
 def undelayed(members, damped: bool) -> Any:
-    """Return the package's own `Reference` of the nominal undelayed contacts, in the order of the members."""
-    references = {name: np.empty(len(members)) for name in Reference._fields}
+    """Return the package's `IdealContact` of the nominal undelayed contacts, in the order of the members."""
+    references = {name: np.empty(len(members)) for name in IdealContact._fields}
     for name in LAWS:
         indices = [i for i, m in enumerate(members) if m.contact.law == name]
         contacts = [members[i].contact for i in indices]

@@ -9,7 +9,7 @@ from c99_cases import RESULT, controller_in_python, loaded, packed
 from fault_runs import LIMITED, PERIOD, FaultRun, document, fault_run
 
 from jaxhil.rig import COMPENSATORS
-from jaxhil.rig.faults import FAULTS, names
+from jaxhil.rig.faults import FAULTS, fault_names
 from jaxhil.rig.gain_file import check_gain_document
 
 BLOCK = 500_000
@@ -34,7 +34,8 @@ def check(run: FaultRun, results: np.ndarray) -> None:
     if len(wrong):
         tick = wrong[0]
         raise AssertionError(
-            f"tick {tick}: raised {names(int(faults[tick]))}, expected {names(int(run.faults[tick]))}, "
+            f"tick {tick}: raised {fault_names(int(faults[tick]))}, expected "
+            f"{fault_names(int(run.faults[tick]))}, "
             f"row {run.rows[tick].tolist()}"
         )
     assert np.all(np.isfinite(force)) and np.all(np.isfinite(position))

@@ -17,9 +17,9 @@ import pytest
 from faults import COMPILER, HANGS, Ran, Runner, without_times
 from sweep_cases import case
 
-from jaxhil.files import is_temporary, read_sealed
+from jaxhil.files import is_temporary, read_checksummed
 from jaxhil.rig import digest
-from tuning.caches.pieces import FOLDER as PIECES
+from tuning.caches.checkpoints import CHECKPOINT_FOLDER as PIECES
 from tuning.gain_file import write_gain_file
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
@@ -139,7 +139,7 @@ class Bench:
         """
         paths = [path.relative_to(self.out) for path in self.out.rglob("*") if path.is_file()]
         finished = [path for path in paths if not any(map(is_temporary, path.parts))]
-        assert all(read_sealed(self.out / path) is not None for path in finished if PIECES in path.parts)
+        assert all(read_checksummed(self.out / path) is not None for path in finished if PIECES in path.parts)
         return {str(path): _content(self.out / path) for path in finished if PIECES not in path.parts}
 
     def everything(self) -> dict[str, bytes]:

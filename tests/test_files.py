@@ -13,22 +13,22 @@ import pytest
 
 from jaxhil.errors import InputError
 from jaxhil.files import (
-    follow,
     make_folder,
-    open_plain,
-    read_sealed,
+    open_regular,
+    read_checksummed,
     remove_stale,
+    report_write_errors,
+    resolve_output_path,
+    write_atomically,
+    write_checksummed,
     write_new,
-    write_sealed,
-    write_whole,
-    writing,
 )
 
 
 def test_write_whole_replaces_file(tmp_path):
     path = tmp_path / "file"
     for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
-        write_whole(path, content)
+        write_atomically(path, content)
         assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
 
 
@@ -49,20 +49,20 @@ def test_write_new_never_overwrites(tmp_path, monkeypatch, has_links):
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_write_whole_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
     path = tmp_path / "file"
-    write_whole(path, b"old")
+    write_atomically(path, b"old")
 
     def fail(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, step, fail)
     with pytest.raises(InputError, match=r"^[^\n]*file: cannot be written: No space left on device$"):
-        with writing(path):
-            write_whole(path, b"new")
+        with report_write_errors(path):
+            write_atomically(path, b"new")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_writing_passes_other_errors_through(tmp_path):
-    with pytest.raises(InputError, match=r"^something else$"), writing(tmp_path):
+    with pytest.raises(InputError, match=r"^something else$"), report_write_errors(tmp_path):
         raise InputError("something else")
 
 
@@ -84,12 +84,12 @@ def test_file_functions_reject_anything_but_plain_files(tmp_path):
     for name in names:
         path = tmp_path / name
         kind = os.lstat(path).st_mode
-        with pytest.raises(InputError, match=r"cannot be written: found a .*, allowed a plain file"):
-            with writing(path):
-                write_whole(path, b"ours")
-        assert read_sealed(path) is None
+        with pytest.raises(InputError, match=r"cannot be written: found a .*, expected a plain file"):
+            with report_write_errors(path):
+                write_atomically(path, b"ours")
+        assert read_checksummed(path) is None
         with pytest.raises(OSError):
-            open_plain(path)
+            open_regular(path)
         assert os.lstat(path).st_mode == kind
     assert target.read_bytes() == b"years" and sorted(os.listdir(tmp_path)) == before
 
@@ -101,37 +101,40 @@ def test_make_folder_rejects_links(tmp_path):
     names, _ = not_plain(tmp_path)
     (tmp_path / "elsewhere").symlink_to(tmp_path / "folder")
     for name in ("elsewhere", *(name for name in names if name != "folder")):
-        with pytest.raises(InputError, match=r"found a .*, allowed a folder"), writing(tmp_path / name):
+        with (
+            pytest.raises(InputError, match=r"found a .*, expected a folder"),
+            report_write_errors(tmp_path / name),
+        ):
             make_folder(tmp_path / name)
 
 
 def test_follow_resolves_link_named_by_user(tmp_path):
     _, target = not_plain(tmp_path)
-    write_whole(follow(tmp_path / "link"), b"picture")
+    write_atomically(resolve_output_path(tmp_path / "link"), b"picture")
     assert (tmp_path / "link").is_symlink() and target.read_bytes() == b"picture"
-    assert follow(tmp_path / "new.png") == tmp_path / "new.png"
+    assert resolve_output_path(tmp_path / "new.png") == tmp_path / "new.png"
     with pytest.raises(OSError, match="a device"):
-        write_whole(follow(tmp_path / "device"), b"picture")
+        write_atomically(resolve_output_path(tmp_path / "device"), b"picture")
 
 
 def test_read_sealed_returns_exact_content_or_none(tmp_path):
     path = tmp_path / "file"
     generator = np.random.default_rng(0)
-    assert read_sealed(path) is None
+    assert read_checksummed(path) is None
     for size in (0, 1, 5000):
         content = generator.bytes(size)
-        write_sealed(path, content)
-        assert read_sealed(path) == content
+        write_checksummed(path, content)
+        assert read_checksummed(path) == content
         whole = path.read_bytes()
         for bit in generator.integers(0, 8 * len(whole), 300):
             harmed = bytearray(whole)
             harmed[bit // 8] ^= 1 << int(bit % 8)
             path.write_bytes(harmed)
-            assert read_sealed(path) is None
+            assert read_checksummed(path) is None
         for cut in (0, 64, 65, len(whole) - 1):
             if cut < len(whole):
                 path.write_bytes(whole[:cut])
-                assert read_sealed(path) is None
+                assert read_checksummed(path) is None
 
 
 def test_remove_stale_removes_only_files_of_killed_processes(tmp_path):

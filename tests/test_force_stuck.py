@@ -9,7 +9,7 @@ from c99_cases import RESULT, ROW, TARE, assert_same, controller_in_python, pack
 
 from jaxhil.rig.faults import FORCE_STUCK
 from jaxhil.rig.gain_file import GainFile
-from jaxhil.rig.limits import complete
+from jaxhil.rig.limits import complete_limits
 
 PERIOD, MASS, STIFFNESS, SPEED = 1e-3, 350.0, 1.2e5, 0.02
 TRAVEL = 6e-5
@@ -40,7 +40,7 @@ def contact(damping_ratio: float, side: float, gap: float) -> tuple[np.ndarray, 
 
 def first_stuck(position, force, gap: float, bias: float = 0.0, noise: float = 0.0) -> int | None:
     """Return the tick on which Python and C report the force stuck; None if never."""
-    limits = complete({"force_stuck_travel": TRAVEL, "tare_ticks": float(TARES)})
+    limits = complete_limits({"force_stuck_travel": TRAVEL, "tare_ticks": float(TARES)})
     gain_file = GainFile("none", {}, PERIOD, gap if gap else math.inf, limits)
     rows = np.zeros((TARES + len(force), len(ROW)))
     rows[:TARES, 0], rows[:TARES, 1], rows[TARES:, 1] = TARE, bias, force + bias

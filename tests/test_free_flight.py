@@ -11,9 +11,9 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.rollout import stretch_length
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.rollout import segment_length
 from jaxhil.simulation.scenario import build_scenarios
 
 LANES, TICKS = 5, 1200
@@ -40,7 +40,7 @@ def test_skipped_approach_changes_no_metric(law):
         np.testing.assert_allclose(getattr(result, name), getattr(flown, name), rtol=1e-9, err_msg=name)
     # Metrics are recorded at the end of a segment, which falls on other ticks.
     later = np.asarray(result.ticks) - np.asarray(flown.ticks)
-    assert np.all(np.abs(later) < stretch_length(loop) * scenarios.contacts)
+    assert np.all(np.abs(later) < segment_length(loop) * scenarios.contacts)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.rig import Controller, GainFileError, digest
 from jaxhil.simulation.gain_file import check_document, load_gain_file
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gain_file import build_document, plain, validity_envelope, write_gain_file
+from tuning.gain_file import build_document, to_json_data, validity_envelope, write_gain_file
 
 ENVELOPE = {"delay": {"low": 0.01, "high": 0.012, "unit": "s"}}
 
@@ -114,17 +114,22 @@ def test_gain_file_write_rejects_missing_folder(tmp_path):
 def test_plain_replaces_non_finite_values_by_null():
     Pair = namedtuple("Pair", "error peak")
     value = {"a": np.array([1.0, np.nan]), "b": (np.inf, 2), "c": np.float32(0.5), "d": Pair(-math.inf, True)}
-    assert plain(value) == {"a": [1.0, None], "b": [None, 2], "c": 0.5, "d": {"error": None, "peak": True}}
+    assert to_json_data(value) == {
+        "a": [1.0, None],
+        "b": [None, 2],
+        "c": 0.5,
+        "d": {"error": None, "peak": True},
+    }
     with pytest.raises(TypeError, match="a set has no place"):
-        plain({"a": {1}})
+        to_json_data({"a": {1}})
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"forgetting": 1.01}, r"gains: forgetting: found 1\.01, allowed 0\.8 to 1 1"),
+        ({"forgetting": 1.01}, r"gains: forgetting: found 1\.01, expected 0\.8 to 1 1"),
         ({"forgetting": math.nan}, "gains: forgetting: found nan"),
-        ({"phase_leed": 0.0}, "gains: phase_leed: found an extra gain, allowed phase_lead, "),
+        ({"phase_leed": 0.0}, "gains: phase_leed: found an extra gain, expected phase_lead, "),
     ],
 )
 def test_build_document_rejects_gains_out_of_bounds(changes, message):
@@ -135,10 +140,10 @@ def test_build_document_rejects_gains_out_of_bounds(changes, message):
 def test_build_document_rejects_missing_gain_and_unknown_compensator():
     mechanism, sha256, _ = load("varying")
     with pytest.raises(
-        InputError, match="gains: lead_filter: found nothing, allowed phase_lead, lead_filter"
+        InputError, match="gains: lead_filter: found nothing, expected phase_lead, lead_filter"
     ):
         build_document("phase_lead", {"phase_lead": 0.0}, mechanism, sha256, {}, {}, 0, {})
-    with pytest.raises(InputError, match="compensator: found 'pid', allowed one of none, "):
+    with pytest.raises(InputError, match="compensator: found 'pid', expected one of none, "):
         build_document("pid", {}, mechanism, sha256, {}, {}, 0, {})
 
 
@@ -164,27 +169,27 @@ def change(document, path, value):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("schema", "jaxhil/gains/2", "schema: found 'jaxhil/gains/2', allowed 'jaxhil/gains/1'"),
-        ("compensator", "pid", "compensator: found 'pid', allowed one of"),
+        ("schema", "jaxhil/gains/2", "schema: found 'jaxhil/gains/2', expected 'jaxhil/gains/1'"),
+        ("compensator", "pid", "compensator: found 'pid', expected one of"),
         ("compensator", "phase_lead", "gains: found an extra gain"),
         ("gains.forgetting", None, "gains.forgetting: found nothing"),
-        ("gains.forgetting.unit", "s", "gains.forgetting.unit: found 's', allowed '1'"),
-        ("gains.forgetting.value", 0.5, "gains.forgetting.value: found 0.5, allowed 0.8 to 1.0"),
-        ("gains.forgetting.lower", 0.5, "gains.forgetting.lower: found 0.5, allowed 0.8 to 1 for this"),
-        ("gains.phase_lead.upper", 1.0, "gains.phase_lead.upper: found 1.0, allowed 0 to 0.0"),
-        ("control_period", 0.002, "control_period: found 0.002, allowed 0.001, as mechanism"),
-        ("mechanism.rig.control_period", 0.002, "control_period: found 0.001, allowed 0.002"),
+        ("gains.forgetting.unit", "s", "gains.forgetting.unit: found 's', expected '1'"),
+        ("gains.forgetting.value", 0.5, "gains.forgetting.value: found 0.5, expected 0.8 to 1.0"),
+        ("gains.forgetting.lower", 0.5, "gains.forgetting.lower: found 0.5, expected 0.8 to 1 for this"),
+        ("gains.phase_lead.upper", 1.0, "gains.phase_lead.upper: found 1.0, expected 0 to 0.0"),
+        ("control_period", 0.002, "control_period: found 0.002, expected 0.001, as mechanism"),
+        ("mechanism.rig.control_period", 0.002, "control_period: found 0.001, expected 0.002"),
         ("mechanism", None, "mechanism: found nothing"),
         ("mechanism.bodies.equivalent_mass", -1.0, "mechanism: bodies.equivalent_mass: found -1.0"),
         ("mechanism.contact.law", "magnetic", "mechanism: contact.law: found 'magnetic'"),
-        ("mechanism_sha256", "abc", "mechanism_sha256: found 'abc', allowed 64 hexadecimal digits"),
-        ("envelope", None, "envelope: found nothing, allowed this key is required"),
-        ("envelope.delay", [0.0, 1.0], "envelope: found a table, allowed an object of {low, high, unit}"),
-        ("figures", 3, "figures: found 3, allowed an object"),
-        ("seed", True, "seed: found true, allowed an integer >= 0"),
-        ("seed", -1, "seed: found -1, allowed an integer >= 0"),
-        ("versions.jax", 1, "versions: found a table, allowed an object of texts"),
-        ("created", "yesterday", "created: found 'yesterday', allowed a date and time with time zone"),
+        ("mechanism_sha256", "abc", "mechanism_sha256: found 'abc', expected 64 hexadecimal digits"),
+        ("envelope", None, "envelope: found nothing, expected this key is required"),
+        ("envelope.delay", [0.0, 1.0], "envelope: found a table, expected an object of {low, high, unit}"),
+        ("figures", 3, "figures: found 3, expected an object"),
+        ("seed", True, "seed: found true, expected an integer >= 0"),
+        ("seed", -1, "seed: found -1, expected an integer >= 0"),
+        ("versions.jax", 1, "versions: found a table, expected an object of texts"),
+        ("created", "yesterday", "created: found 'yesterday', expected a date and time with time zone"),
         ("timings", None, "timings: found nothing"),
     ],
 )
@@ -222,7 +227,7 @@ def test_gain_file_of_earlier_version_is_rejected_with_advice(tmp_path, jaxhil):
     for name in ("prior_friction_spread", "prior_preload_spread"):
         del document["gains"][name]
     text = (
-        f"{file}: gains.prior_friction_spread: found nothing, allowed all gains of impulse_ledger "
+        f"{file}: gains.prior_friction_spread: found nothing, expected all gains of impulse_ledger "
         "(is it of an earlier version? `jaxhil tune` makes a new file)"
     )
     assert_refused_everywhere(file, document, text, jaxhil)

@@ -19,7 +19,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig.filters import DelayLine
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios

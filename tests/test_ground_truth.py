@@ -25,7 +25,7 @@ from lanes import (
 )
 from scipy.special import lambertw
 
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 
 OMEGA = 2 * pi * 3.0
 STIFFNESS = MASS * OMEGA**2

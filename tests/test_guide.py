@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.rig.law_status import STATUSES
 
@@ -101,7 +101,7 @@ def test_guide_has_the_sections_that_code_cites(model):
 
 def test_guide_describes_every_law_and_status(model):
     in_tables = set(re.findall(r"^\| `(\w+)` \|", section(model, 3) + section(model, 5), re.M))
-    assert in_tables == {*COMPENSATORS, *LAWS}
+    assert in_tables == {*COMPENSATORS, *CONTACT_LAWS}
     statuses = section(text_of("impulse_ledger.md"), 6)
     assert set(re.findall(r"^\| `(\w+)` \|", statuses, re.M)) == {status.name for status in STATUSES}
 
@@ -172,7 +172,7 @@ def test_guide_numbers_of_lead_and_smith_predictor_are_correct(model):
 
 
 def test_guide_script_is_the_tested_interface_script():
-    """`test_front_door_tuning` runs the script with small numbers."""
+    """`test_api_tuning` runs the script with small numbers."""
     block = re.search(r"^```python\n(.*?)^```", text_of("python.md"), re.M | re.S)
     run = (ROOT / "tests" / "interface_script.py").read_text(encoding="utf-8")
     sizes = re.compile(r"\b(scenarios|starts|judged)=[\d_]+")

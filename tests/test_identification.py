@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxhil.laws.shared.recursive_least_squares.rig import ContactIdentification
-from jaxhil.laws.shared.recursive_least_squares.simulation import Identified, update
+from jaxhil.laws.shared.recursive_least_squares.simulation import ContactEstimate, update_estimate
 
 INITIAL = (2.0, -1.0)
 VARIANCES = (5.0, 0.5)
@@ -13,11 +13,11 @@ VARIANCES = (5.0, 0.5)
 
 def on_jax(readings, weights, forgetting):
     start = (*INITIAL, 0.0, *VARIANCES)
-    state = Identified(*(jnp.asarray(value) for value in start))
+    state = ContactEstimate(*(jnp.asarray(value) for value in start))
     most = tuple(jnp.asarray(d) for d in VARIANCES)
     for (depth, rate, force), weight in zip(readings, weights, strict=True):
         values = (jnp.asarray(value) for value in (depth, rate, force, weight))
-        state = update(state, jnp.asarray(forgetting), most, *values)
+        state = update_estimate(state, jnp.asarray(forgetting), most, *values)
     return [float(leaf) for leaf in state]
 
 
@@ -25,7 +25,7 @@ def rig(readings, weights, forgetting):
     state = ContactIdentification(*INITIAL, *VARIANCES, forgetting)
     for (depth, rate, force), weight in zip(readings, weights, strict=True):
         state.update(float(force), float(depth), float(rate), float(weight))
-    return [getattr(state, name) for name in Identified._fields]
+    return [getattr(state, name) for name in ContactEstimate._fields]
 
 
 def batch(readings, weights, forgetting):

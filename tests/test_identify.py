@@ -10,19 +10,22 @@ import numpy as np
 import pytest
 
 import jaxhil
-from jaxhil.mechanism.file import from_builtins
+from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Uncertainty
 from jaxhil.mechanism.uncertainty import draw
-from tuning.identification.check import check
-from tuning.identification.estimate import Options, held_out, identify
-from tuning.identification.mechanism_file import to_toml, uncertainty_tables
+from tuning.identification.identify import IdentificationOptions, identify, select_held_out_contacts
+from tuning.identification.mechanism_check import check_against_mechanism
+from tuning.identification.mechanism_file import make_uncertainty_tables, to_toml
 
 FEW = (0.003, 0.006, 0.012) * 3
 
 
 def identify_kind(name, seed=0, options=None, **changes):
     law = campaigns.KINDS[name].contact["law"]
-    return identify(campaigns.campaign(name, seed, **changes), options=options or Options(law=law, seed=seed))
+    return identify(
+        campaigns.campaign(name, seed, **changes),
+        options=options or IdentificationOptions(law=law, seed=seed),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +76,7 @@ DEFECTS = {"hold": "command hold", "sign": "sign of the force", "scale": "scale"
 )
 def test_identify_names_defect_and_verdict_is_bad(wrong, worst):
     campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
-    options = Options(law="kelvin_voigt", order=2 if wrong == "order" else None)
+    options = IdentificationOptions(law="kelvin_voigt", order=2 if wrong == "order" else None)
     runs = campaign.runs
     if wrong == "hold":
         campaign = replace(campaign, timing=replace(campaign.timing, command_hold="zoh"))
@@ -96,7 +99,7 @@ def test_identify_reports_stiffening_contact_as_drift():
 
 def test_identify_separates_dead_zone_from_bias_and_names_confounded_pair():
     law = campaigns.KINDS["dead_zone"].contact["law"]
-    options = Options(law=law, fixed={"rig.contact_plane": 0.0})
+    options = IdentificationOptions(law=law, fixed={"rig.contact_plane": 0.0})
     result = identify_kind("dead_zone", options=options, speeds=FEW)
     dead = result["rig.force_sensor.dead_zone"]
     assert dead.value == pytest.approx(4.0, rel=0.03) and dead.low < 4.0 < dead.high
@@ -116,7 +119,7 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
         )
         for run in campaign.runs
     ]
-    result = identify(replace(campaign, runs=tuple(moved)), options=Options(law="kelvin_voigt"))
+    result = identify(replace(campaign, runs=tuple(moved)), options=IdentificationOptions(law="kelvin_voigt"))
     truth = campaigns.KINDS["dead_zone"]
     for key, value in (
         ("rig.force_sensor.dead_zone", truth.rig["force_sensor"]["dead_zone"]),
@@ -131,7 +134,7 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
 def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
     """Expect an interval of several newtons: 4 N of dead zone are as likely as a surface 33 um off."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
-    dead = identify(campaign, options=Options(law=law))["rig.force_sensor.dead_zone"]
+    dead = identify(campaign, options=IdentificationOptions(law=law))["rig.force_sensor.dead_zone"]
     assert dead.low < 4.0 < dead.high and dead.high - dead.low > 5.0
 
 
@@ -139,7 +142,7 @@ def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
 def test_identify_uses_prior_for_missing_motion_or_contact():
     campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)
     overrides = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.delay": 0.0043}
-    result = identify(campaign, jaxhil.load("varying", overrides), Options(law="kelvin_voigt"))
+    result = identify(campaign, jaxhil.load("varying", overrides), IdentificationOptions(law="kelvin_voigt"))
     assert result["contact.stiffness.0"].value == pytest.approx(1.2e5, rel=0.005)
     assert result.mechanism["rig"]["simulator"]["delay"] == 0.0043 and "prior" in result.notes[0]
     free = campaigns.campaign("clean", 2, speeds=(), seconds=30.0)
@@ -162,7 +165,7 @@ def test_identify_names_missing_runs_without_prior(speeds, seconds, says):
 def test_identify_uses_prior_for_contact_below_noise():
     """The noise of 2.67 N exceeds the contact force at 0.3 mm/s."""
     campaign = campaigns.campaign("noisy", 0, speeds=(0.0002, 0.0003), seconds=5.0)
-    options = Options(law="linear", fixed={"rig.contact_plane": 0.0}, hold_out=0.0)
+    options = IdentificationOptions(law="linear", fixed={"rig.contact_plane": 0.0}, hold_out=0.0)
     result = identify(campaign, jaxhil.load("varying"), options)
     assert result.mechanism["contact"]["stiffness"] == [124355.0, 373065.0, 62177.5]
     assert "the contact is the prior's" in result.notes[0]
@@ -172,9 +175,9 @@ def test_identify_uses_prior_for_contact_below_noise():
 def test_identify_keeps_fixed_values(clean):
     fixed = {"rig.contact_plane": 0.0, "rig.position_sensor.delay": 0.001}
     result = identify_kind(
-        "clean", speeds=FEW, seconds=30.0, options=Options(law="kelvin_voigt", fixed=fixed)
+        "clean", speeds=FEW, seconds=30.0, options=IdentificationOptions(law="kelvin_voigt", fixed=fixed)
     )
-    assert result["rig.contact_plane"].told and "rig.contact_plane" not in result.mechanism["uncertainty"]
+    assert result["rig.contact_plane"].is_fixed and "rig.contact_plane" not in result.mechanism["uncertainty"]
     assert result["rig.simulator.delay"].value == pytest.approx(
         clean["rig.simulator.delay"].value - 0.001, abs=1e-6
     )
@@ -183,14 +186,15 @@ def test_identify_keeps_fixed_values(clean):
     assert result.mechanism["rig"]["position_sensor"]["delay"] == 0.001
     with pytest.raises(jaxhil.InputError, match=r"fix: found rig\.range"):
         identify(
-            campaigns.campaign("clean", 0, speeds=(), seconds=5.0), options=Options(fixed={"rig.range": 1.0})
+            campaigns.campaign("clean", 0, speeds=(), seconds=5.0),
+            options=IdentificationOptions(fixed={"rig.range": 1.0}),
         )
 
 
 def test_identify_attributes_computing_delay_to_motion(clean):
     campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
     late = replace(campaign, timing=replace(campaign.timing, computing_delay=2), integrator="explicit_euler")
-    result = identify(late, options=Options(law="kelvin_voigt"))
+    result = identify(late, options=IdentificationOptions(law="kelvin_voigt"))
     delay = clean["rig.simulator.delay"].value
     assert result["rig.simulator.delay"].value == pytest.approx(delay + 0.002, abs=1e-8)
     force = clean["rig.force_sensor.delay"].value
@@ -208,7 +212,7 @@ def test_identify_keeps_prior_only_for_unobservable_values(clean):
     stated |= {"rig.simulator.damping_ratio": Uncertainty(distribution="normal", std=0.3)}
     prior = msgspec.structs.replace(prior, uncertainty=stated, correlation=None)
     campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
-    result = identify(campaign, prior, Options(law="kelvin_voigt")).mechanism
+    result = identify(campaign, prior, IdentificationOptions(law="kelvin_voigt")).mechanism
     sensor, uncertain = result["rig"]["force_sensor"], result["uncertainty"]
     assert not {"time_constant", "dead_zone"} & sensor.keys() and sensor["range"] == 800.0
     assert uncertain["rig.position_sensor.noise_std"]["std"] == 1e-7
@@ -218,7 +222,7 @@ def test_identify_keeps_prior_only_for_unobservable_values(clean):
 def test_identify_copies_previous_list_entry_for_missing_contact():
     campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.006, 0.012, 0.003) * 2, seconds=15.0)
     runs = tuple(run for run in campaign.runs if run.kind != "contact" or run.contact_index[0] != 1)
-    result = identify(replace(campaign, runs=runs), options=Options(law="kelvin_voigt"))
+    result = identify(replace(campaign, runs=runs), options=IdentificationOptions(law="kelvin_voigt"))
     first, between, last = result.mechanism["contact"]["stiffness"]
     assert first == between == pytest.approx(1.2e5, rel=0.01) and last == pytest.approx(7e4, rel=0.01)
     assert "only entries 0, 2 were met" in result.notes[0]
@@ -228,7 +232,7 @@ def test_identify_copies_previous_list_entry_for_missing_contact():
 def test_identify_copies_previous_list_entry_for_grazing_contact():
     """Touches of the second entry only graze the contact."""
     campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.012, 0.0002, 0.012, 0.006, 0.0002, 0.006))
-    result = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
     first, second, last = result.mechanism["contact"]["stiffness"]
     assert first == second == pytest.approx(1.2e5, rel=0.02) and last == pytest.approx(7e4, rel=0.02)
     assert "contact.stiffness.1: known to 30 % at best: taken as the entry before it" in result.notes[0]
@@ -239,15 +243,15 @@ def test_identify_splits_delay_if_position_sensor_lags_more(monkeypatch):
     rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=30.0)
-    result = identify(campaign, options=Options(law="kelvin_voigt"))
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt"))
     share = result["rig.position_sensor.delay"].value
     assert result["rig.simulator.delay"].value + share == pytest.approx(0.0073, abs=2e-5)
     assert 0.0 < result["rig.force_sensor.delay"].value == pytest.approx(share - 0.0018, abs=2.5e-4)
     assert "the position sensor lags more than the force sensor" in result.notes[0] and result.good
-    assert check(campaign, from_builtins(result.mechanism, "found")).good
+    assert check_against_mechanism(campaign, from_plain_data(result.mechanism, "found")).good
     # A prior specifies the position sensor's share; the other delays follow.
     prior = campaign_rigs.mechanism("slow")
-    result = identify(campaign, prior, Options(law="kelvin_voigt"))
+    result = identify(campaign, prior, IdentificationOptions(law="kelvin_voigt"))
     assert result["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
     assert result["rig.force_sensor.delay"].value == pytest.approx(0.0012, abs=2.5e-4)
     assert result.mechanism["rig"]["position_sensor"]["delay"] == 0.003 and result.notes == ()
@@ -257,23 +261,25 @@ def test_identify_does_not_write_impossible_mechanism():
     """The message must not name a key of a file that does not exist."""
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 2, seconds=10.0)
     negative = tuple(replace(run, force_measured=-run.force_measured) for run in campaign.runs)
-    result = identify(replace(campaign, runs=negative), options=Options(law="kelvin_voigt", hold_out=0.0))
+    result = identify(
+        replace(campaign, runs=negative), options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0)
+    )
     assert result.mechanism is None and not result.good
     assert "mechanism file: identified mechanism: contact.stiffness[0]: found -" in result.verdict
 
 
 @pytest.mark.parametrize("options, message", (
-    ({"law": "rubber"}, "law: found 'rubber', allowed linear"),
-    ({"order": 7}, "order: found 7, allowed 0, 1, 2"),
+    ({"law": "rubber"}, "law: found 'rubber', expected linear"),
+    ({"order": 7}, "order: found 7, expected 0, 1, 2"),
 ))  # fmt: skip
 def test_identify_rejects_unknown_law_and_order(options, message):
     with pytest.raises(jaxhil.InputError, match=message):
-        identify(campaigns.campaign("clean", 0, (), 5.0), options=Options(**options))
+        identify(campaigns.campaign("clean", 0, (), 5.0), options=IdentificationOptions(**options))
 
 
 def test_identify_holds_out_touches_of_every_speed():
     runs = campaigns.campaign("clean", 0, seconds=0, rest=0).runs
-    is_held_out = held_out(runs, 0.2)
+    is_held_out = select_held_out_contacts(runs, 0.2)
     assert is_held_out.sum() == 3 and {
         run.speed for run, out in zip(runs, is_held_out, strict=True) if out
     } == {
@@ -281,14 +287,14 @@ def test_identify_holds_out_touches_of_every_speed():
         0.006,
         0.012,
     }
-    assert not held_out(runs, 0.0).any() and not held_out(runs[:2], 0.2).any()
+    assert not select_held_out_contacts(runs, 0.0).any() and not select_held_out_contacts(runs[:2], 0.2).any()
 
 
 def test_uncertainty_tables_have_floors_and_positive_definite_correlation():
     rng = np.random.default_rng(0)
     column = rng.standard_normal(3000)
     draws = np.column_stack([column, column, 1e-9 * rng.standard_normal(3000), rng.standard_normal(3000)])
-    tables = uncertainty_tables(["a.x.0", "a.x.1", "b", "c"], draws, np.array([0.0, 0.0, 0.5, 0.0]))
+    tables = make_uncertainty_tables(["a.x.0", "a.x.1", "b", "c"], draws, np.array([0.0, 0.0, 0.5, 0.0]))
     assert (
         tables["uncertainty"]["b"]["std"] == pytest.approx(0.5)
         and tables["uncertainty"]["a.x"]["independent"]

@@ -13,15 +13,19 @@ import campaigns
 import numpy as np
 import pytest
 
-from jaxhil.mechanism.file import from_builtins, load
+from jaxhil.mechanism.file import from_plain_data, load
 from jaxhil.simulation.gain_choice import choose_gains
-from tuning.identification import known
-from tuning.identification.check import check
-from tuning.identification.estimate import Options, identify
-from tuning.identification.estimates import estimates
+from tuning.identification import mechanism_models
+from tuning.identification.estimates import make_estimates
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.identification.mechanism_check import check_against_mechanism
 from tuning.identification.mechanism_file import to_toml
-from tuning.identification.result import UNCERTAINTY
-from tuning.identification.uncertain_effect import IDENTIFIED, _contact, uncertain_effect
+from tuning.identification.result import UNCERTAINTY_CHECK
+from tuning.identification.uncertainty_effect import (
+    IDENTIFIED_SOURCE_PREFIX,
+    _simulate_ideal_contact,
+    compute_uncertainty_effect,
+)
 
 FEW = (0.003, 0.006, 0.012) * 3
 PRESS = "a press run with a multisine to 45 Hz"
@@ -47,13 +51,13 @@ def test_identify_never_drops_damping_while_delay_is_free(monkeypatch, tmp_path,
     verdict.
     """
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
-    result = identify(campaign, ambiguous.prior(name), Options(seed=seed))
+    result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
     assert result.contact.law.name == "kelvin_voigt"
     damping, age = result["contact.damping.0"], delay_and_lag(result)
     assert damping.low < 264.0 < damping.high and age.low < 0.0037 < age.high
     mechanism = written(result, tmp_path)
     assert {"rig.force_sensor.delay", "contact.damping"} <= {*mechanism.correlation.keys}
-    (line,) = (line for line in result.lines if line.name == UNCERTAINTY)
+    (line,) = (line for line in result.lines if line.name == UNCERTAINTY_CHECK)
     assert line.on_error > 1.2 * line.effect
     if name == "hidden":
         pair = {"rig.force_sensor.delay", "contact.damping.0"}
@@ -67,7 +71,9 @@ def test_identify_widens_damping_and_delay_for_possible_lag(monkeypatch):
     """Without the lag, the force's age was estimated as 2.84 +- 0.10 ms; the true value is 4.2 ms."""
     name, seed = "lag", 1002
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
-    result = identify(campaign, ambiguous.prior(name), Options(law="kelvin_voigt", hold_out=0.0, seed=seed))
+    result = identify(
+        campaign, ambiguous.prior(name), IdentificationOptions(law="kelvin_voigt", hold_out=0.0, seed=seed)
+    )
     age, damping = delay_and_lag(result), result["contact.damping.0"]
     assert abs(age.value - 0.0053) < 3.0 * age.std and abs(damping.value - 264.0) < 3.0 * damping.std
     assert not result.good and PRESS in result.verdict
@@ -76,7 +82,9 @@ def test_identify_widens_damping_and_delay_for_possible_lag(monkeypatch):
 @pytest.mark.parametrize(("name", "possible"), (("undamped", True), ("plain", False)))
 def test_identify_keeps_undamped_contact_in_the_draws(monkeypatch, name, possible):
     campaign = ambiguous.campaign(monkeypatch, name, 0, seconds=10.0)
-    result = identify(campaign, ambiguous.prior(name), Options(law="kelvin_voigt", hold_out=0.0))
+    result = identify(
+        campaign, ambiguous.prior(name), IdentificationOptions(law="kelvin_voigt", hold_out=0.0)
+    )
     posterior = result.contact.posterior
     share = np.mean(posterior.draws[:, posterior.names.index("damping")] == 0.0)
     assert (0.05 < share < 1.0) if possible else share == 0.0
@@ -89,14 +97,14 @@ def test_delay_interval_includes_delay_of_undamped_contact():
     damping = np.abs(rng.normal(0.0, 100.0, 4000))
     delay = 0.0037 + damping / 124355.0 + 2e-5 * rng.standard_normal(4000)
     draws = {"contact.damping.0": damping, "rig.force_sensor.delay": delay}
-    of_damping, of_delay = estimates(draws, None, None, None, None, {})
+    of_damping, of_delay = make_estimates(draws, None, None, None, None, {})
     assert of_damping.low == 0.0 and np.quantile(delay, 0.025) > 0.00371
     assert 0.00364 < of_delay.low < 0.00368 and of_delay.high < np.quantile(delay, 0.99)
 
 
 def test_identify_uses_specified_contact_law(monkeypatch):
     campaign = ambiguous.campaign(monkeypatch, "undamped", 0, speeds=FEW, seconds=10.0)
-    result = identify(campaign, options=Options(law="linear", hold_out=0.0))
+    result = identify(campaign, options=IdentificationOptions(law="linear", hold_out=0.0))
     assert result.contact.law.name == "linear" and result["rig.force_sensor.delay"].std < 5e-5
     assert any(note.startswith("law linear: without damping, as asked for") for note in result.notes)
 
@@ -107,12 +115,12 @@ def test_identify_reports_negative_delay_and_verdict_is_bad(monkeypatch, tmp_pat
     monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=10.0)
     fixed = {"rig.position_sensor.delay": 0.0}
-    result = identify(campaign, options=Options(law="kelvin_voigt", fixed=fixed))
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", fixed=fixed))
     assert result["rig.force_sensor.delay"].value == pytest.approx(-0.0018, abs=3e-4)
     assert result.mechanism["rig"]["force_sensor"]["delay"] == 0.0
     assert result.mechanism["uncertainty"]["rig.force_sensor.delay"]["std"] > 0.0015
     assert any(note.startswith("rig.force_sensor.delay: the logs say -0.001") for note in result.notes)
-    assert not result.good and not check(campaign, written(result, tmp_path)).good
+    assert not result.good and not check_against_mechanism(campaign, written(result, tmp_path)).good
 
 
 def _hold(campaign):
@@ -140,8 +148,8 @@ def test_identify_verdict_equals_check_of_written_file(monkeypatch, tmp_path, na
     """Include cases with a bad verdict."""
     monkeypatch.setattr(campaigns, "KINDS", campaign_kinds.KINDS | ambiguous.KINDS)
     campaign = change(campaigns.campaign(name, 3, speeds=FEW, seconds=10.0))
-    result = identify(campaign, options=Options(**options))
-    again = check(campaign, written(result, tmp_path), result.limit)
+    result = identify(campaign, options=IdentificationOptions(**options))
+    again = check_against_mechanism(campaign, written(result, tmp_path), result.limit)
     assert again.good == result.good
     assert again.effect == result.effect and again.effect_on_error == result.effect_on_error
 
@@ -161,21 +169,27 @@ def test_identify_accepts_log_of_one_contact(monkeypatch, noise):
 
 def test_uncertainty_effect_matches_spring_to_first_order():
     mechanism = ambiguous.truth("undamped")
-    contact, frequency = _contact(mechanism, known.contact_law(mechanism.contact), 0)
+    contact, frequency = _simulate_ideal_contact(
+        mechanism, mechanism_models.make_regression_law(mechanism.contact), 0
+    )
     natural = np.sqrt(124355.0 / 350.0)
     assert contact.restitution == pytest.approx(1.0, abs=1e-3)
     assert 2.0 * np.pi * frequency == pytest.approx(natural, rel=0.01)
-    assert contact.by_age == pytest.approx(np.pi / 2.0 * natural, rel=0.01)
+    assert contact.age_sensitivity == pytest.approx(np.pi / 2.0 * natural, rel=0.01)
     # e* = exp(-pi zeta), zeta = b / (2 sqrt(k M)).
-    assert contact.by_coefficient[1] == pytest.approx(-np.pi / 2.0 / np.sqrt(124355.0 * 350.0), rel=0.01)
+    assert contact.coefficient_sensitivity[1] == pytest.approx(
+        -np.pi / 2.0 / np.sqrt(124355.0 * 350.0), rel=0.01
+    )
 
 
 def test_uncertainty_effect_counts_only_identified_uncertainty():
     """Uncertainty of other origin describes how mechanisms vary."""
-    assert uncertain_effect(load("rig-300kg").mechanism).parts == {}
-    document = ambiguous.to_builtins(ambiguous.truth("plain")) | {"source": f"{IDENTIFIED} logs"}
+    assert compute_uncertainty_effect(load("rig-300kg").mechanism).parts == {}
+    document = ambiguous.to_plain_data(ambiguous.truth("plain")) | {
+        "source": f"{IDENTIFIED_SOURCE_PREFIX} logs"
+    }
     document["uncertainty"] = {"rig.force_sensor.delay": {"distribution": "normal", "std": 1e-4}}
-    effect = uncertain_effect(from_builtins(document, "one"))
+    effect = compute_uncertainty_effect(from_plain_data(document, "one"))
     # 99 % of normal draws lie within 2.576 standard deviations.
     assert effect.error >= 0.9 * 2.576 * 1e-4 * 29.5 and effect.restitution >= effect.error
 
@@ -196,10 +210,10 @@ def test_identified_files_with_good_verdict_are_accurate(monkeypatch, name):
     mechanisms, good, inside = [], [], []
     for seed in range(REPEATS):
         campaign = ambiguous.campaign(monkeypatch, name, 80_000 + seed)
-        result = identify(campaign, ambiguous.prior(name), Options(seed=seed))
-        mechanisms.append(from_builtins(result.mechanism, "identified"))
+        result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
+        mechanisms.append(from_plain_data(result.mechanism, "identified"))
         good.append(result.good)
-        assert check(campaign, mechanisms[-1]).good == result.good
+        assert check_against_mechanism(campaign, mechanisms[-1]).good == result.good
         share = mechanisms[-1].rig.position_sensor.delay - kind.rig["position_sensor"].get("delay", 0.0)
         covered = [item.low <= true[item.key] <= item.high for item in result.estimates if item.key in true]
         estimate = delay_and_lag(result)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import jaxhil
-from tuning.caches.pieces import Pieces
+from tuning.caches.checkpoints import Checkpoints
 from tuning.identification import bootstrap
-from tuning.identification.contact import estimate
+from tuning.identification.contact_fit import fit_contact
 from tuning.identification.contact_laws import kelvin_voigt
-from tuning.identification.estimate import Options, identify
-from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.identification.rational import STRUCTURES, MotionModel
 
 
 def scattering(seed, share, speeds=campaigns.SPEEDS):
@@ -30,7 +30,9 @@ def scattering(seed, share, speeds=campaigns.SPEEDS):
 
 
 def of(campaign, repeats):
-    return identify(campaign, options=Options(law="kelvin_voigt", order=2, bootstrap=repeats, hold_out=0.0))
+    return identify(
+        campaign, options=IdentificationOptions(law="kelvin_voigt", order=2, bootstrap=repeats, hold_out=0.0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +40,15 @@ def fit():
     """Fit eight equal contacts."""
     kind, timing = campaigns.KINDS["clean"], campaigns.campaign("clean", 0, (), 0, 0).timing
     runs = campaigns._touch_runs(kind, np.random.default_rng(0), (0.006, 0.012) * 4)
-    model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-    return estimate(runs, model, timing, None, kelvin_voigt())
+    model = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+    return fit_contact(runs, model, timing, None, kelvin_voigt())
 
 
 @pytest.mark.parametrize("times", (1.2, 3.0))
 def test_bootstrap_widens_draws_if_fits_scatter_more(fit, monkeypatch, times):
     original = fit.posterior.draws
     monkeypatch.setattr(
-        "tuning.identification.bootstrap.fits",
+        "tuning.identification.bootstrap.fit_bootstrap_samples",
         lambda *_: original.mean(axis=0) + times * (original - original.mean(axis=0)),
     )
     result = bootstrap.bootstrap(fit, 20)
@@ -82,11 +84,11 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
         spread = np.array([readings.force[:, lanes].std() for lanes in drawn]) + seed
         return np.outer(spread, np.arange(1.0, 1.0 + fit.posterior.draws.shape[1]))
 
-    monkeypatch.setattr(bootstrap, "means", means)
+    monkeypatch.setattr(bootstrap, "fit_resampled_contacts", means)
     with pytest.raises(KeyboardInterrupt):
-        bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path))
+        bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path))
     most = 100
-    again = bootstrap.bootstrap(fit, 20, kept=Pieces(tmp_path, resume=True), say=messages.append)
+    again = bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path, resume=True), say=messages.append)
     assert len(done) == 4 and messages == ["fits to contacts drawn again: 15 of 20"]
     whole = bootstrap.bootstrap(fit, 20)
     assert again.resampled == whole.resampled
@@ -94,13 +96,13 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
 
 
 def test_bootstrap_checkpoints_fit_only_the_same_problem(fit, tmp_path, monkeypatch):
-    monkeypatch.setattr(bootstrap, "means", lambda drawn, *_: np.zeros((len(drawn), 3)))
+    monkeypatch.setattr(bootstrap, "fit_resampled_contacts", lambda drawn, *_: np.zeros((len(drawn), 3)))
 
     def anew(other_fit, seed=0):
         """Return how many of the four checkpoints of `fit` are rejected for another problem."""
-        bootstrap.fits(fit, 20, 0, None, Pieces(tmp_path), messages.append)
-        checkpoints = Pieces(tmp_path, resume=True)
-        bootstrap.fits(other_fit, 20, seed, None, checkpoints, messages.append)
+        bootstrap.fit_bootstrap_samples(fit, 20, 0, None, Checkpoints(tmp_path), messages.append)
+        checkpoints = Checkpoints(tmp_path, resume=True)
+        bootstrap.fit_bootstrap_samples(other_fit, 20, seed, None, checkpoints, messages.append)
         return len(checkpoints.other)
 
     def changed(owner, **values):
@@ -124,7 +126,7 @@ def test_bootstrap_checkpoints_fit_only_the_same_problem(fit, tmp_path, monkeypa
 def test_bootstrap_rejects_too_few_contacts_and_repeats():
     few = campaigns.campaign("clean", 0, speeds=(0.006, 0.012, 0.006), seconds=5.0)
     assert "no bootstrap: 3 contacts, 6 are needed" in of(few, 20).notes
-    with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, allowed 0, or 20 or more"):
+    with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, expected 0, or 20 or more"):
         of(few, 5)
 
 

@@ -8,9 +8,9 @@ import campaigns
 import numpy as np
 import pytest
 
-from tuning.identification.contact_problem import Problem
-from tuning.identification.estimate import Options, identify
-from tuning.identification.result import UNCERTAINTY
+from tuning.identification.contact_problem import ContactProblem
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.identification.result import UNCERTAINTY_CHECK
 
 pytestmark = pytest.mark.slow
 REPEATS = 400
@@ -56,7 +56,9 @@ def test_identify_intervals_have_stated_95_percent_coverage(name):
     inside, scores, errors = ({key: [] for key in numbers} for _ in range(3))
     for seed in range(REPEATS):
         campaign = campaigns.campaign(name, 10_000 + seed)
-        result = identify(campaign, options=Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed))
+        result = identify(
+            campaign, options=IdentificationOptions(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed)
+        )
         for key, value in numbers.items():
             estimate = result[key]
             inside[key].append(estimate.low <= value <= estimate.high)
@@ -99,7 +101,8 @@ def test_identify_errors_lie_within_allowed_limits(name):
     rows, good, left = [], 0, []
     for seed in range(10):
         result = identify(
-            campaigns.campaign(name, 20_000 + seed), options=Options(law="kelvin_voigt", seed=seed)
+            campaigns.campaign(name, 20_000 + seed),
+            options=IdentificationOptions(law="kelvin_voigt", seed=seed),
         )
         delays = result["rig.force_sensor.delay"].value
         lag = next(
@@ -115,7 +118,7 @@ def test_identify_errors_lie_within_allowed_limits(name):
             (result["apparent damping"].value - (numbers["apparent damping"] + 0.0)) / critical,
         ])  # fmt: skip
         # Noise and dead zones leave damping and delay uncertain; that is not a defect.
-        good += result.good or result.worst.name == UNCERTAINTY
+        good += result.good or result.worst.name == UNCERTAINTY_CHECK
         held_out_line = next(
             line for line in result.lines if line.name == "restitution of touches not fitted"
         )
@@ -137,13 +140,17 @@ def test_identify_errors_lie_within_allowed_limits(name):
 ))  # fmt: skip
 def test_identify_selects_the_true_contact_law_in_20_of_20_campaigns(name, law):
     for seed in range(20):
-        result = identify(campaigns.campaign(name, 30_000 + seed), options=Options(hold_out=0.0))
+        result = identify(
+            campaigns.campaign(name, 30_000 + seed), options=IdentificationOptions(hold_out=0.0)
+        )
         assert result.contact.law.name == law, (seed, result.contact.law)
 
 
 def test_identify_detects_every_drift():
     for seed in range(20):
-        result = identify(campaigns.campaign("drifting", 40_000 + seed), options=Options(law="kelvin_voigt"))
+        result = identify(
+            campaigns.campaign("drifting", 40_000 + seed), options=IdentificationOptions(law="kelvin_voigt")
+        )
         assert not result.good
 
 
@@ -154,12 +161,12 @@ def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
     off, bounds = [], []
     for seed in range(10):
         campaign = campaigns.campaign("lagging", 20_000 + seed)
-        result = identify(campaign, options=Options(law="kelvin_voigt", hold_out=0.0))
+        result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
         off.append(result["delay and lag of force"].value - 0.0041)
         problem = result.contact.problem
 
         def force(numbers, problem=problem):
-            lag = Problem(problem.motion, problem.readings, problem.law, None, numbers[1])
+            lag = ContactProblem(problem.motion, problem.readings, problem.law, None, numbers[1])
             return lag.force(numbers[0], numbers[2], numbers[3:]).ravel()[problem.kept] / 0.5
 
         slopes = np.array(
@@ -181,7 +188,8 @@ def test_identify_separates_force_delay_from_damping_with_press_run():
     off = []
     for seed in range(5):
         result = identify(
-            campaigns.campaign("noisy", 50_000 + seed, press=True), options=Options(law="kelvin_voigt")
+            campaigns.campaign("noisy", 50_000 + seed, press=True),
+            options=IdentificationOptions(law="kelvin_voigt"),
         )
         off.append((result["rig.force_sensor.delay"].value - 0.0037, result["rig.force_sensor.delay"].std))
         assert result.good

@@ -1,4 +1,4 @@
-"""`check` of logs of an independent rig against its own mechanism and against similar ones."""
+"""`check_against_mechanism` on logs of an independent rig, with its own mechanism and with similar ones."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import campaigns
 import pytest
 
 from jaxhil.errors import InputError
-from tuning.identification.check import check
+from tuning.identification.mechanism_check import check_against_mechanism
 
 FEW = (0.003, 0.006, 0.012)
 
@@ -22,7 +22,7 @@ def worst(result):
 
 
 def test_check_accepts_logs_of_the_same_mechanism(clean):
-    result = check(clean, campaign_rigs.mechanism("clean"))
+    result = check_against_mechanism(clean, campaign_rigs.mechanism("clean"))
     assert result.good and result.effect == 0.0 and result.estimates == ()
     names = [line.name for line in result.lines]
     assert "motion model" in names and "contact law" in names and "drift from touch to touch" not in names
@@ -42,7 +42,7 @@ def test_check_accepts_logs_of_the_same_mechanism(clean):
 )
 def test_check_rejects_logs_of_another_mechanism(clean, changed, name):
     """The command hold belongs to the logs, not to the mechanism."""
-    result = check(clean, campaign_rigs.mechanism("clean", **changed))
+    result = check_against_mechanism(clean, campaign_rigs.mechanism("clean", **changed))
     assert result.good == (name is None)
     assert name in [None, *(line.name for line in result.lines if line.there)]
 
@@ -51,7 +51,7 @@ def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
     runs = [replace(run, source=f"run_{index}.csv") for index, run in enumerate(clean.runs)]
     index = next(index for index, run in reversed(list(enumerate(runs))) if run.kind == "contact")
     runs[index] = replace(runs[index], force_measured=1.1 * runs[index].force_measured, begin=7.0)
-    result = check(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
+    result = check_against_mechanism(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
     (line,) = (line for line in result.lines if line.name == "contact law")
     assert line.there and line.where.startswith(f"run_{index}.csv from 7.")
 
@@ -59,7 +59,9 @@ def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
 def test_check_detects_wrong_command_hold(clean):
     wrong = replace(clean, timing=replace(clean.timing, command_hold="zoh"))
     assert "command hold" in [
-        line.name for line in check(wrong, campaign_rigs.mechanism("clean")).lines if line.there
+        line.name
+        for line in check_against_mechanism(wrong, campaign_rigs.mechanism("clean")).lines
+        if line.there
     ]
 
 
@@ -69,22 +71,23 @@ def test_check_accepts_logs_of_every_kind_of_rig(name):
     if name in ("coloured", "jitter"):
         pytest.skip("the same rig as clean")
     good = [
-        check(campaigns.campaign(name, 60 + seed), campaign_rigs.mechanism(name)).good for seed in range(5)
+        check_against_mechanism(campaigns.campaign(name, 60 + seed), campaign_rigs.mechanism(name)).good
+        for seed in range(5)
     ]
     assert all(good)
 
 
 @pytest.mark.slow
 def test_check_detects_drift():
-    result = check(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
+    result = check_against_mechanism(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
     assert not result.good and any(line.name.startswith("drift") and line.there for line in result.lines)
 
 
 def test_check_rejects_logs_without_motion_and_unsupported_contact_law(clean):
     at_rest_only = replace(clean, runs=tuple(run for run in clean.runs if run.kind == "rest"))
     with pytest.raises(InputError, match="found neither free motion nor contact"):
-        check(at_rest_only, campaign_rigs.mechanism("clean"))
+        check_against_mechanism(at_rest_only, campaign_rigs.mechanism("clean"))
     plastic = campaign_rigs.mechanism("clean", contact__law="elastoplastic", contact__unloading_ratio=2.0,
                                   contact__damping=[0.0])  # fmt: skip
     with pytest.raises(InputError, match=r"contact\.law: found 'elastoplastic', expected linear"):
-        check(clean, plastic)
+        check_against_mechanism(clean, plastic)

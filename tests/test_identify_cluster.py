@@ -7,9 +7,9 @@ from clusters import killed_meanwhile, started
 
 from jaxhil.errors import InputError
 from tuning.identification import bootstrap
-from tuning.identification.contact import estimate
+from tuning.identification.contact_fit import fit_contact
 from tuning.identification.contact_laws import kelvin_voigt
-from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.rational import STRUCTURES, MotionModel
 
 pytestmark = pytest.mark.users_options
 
@@ -18,16 +18,16 @@ pytestmark = pytest.mark.users_options
 def fit():
     """Fit so many rows that BLAS would divide a dot product among its threads."""
     runs = campaigns._touch_runs(campaigns.KINDS["clean"], np.random.default_rng(0), (0.006, 0.012) * 15)
-    model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+    model = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     timing = campaigns.campaign("clean", 0, (), 0, 0).timing
-    return estimate(runs, model, timing, None, kelvin_voigt())
+    return fit_contact(runs, model, timing, None, kelvin_voigt())
 
 
 @pytest.mark.parametrize("asked", (("--scheduler", "tcp://127.0.0.1:1"), ("--resume",)))
 def test_identify_rejects_bootstrap_options_without_bootstrap(jaxhil, asked):
     run = jaxhil("identify", "x.csv", *asked)
     assert run.code == 2
-    assert f"{asked[0]}: found no --bootstrap, allowed beside one" in run.err
+    assert f"{asked[0]}: found no --bootstrap, expected beside one" in run.err
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ FEW = (0.003, 0.006, 0.012) * 3
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
     """Skip the plots; they have their own tests."""
-    monkeypatch.setattr("tuning.plots.identification.draw", lambda *_: {})
+    monkeypatch.setattr("tuning.plots.identification.draw_identification", lambda *_: {})
 
 
 @pytest.fixture(scope="module")
@@ -113,17 +113,17 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
         (["LOGS", "--prior", "rig-300"], ["did you mean rig-300kg"]),
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),
         (["LOGS", "--fix", "rig.contact_plane"], ["--fix rig.contact_plane"]),
-        (["LOGS", "--fix", "rig.contact_plane=a"], ["contact_plane=a: found 'a', allowed a number"]),
-        (["LOGS", "--fix", "contact.damping=[650, nan]"], ["found [650, nan], allowed a number, or a list"]),
+        (["LOGS", "--fix", "rig.contact_plane=a"], ["contact_plane=a: found 'a', expected a number"]),
+        (["LOGS", "--fix", "contact.damping=[650, nan]"], ["found [650, nan], expected a number, or a list"]),
         (["--check", "LOG"], ["--check: found no mechanism"]),
         (["--check", "LOG", "rig-300"], ["did you mean rig-300kg"]),
         (["--check", "LOG", "rig-300kg", "--law", "linear"], ["--check: found --law beside it"]),
         (["--design"], ["--design: found 0 mechanisms"]),
         (["--design", "rig-300"], ["did you mean rig-300kg"]),
-        (["--design", "rig-300kg", "--stroke", "0"], ["--stroke: found 0 m, allowed a number > 0"]),
+        (["--design", "rig-300kg", "--stroke", "0"], ["--stroke: found 0 m, expected a number > 0"]),
         (["LOGS", "--bayes"], ["--bayes: found no prior"]),
         (["LOGS", "--limit", "nan"], ["--limit"]),
-        (["LOGS", "--order", "ten"], ["--order: found 'ten', allowed auto, or 0 to 4"]),
+        (["LOGS", "--order", "ten"], ["--order: found 'ten', expected auto, or 0 to 4"]),
         (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from tuning.identification import contact_profile
-from tuning.identification.contact import after_gaps, pieces
+from tuning.identification.contact_fit import exclude_rows_after_gaps, split_long_run
 from tuning.identification.contact_laws import kelvin_voigt
-from tuning.identification.contact_problem import LONGEST, Problem
-from tuning.identification.contact_profile import profile
-from tuning.identification.force_readings import Readings
-from tuning.identification.law_choice import judge, quick
-from tuning.identification.motion import Motion, exponential
-from tuning.identification.rational import STRUCTURES, Model
-from tuning.identification.sensor_filter import lag_weights, onset_weights
+from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
+from tuning.identification.contact_profile import compute_posterior
+from tuning.identification.force_readings import ForceReadings
+from tuning.identification.law_choice import choose_contact_law, search_coarsely
+from tuning.identification.motion import MotionResponse, compute_matrix_exponential
+from tuning.identification.rational import STRUCTURES, MotionModel
+from tuning.identification.sensor_filter import compute_lag_weights, compute_onset_weights
 
-HERTZ = contact_law("hunt_crossley").regression(SimpleNamespace(exponent=1.5))
-SECOND = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+HERTZ = find_contact_law("hunt_crossley").regression(SimpleNamespace(exponent=1.5))
+SECOND = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 
 
 def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, time_constant=0.0):
@@ -32,9 +32,9 @@ def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, t
     runs = campaigns._touch_runs(kind, np.random.default_rng(seed), speeds)
     timing = campaigns.campaign(name, 0, speeds=(), seconds=0, rest=0).timing
     sensor_delay = kind.rig["position_sensor"].get("delay", 0.0)
-    model = Model(SECOND.structure, SECOND.parameters + np.array([0.0, 0.0, sensor_delay]))
-    readings = Readings.of(runs, noise or 0.5)
-    return Problem(Motion(model, runs, timing, 0.022), readings, law, plane, time_constant)
+    model = MotionModel(SECOND.structure, SECOND.parameters + np.array([0.0, 0.0, sensor_delay]))
+    readings = ForceReadings.of(runs, noise or 0.5)
+    return ContactProblem(MotionResponse(model, runs, timing, 0.022), readings, law, plane, time_constant)
 
 
 @pytest.mark.parametrize("name, law, plane, expected", (
@@ -63,7 +63,7 @@ def test_contact_fit_is_exact_with_force_sensor_lag():
 
 def test_lag_weights_are_exact_for_parabola():
     rate = 0.7
-    pole, weights = lag_weights(rate)
+    pole, weights = compute_lag_weights(rate)
     t = np.linspace(0.0, 1.0, 200_001)
     kernel = rate * np.exp(-(1.0 - t) * rate)
     for power in (0, 1, 2):
@@ -74,7 +74,7 @@ def test_lag_weights_are_exact_for_parabola():
 
 def test_onset_weights_are_exact_for_contact_onset_within_a_period():
     rate, left = 0.7, np.array([0.03, 0.4, 1.0])
-    after, end = onset_weights(rate, left)
+    after, end = compute_onset_weights(rate, left)
     for share, begin_weight, end_weight in zip(left, after, end, strict=True):
         t = np.linspace(1.0 - share, 1.0, 200_001)
         line = 3.0 + 2.0 * (t - t[0]) / share
@@ -84,7 +84,7 @@ def test_onset_weights_are_exact_for_contact_onset_within_a_period():
 
 def test_contact_fit_with_white_noise_equals_filtered_path():
     plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
-    filtered = Problem(plain.motion, plain.readings, plain.law, None)
+    filtered = ContactProblem(plain.motion, plain.readings, plain.law, None)
     filtered.plain, filtered.where = False, np.arange(plain.readings.counts.size)
     filtered.entry = plain.readings.entry.ravel()
     for delay in (0.0031, 0.0037):
@@ -96,11 +96,11 @@ def test_contact_fit_with_white_noise_equals_filtered_path():
 
 def test_matrix_exponential_matches_scipy():
     matrix = np.random.default_rng(0).standard_normal((5, 5)) * 3.0
-    np.testing.assert_allclose(exponential(matrix), expm(matrix), rtol=1e-11)
+    np.testing.assert_allclose(compute_matrix_exponential(matrix), expm(matrix), rtol=1e-11)
 
 
 def test_contact_posterior_covers_truth_and_apparent_damping_is_most_precise():
-    posterior = profile(problem("clean", kelvin_voigt(), seed=4))
+    posterior = compute_posterior(problem("clean", kelvin_voigt(), seed=4))
     values = dict(zip(posterior.names, posterior.draws.T, strict=True))
     for name, truth in (("delay", 0.0037), ("plane", 0.0), ("stiffness.0", 1.2e5), ("damping", 650.0)):
         # 99.99 % of normal draws lie within 4 standard deviations.
@@ -118,11 +118,13 @@ def test_contact_fit_of_press_in_chunks_is_exact():
         sensor: {**kind.rig[sensor], "noise_std": 0.0} for sensor in ("force_sensor", "position_sensor")
     }
     run = campaigns._press_run(replace(kind, rig={**kind.rig, **silent}), np.random.default_rng(0), 10.0)
-    cut = pieces(run, 0.001)
+    cut = split_long_run(run, 0.001)
     assert sum(int(piece.valid.sum()) for piece in cut) == len(run.tick) - 500
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
     law = kelvin_voigt()
-    inner = Problem(Motion(SECOND, cut, timing, 0.022), Readings.of(cut, 0.5), law, 0.0).at(0.0037, 0.0)
+    inner = ContactProblem(
+        MotionResponse(SECOND, cut, timing, 0.022), ForceReadings.of(cut, 0.5), law, 0.0
+    ).at(0.0037, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
 
 
@@ -141,13 +143,13 @@ def test_contact_fit_skips_rows_until_motion_forgets_a_gap():
         for run in runs
         for part in (slice(0, 120), slice(150, None))
     ]
-    usable = after_gaps(halves, SECOND, 0.001)
+    usable = exclude_rows_after_gaps(halves, SECOND, 0.001)
     assert [int(run.valid.sum()) for run in usable] == [120, 79, 120, 79]
-    assert after_gaps(runs, SECOND, 0.001)[0].valid.all()
+    assert exclude_rows_after_gaps(runs, SECOND, 0.001)[0].valid.all()
     worst = []
     for cut in (usable, halves):
-        motion = Motion(SECOND, cut, timing, 0.022)
-        inner = Problem(motion, Readings.of(cut, 0.5), kelvin_voigt(), 0.0).at(0.0037, 0.0)
+        motion = MotionResponse(SECOND, cut, timing, 0.022)
+        inner = ContactProblem(motion, ForceReadings.of(cut, 0.5), kelvin_voigt(), 0.0).at(0.0037, 0.0)
         worst.append(np.max(np.abs(inner.coefficients - [1.2e5, 650.0, 0.0]) / [1.2e5, 650.0, 1.0]))
     assert worst[0] < 1e-3 < 1e-2 < worst[1]
 
@@ -157,8 +159,10 @@ def test_contact_fit_of_undamped_contact_has_no_negative_damping():
     soft = replace(kind, contact={**kind.contact, "damping": [0.0]})
     runs = campaigns._touch_runs(soft, np.random.default_rng(0), (0.003, 0.006, 0.012))
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
-    undamped = Problem(Motion(SECOND, runs, timing, 0.022), Readings.of(runs, 0.5), kelvin_voigt(), 0.0)
-    posterior = profile(undamped, size=(21, 5))
+    undamped = ContactProblem(
+        MotionResponse(SECOND, runs, timing, 0.022), ForceReadings.of(runs, 0.5), kelvin_voigt(), 0.0
+    )
+    posterior = compute_posterior(undamped, size=(21, 5))
     damping = posterior.draws[:, posterior.names.index("damping")]
     assert damping.min() >= 0.0 and damping.mean() < 4.0 * damping.std()
     assert posterior.mean[0] == pytest.approx(0.0037, abs=4.0 * posterior.draws[:, 0].std())
@@ -167,20 +171,28 @@ def test_contact_fit_of_undamped_contact_has_no_negative_damping():
 @pytest.mark.parametrize("name, law", (("clean", "kelvin_voigt"), ("hertz", "hunt_crossley")))
 def test_contact_law_selection_finds_the_true_law(name, law):
     readings_problem = problem(name, kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
-    candidates = judge(
+    candidates = choose_contact_law(
         readings_problem.motion, readings_problem.readings, None, ("linear", "kelvin_voigt", "hunt_crossley")
     )
     assert candidates[0].law.name == law and not candidates[0].law.pulls
-    assert all(other.short[0] > 2.0 * other.short[1] for other in candidates[1:] if other.law.name != law)
+    assert all(
+        other.likelihood_deficit[0] > 2.0 * other.likelihood_deficit[1]
+        for other in candidates[1:]
+        if other.law.name != law
+    )
     if name == "hertz":
         assert candidates[0].law.shape == {"exponent": 1.5}
 
 
 def test_contact_profile_cells_are_cut_at_contact_onsets():
     at = np.array([0.1, 0.15, 0.7])
-    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0])
-    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at, 3), [0.0, 0.15, 0.7, 1.0])
-    np.testing.assert_allclose(contact_profile.cut(0.0, 1.0, at[:0], 4), [0.0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(
+        contact_profile.divide_into_cells(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0]
+    )
+    np.testing.assert_allclose(contact_profile.divide_into_cells(0.0, 1.0, at, 3), [0.0, 0.15, 0.7, 1.0])
+    np.testing.assert_allclose(
+        contact_profile.divide_into_cells(0.0, 1.0, at[:0], 4), [0.0, 0.25, 0.5, 0.75, 1.0]
+    )
     exact = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012, 0.003), seed=3)
     (plane, *_) = exact.onsets_between(0.0037, -3e-6, 3e-6)
     inside = [exact.motion.at(0.0037)[0] > surface for surface in (plane - 1e-9, plane + 1e-9)]
@@ -191,6 +203,6 @@ def test_quick_search_stays_within_longest_delay():
     """Beyond the longest delay, the grid about the delay had a single point."""
     clean = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
-    late = Problem(clean.motion, late, clean.law, clean.plane)
-    delay, *_ = quick(late, (LONGEST + 0.002, 0.0, np.inf))
-    assert delay <= LONGEST
+    late = ContactProblem(clean.motion, late, clean.law, clean.plane)
+    delay, *_ = search_coarsely(late, (MAX_FORCE_DELAY + 0.002, 0.0, np.inf))
+    assert delay <= MAX_FORCE_DELAY

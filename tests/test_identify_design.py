@@ -12,12 +12,12 @@ from scipy import optimize
 from jaxhil.errors import InputError
 from jaxhil.rig import digest
 from jaxhil.simulation.gain_choice import choose_gains
-from tuning.identification import contact, free_motion
+from tuning.identification import contact_fit, free_motion
 from tuning.identification.design import powers, waveform
-from tuning.identification.design.excitation import PERIODS, design, error_slopes
-from tuning.identification.estimate import SHORTEST_REST
-from tuning.identification.noise import at_rest
-from tuning.identification.records import Timing
+from tuning.identification.design.excitation import MULTISINE_PERIODS, design_excitation, differentiate_error
+from tuning.identification.identify import MIN_REST_ROWS
+from tuning.identification.noise import estimate_noise
+from tuning.identification.records import CampaignTiming
 
 # Derivatives of e - e* by the parameters of "clean", as the slow test computes them.
 SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
@@ -29,8 +29,8 @@ def test_best_powers_of_slope_lie_at_both_ends():
     """
     x = np.linspace(-1.0, 1.0, 21)
     rows = np.stack([np.ones_like(x), x])
-    group = powers.Group(np.einsum("il,jl->lij", rows, rows), np.ones((1, 21)))
-    (power,) = powers.best_powers([group], np.diag([0.0, 1.0]))
+    group = powers.RunLines(np.einsum("il,jl->lij", rows, rows), np.ones((1, 21)))
+    (power,) = powers.optimise_powers([group], np.diag([0.0, 1.0]))
     np.testing.assert_allclose(power[[0, -1]], 0.5, atol=1e-2)
     assert power[1:-1].sum() < 1e-2
 
@@ -40,16 +40,16 @@ def test_best_powers_within_limits_match_general_solver(seed):
     random = np.random.default_rng(seed)
     rows = random.standard_normal((2, 7))
     use = random.uniform(0.1, 1.0, (2, 7))
-    group, weight = powers.Group(np.einsum("il,jl->lij", rows, rows), use), np.diag([1.0, 0.3])
+    group, weight = powers.RunLines(np.einsum("il,jl->lij", rows, rows), use), np.diag([1.0, 0.3])
 
     def error(power):
-        return np.trace(weight @ np.linalg.inv(powers.information([group], [power])))
+        return np.trace(weight @ np.linalg.inv(powers.sum_information([group], [power])))
 
     limits = [{"type": "ineq", "fun": lambda p, row=row: 1.0 - row @ p} for row in use]
-    start = powers.flat_powers(group)
+    start = powers.make_flat_powers(group)
     result = optimize.minimize(error, start, method="SLSQP", bounds=[(1e-9, None)] * 7, constraints=limits,
                               options={"ftol": 1e-10, "maxiter": 500})  # fmt: skip
-    (power,) = powers.best_powers([group], weight)
+    (power,) = powers.optimise_powers([group], weight)
     assert np.all(use @ power <= 1.0 + 1e-9)
     assert error(power) == pytest.approx(result.fun, rel=5e-3) and error(power) < error(start)
 
@@ -57,10 +57,12 @@ def test_best_powers_within_limits_match_general_solver(seed):
 def test_multisine_has_low_crest_factor_and_given_amplitudes():
     lines, rows = np.arange(1, 200, 2), 2000
     amplitude = np.random.default_rng(0).uniform(0.1, 1.0, len(lines))
-    made = waveform.wave(amplitude, lines, rows, waveform.phases(amplitude, lines, rows))
+    made = waveform.synthesise_multisine(
+        amplitude, lines, rows, waveform.optimise_phases(amplitude, lines, rows)
+    )
     np.testing.assert_allclose(2.0 / rows * np.abs(np.fft.rfft(made))[lines], amplitude, rtol=1e-12)
     assert waveform.crest_factor(made) < 1.6
-    whole = waveform.repeated(made, 3, 100)
+    whole = waveform.repeat_with_fades(made, 3, 100)
     assert whole[0] == 0.0 and np.max(np.abs(np.diff(whole))) <= 1.1 * np.max(np.abs(np.diff(made)))
     np.testing.assert_array_equal(whole[100 : 100 + 2 * rows], np.tile(made, 2))
 
@@ -70,7 +72,7 @@ def planned():
     mechanism = campaign_rigs.mechanism(
         "clean", simulator__acceleration_limit=20.0, simulator__velocity_limit=0.3
     )
-    return design(mechanism, 0.002, lambda keys: SLOPES)
+    return design_excitation(mechanism, 0.002, lambda keys: SLOPES)
 
 
 def test_design_keeps_and_uses_the_limits(planned):
@@ -95,11 +97,11 @@ def test_design_is_more_informative_than_flat_spectrum(planned):
 
 def spread(planned, repeats):
     """Return the standard deviations of the motion parameters over campaigns, relative to those predicted."""
-    timing, rows = Timing(1e-3, "linear", 0, "tick"), []
+    timing, rows = CampaignTiming(1e-3, "linear", 0, "tick"), []
     for seed in range(repeats):
         run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, seed)
-        fit = free_motion.estimate([run], timing, 2)
-        assert fit is not None and fit.spectra[0].periods == PERIODS - 1
+        fit = free_motion.fit_free_motion([run], timing, 2)
+        assert fit is not None and fit.spectra[0].periods == MULTISINE_PERIODS - 1
         w, zeta, delay = fit.model.parameters
         rows.append([np.exp(w) / (2.0 * np.pi), np.exp(zeta), delay])
     return np.std(rows, axis=0, ddof=1) / planned.std[:3], np.mean(rows, axis=0)
@@ -107,8 +109,8 @@ def spread(planned, repeats):
 
 def test_design_predicts_standard_deviations_of_fit(planned):
     run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0)
-    fit = free_motion.estimate([run], Timing(1e-3, "linear", 0, "tick"), 2)
-    assert fit is not None and fit.spectra[0].periods == PERIODS - 1
+    fit = free_motion.fit_free_motion([run], CampaignTiming(1e-3, "linear", 0, "tick"), 2)
+    assert fit is not None and fit.spectra[0].periods == MULTISINE_PERIODS - 1
     values, std = fit.model.parameters, np.sqrt(np.diag(fit.covariance))
     scale = np.array([np.exp(values[0]) / (2.0 * np.pi), np.exp(values[1]), 1.0])
     np.testing.assert_allclose(scale * std, planned.std[:3], rtol=0.1)
@@ -118,20 +120,24 @@ def test_design_predicts_standard_deviations_of_fit(planned):
 def test_design_predicts_scatter_over_many_campaigns():
     mechanism = campaign_rigs.mechanism("clean")
     gains = choose_gains(mechanism, "response_error", None)[1]
-    planned = design(mechanism, 0.002, partial(error_slopes, mechanism, "response_error", gains))
+    planned = design_excitation(
+        mechanism, 0.002, partial(differentiate_error, mechanism, "response_error", gains)
+    )
     assert max(planned.free.crest, planned.press.crest) < 1.8
     print("slopes", np.round(planned.slopes.mean(axis=0), 9).tolist(), "flat over best", planned.flat)
     np.testing.assert_allclose(planned.slopes.mean(axis=0), SLOPES[0], rtol=0.2, atol=1e-6)
     ratio, _ = spread(planned, 100)
     print("free: std over predicted", ratio)
     assert np.all(np.abs(ratio - 1.0) < 0.25)
-    timing, kind = Timing(1e-3, "linear", 0, "tick"), campaigns.KINDS["clean"]
-    noise = at_rest(0.5 * np.random.default_rng(0).standard_normal(10 * SHORTEST_REST))
+    timing, kind = CampaignTiming(1e-3, "linear", 0, "tick"), campaigns.KINDS["clean"]
+    noise = estimate_noise(0.5 * np.random.default_rng(0).standard_normal(10 * MIN_REST_ROWS))
     free = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0, noise=False)
-    model, rows = free_motion.estimate([free], timing, 2).model, []
+    model, rows = free_motion.fit_free_motion([free], timing, 2).model, []
     for seed in range(16):
         run = campaign_rigs.commanded("clean", "press", planned.press.position, seed)
-        fit = contact.estimate(contact.pieces(run, 1e-3), model, timing, noise, "kelvin_voigt")
+        fit = contact_fit.fit_contact(
+            contact_fit.split_long_run(run, 1e-3), model, timing, noise, "kelvin_voigt"
+        )
         estimates = dict(zip(fit.posterior.names, fit.posterior.mean, strict=True))
         rows.append([estimates["delay"], estimates["stiffness.0"], estimates["damping"]])
     ratio = np.std(rows, axis=0, ddof=1) / planned.std[3:]
@@ -150,7 +156,7 @@ def test_design_rejects_unsupported_mechanism():
         ({"rig__simulator": campaign_kinds.RESONANT}, r"rig\.simulator\.model: found 'transfer_function'"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=reason):
-            design(campaign_rigs.mechanism("clean", **changed), 0.002, lambda keys: SLOPES)
+            design_excitation(campaign_rigs.mechanism("clean", **changed), 0.002, lambda keys: SLOPES)
 
 
 @pytest.mark.slow

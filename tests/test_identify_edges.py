@@ -8,22 +8,22 @@ import campaigns
 import numpy as np
 import pytest
 
-from jaxhil.mechanism.file import from_builtins, to_builtins
-from tuning.identification.check import check
-from tuning.identification.estimate import identify
-from tuning.identification.motion import Motion
-from tuning.identification.noise import at_rest
-from tuning.identification.rational import STRUCTURES, Model
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from tuning.identification.identify import identify
+from tuning.identification.mechanism_check import check_against_mechanism
+from tuning.identification.motion import MotionResponse
+from tuning.identification.noise import estimate_noise
+from tuning.identification.rational import STRUCTURES, MotionModel
 
 
 def checked(monkeypatch, lag):
     """Return the check of the edges for a file with the true lag [s], or with it as a longer delay."""
     campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
-    raw: dict[str, Any] = to_builtins(ambiguous.truth("lag")) | {"source": "identified from logs"}
+    raw: dict[str, Any] = to_plain_data(ambiguous.truth("lag")) | {"source": "identified from logs"}
     sensor = raw["rig"]["force_sensor"]
     raw["rig"]["force_sensor"] = {**sensor, "time_constant": lag, "delay": sensor["delay"] + 0.0016 - lag}
     raw["uncertainty"] = {"rig.force_sensor.delay": {"distribution": "normal", "std": 1e-4}}
-    result = check(campaign, from_builtins(raw, "identified"))
+    result = check_against_mechanism(campaign, from_plain_data(raw, "identified"))
     (line,) = (line for line in result.lines if line.name == "edges of contact")
     return line
 
@@ -37,11 +37,11 @@ def test_check_detects_missing_force_lag_at_contact_edges(monkeypatch, lag, ther
 
 def test_at_rest_estimates_dead_zone_from_noise():
     signal = np.random.default_rng(1).standard_normal(20_000)
-    noise = at_rest(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
+    noise = estimate_noise(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
     assert noise.silent and noise.dead_zone is not None
     value, std = noise.dead_zone
     assert abs(value - 0.7) < 4.0 * std < 0.1 and noise.std == pytest.approx(1.0, rel=0.05)
-    cut = at_rest(np.where(np.abs(signal) > 0.7, signal, 0.0))
+    cut = estimate_noise(np.where(np.abs(signal) > 0.7, signal, 0.0))
     assert cut.silent and cut.dead_zone is None
 
 
@@ -54,9 +54,9 @@ def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_
         less = 0.0 if is_cut else 3.0 * np.sign(force)
         runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force - less, 0.0)))
     campaign = replace(campaign, runs=tuple(runs))
-    prior: dict[str, Any] = to_builtins(ambiguous.prior("plain"))
+    prior: dict[str, Any] = to_plain_data(ambiguous.prior("plain"))
     prior["rig"]["force_sensor"]["dead_zone"] = 3.0
-    result = identify(campaign, from_builtins(prior, "prior"))
+    result = identify(campaign, from_plain_data(prior, "prior"))
     findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
     assert findings == (
         ["no reading lies between 0 and 3 N, as behind a dead zone that cuts"] if is_cut else []
@@ -66,9 +66,11 @@ def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_
 
 def test_motion_is_evaluated_at_the_time_of_the_force_readings():
     campaign = campaigns.campaign("clean", 0, speeds=(0.006, 0.012), seconds=0, rest=0)
-    model = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+    model = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     late = [replace(run, force_late=np.full(len(run.tick), 3e-4)) for run in campaign.runs]
-    motion, undelayed = (Motion(model, runs, campaign.timing, 0.022) for runs in (late, campaign.runs))
+    motion, undelayed = (
+        MotionResponse(model, runs, campaign.timing, 0.022) for runs in (late, campaign.runs)
+    )
     for late_values, values in zip(motion.at(0.004), undelayed.at(0.0037), strict=True):
         np.testing.assert_allclose(late_values, values, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(motion.of_positions().at(0.004)[0], undelayed.at(0.004)[0])
+    np.testing.assert_array_equal(motion.at_row_times().at(0.004)[0], undelayed.at(0.004)[0])

@@ -17,7 +17,7 @@ PRIOR = "--prior", "rig-300kg"
 
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
-    monkeypatch.setattr("tuning.plots.identification.draw", lambda *_: {})
+    monkeypatch.setattr("tuning.plots.identification.draw_identification", lambda *_: {})
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def only(kind, number=99):
 
 
 REFUSED = {
-    "the force's sign": (lambda day: changed(day, FORCE, np.negative), "allowed the other sign"),
+    "the force's sign": (lambda day: changed(day, FORCE, np.negative), "expected the other sign"),
     "N for kN": (lambda day: changed(day, FORCE, lambda values: 1e3 * values), "is its unit right?"),
     "m for mm": (lambda day: changed(day, COMMAND, lambda values: 1e-3 * values), "is its unit right?"),
     "position and command": (swapped(COMMAND, POSITION), "are the two swapped?"),
@@ -81,7 +81,7 @@ REFUSED = {
         lambda day: changed(day, COMMAND, held(4), ("contact",), reveals=True), "changes every 4 rows",
     ),
     "time backwards": (
-        lambda day: changed(day, TIME, lambda values: values[::-1]), "allowed time that increases",
+        lambda day: changed(day, TIME, lambda values: values[::-1]), "expected time that increases",
     ),
     "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact where there is"),
     "a force range of 5 N": (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import from_builtins, to_builtins
-from tuning.identification import knowledge
-from tuning.identification.estimate import Options, identify
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from tuning.identification import conditioning
+from tuning.identification.identify import IdentificationOptions, identify
 
 KEYS = [
     "rig.simulator.natural_frequency",
@@ -38,7 +38,7 @@ def logs_say(keys, seed=0):
 def prior(shift=1.0, scale=1.5):
     """Return a mechanism whose marginals are off by so many standard deviations."""
     mean = MEAN + shift * STD * np.array([1, -1, 1, -1])
-    document = to_builtins(campaign_rigs.mechanism("clean", simulator__natural_frequency=mean[0],
+    document = to_plain_data(campaign_rigs.mechanism("clean", simulator__natural_frequency=mean[0],
                            force_sensor__delay=mean[1], contact__stiffness=[mean[2]],
                            contact__damping=[mean[3]]))  # fmt: skip
     names = [key.removesuffix(".0") for key in KEYS]
@@ -48,7 +48,7 @@ def prior(shift=1.0, scale=1.5):
     }
     rows = [[float(value) for value in CORRELATION[i, : i + 1]] for i in range(4)]
     document["correlation"] = {"keys": names, "matrix": rows}
-    return from_builtins(document, "prior"), mean, scale**2 * COVARIANCE
+    return from_plain_data(document, "prior"), mean, scale**2 * COVARIANCE
 
 
 def summary(draws, keys=KEYS):
@@ -66,7 +66,7 @@ def close(actual, expected, share=0.06):
 
 def test_with_prior_equals_weighted_least_squares():
     mechanism, mean, spread = prior()
-    result = knowledge.with_prior(logs_say(KEYS), mechanism, 3.0)
+    result = conditioning.condition_on_prior(logs_say(KEYS), mechanism, 3.0)
     both = np.linalg.inv(np.linalg.inv(COVARIANCE) + np.linalg.inv(spread))
     wanted = both @ (np.linalg.solve(COVARIANCE, MEAN) + np.linalg.solve(spread, mean))
     close(summary(result), (wanted, both))
@@ -77,8 +77,8 @@ def test_with_prior_moves_values_known_only_from_the_prior():
     lags.
     """
     mechanism, mean, spread = prior()
-    draws = knowledge.with_prior(logs_say(KEYS[1:]), mechanism, 3.0)
-    slope = knowledge._lag_slopes(mechanism, KEYS[:1], 3.0)[KEYS[0]]
+    draws = conditioning.condition_on_prior(logs_say(KEYS[1:]), mechanism, 3.0)
+    slope = conditioning._differentiate_lag(mechanism, KEYS[:1], 3.0)[KEYS[0]]
     # Second order: the lag is 2 zeta/w at low frequencies, so its relative slope is -1/12 per Hz.
     assert slope == pytest.approx(-2 * 0.8 / (2 * np.pi * 12.0) / 12.0, rel=0.1)
     reading = np.array([[slope, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
@@ -90,34 +90,37 @@ def test_with_prior_moves_values_known_only_from_the_prior():
 
 
 def test_fixed_values_condition_draws_and_note_contradictions():
-    result, notes = knowledge.with_told(logs_say(KEYS), {"contact.damping.0": 660.0})
+    result, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 660.0})
     assert KEYS[3] not in result and notes == []
     regression = COVARIANCE[:3, 3] / COVARIANCE[3, 3]
     rest = COVARIANCE[:3, :3] - np.outer(regression, COVARIANCE[3, :3])
     close(summary(result, KEYS[:3]), (MEAN[:3] + 10.0 * regression, rest), 1e-6)
-    _, notes = knowledge.with_told(logs_say(KEYS), {"contact.damping.0": 0.0})
+    _, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 0.0})
     assert notes == ["contact.damping.0: 0 was told, the logs say 650 +- 12"]
 
 
 def test_spread_out_assigns_list_values_entry_by_entry():
     result = ["contact.stiffness.0", "contact.stiffness.1", "contact.damping.0"]
-    assert knowledge.spread_out({"contact.stiffness": [1.0, 2.0]}, result) == {result[0]: 1.0, result[1]: 2.0}
-    assert knowledge.spread_out({"contact.stiffness": 3.0}, result) == {result[0]: 3.0, result[1]: 3.0}
-    assert knowledge.spread_out({"contact.stiffness.1": 3.0}, result) == {result[1]: 3.0}
+    assert conditioning.split_lists({"contact.stiffness": [1.0, 2.0]}, result) == {
+        result[0]: 1.0,
+        result[1]: 2.0,
+    }
+    assert conditioning.split_lists({"contact.stiffness": 3.0}, result) == {result[0]: 3.0, result[1]: 3.0}
+    assert conditioning.split_lists({"contact.stiffness.1": 3.0}, result) == {result[1]: 3.0}
     for key, value in (
         ("rig.range", 1.0),
         ("contact.stiffness", [1.0, 2.0, 3.0]),
         ("contact.damping", [[1.0]]),
     ):
-        with pytest.raises(InputError, match=f"fix: found {key}.*, allowed contact.stiffness.0, "):
-            knowledge.spread_out({key: value}, result)
+        with pytest.raises(InputError, match=f"fix: found {key}.*, expected contact.stiffness.0, "):
+            conditioning.split_lists({key: value}, result)
 
 
 def test_with_prior_rejects_prior_without_uncertainty():
     with pytest.raises(InputError, match=r"prior: \[uncertainty\]: found no entry of what the logs tell"):
-        knowledge.with_prior(logs_say(KEYS), campaign_rigs.mechanism("clean"), 3.0)
+        conditioning.condition_on_prior(logs_say(KEYS), campaign_rigs.mechanism("clean"), 3.0)
     with pytest.raises(InputError, match="bayes: found no prior"):
-        identify(campaigns.campaign("clean", 0, (), 5.0), options=Options(bayes=True))
+        identify(campaigns.campaign("clean", 0, (), 5.0), options=IdentificationOptions(bayes=True))
 
 
 @pytest.mark.slow
@@ -128,14 +131,14 @@ def test_sequential_campaigns_equal_joint_identification(name, seed):
     whole = campaigns.campaign(name, seed, speeds=speeds, seconds=30.0)
     rest, free, *touches = whole.runs
     *_, other = campaigns.campaign(name, seed + 50, speeds=(), seconds=30.0).runs
-    options = Options(law="kelvin_voigt", order=2, hold_out=0.0, calibration=0.0, clock=0.0)
+    options = IdentificationOptions(law="kelvin_voigt", order=2, hold_out=0.0, calibration=0.0, clock=0.0)
 
     def identify_runs(*runs, **changes):
         return identify(replace(whole, runs=runs), changes.pop("prior", None), replace(options, **changes))
 
     first = identify_runs(rest, free, *touches[::2])
     second = identify_runs(
-        rest, other, *touches[1::2], prior=from_builtins(first.mechanism, "first"), bayes=True
+        rest, other, *touches[1::2], prior=from_plain_data(first.mechanism, "first"), bayes=True
     )
     once = identify_runs(rest, free, other, *touches)
     keys = [key for key in second.mechanism["correlation"]["keys"]]

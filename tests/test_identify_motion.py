@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from tuning.identification import free_motion, frf, hold, rational
-from tuning.identification.order import choose
-from tuning.identification.rational import STRUCTURES, Lines, Model, fit
+from tuning.identification.rational import STRUCTURES, MotionModel, SpectralLines, fit_structure
+from tuning.identification.structure_choice import choose_structure
 
 BY_NAME = {structure.name: structure for structure in STRUCTURES}
-SECOND = Model(BY_NAME["second_order"], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-THIRD = Model(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np.log(0.5), 0.0031]))
+SECOND = MotionModel(BY_NAME["second_order"], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+THIRD = MotionModel(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np.log(0.5), 0.0031]))
 
 
 def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
@@ -18,8 +18,10 @@ def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
     frequency = np.delete(np.arange(1, 226, 2), np.s_[3::4]) / 5.0
     rng = np.random.default_rng(0)
     command = 1e-4 * np.exp(2j * np.pi * rng.uniform(size=len(frequency)))
-    empty = Lines(frequency, command, command, np.full(len(frequency), std), period, hold, latency, shift)
-    return Lines(frequency, command, model.predict(empty), empty.std, period, hold, latency, shift)
+    empty = SpectralLines(
+        frequency, command, command, np.full(len(frequency), std), period, hold, latency, shift
+    )
+    return SpectralLines(frequency, command, model.predict(empty), empty.std, period, hold, latency, shift)
 
 
 @pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
@@ -34,8 +36,8 @@ def test_motion_model_matches_exactly_sampled_simulator(name):
     U, Y = np.fft.rfft(wave), np.fft.rfft(response)
     number = np.flatnonzero(np.abs(U) > 1e-6 * np.abs(U).max())
     hold_of = kind.rig.get("command_hold", "linear"), kind.rig.get("command_latency", 0)
-    lines = Lines(number / (len(wave) * T), U[number], Y[number], np.ones(len(number)), T, *hold_of)
-    result = fit(BY_NAME[{"clean": "second_order"}.get(name, name)], lines)
+    lines = SpectralLines(number / (len(wave) * T), U[number], Y[number], np.ones(len(number)), T, *hold_of)
+    result = fit_structure(BY_NAME[{"clean": "second_order"}.get(name, name)], lines)
     np.testing.assert_allclose(result.model.predict(lines), Y[number], rtol=2e-6)
     assert result.model.delay == pytest.approx(kind.rig["simulator"]["delay"], abs=2e-9)
     if name == "clean":
@@ -48,7 +50,7 @@ def test_motion_model_matches_exactly_sampled_simulator(name):
 ))  # fmt: skip
 def test_hold_response_is_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
     frequency = np.array([0.1, 1.0, 10.0])
-    response = hold.response(frequency, 0.002, kind, latency, shift)
+    response = hold.compute_hold_response(frequency, 0.002, kind, latency, shift)
     np.testing.assert_allclose(np.angle(response), -2.0 * np.pi * frequency * periods * 0.002, atol=1e-12)
     assert np.all(np.diff(np.abs(response)) < 0.0) and abs(response[0]) > 0.9999
 
@@ -59,7 +61,9 @@ def test_motion_model_slopes_match_finite_differences(model):
     for i, slope in enumerate(model.slopes(s)):
         step = np.zeros(len(model.parameters))
         step[i] = 1e-6
-        up, down = (np.log(Model(model.structure, model.parameters + d).response(s)) for d in (step, -step))
+        up, down = (
+            np.log(MotionModel(model.structure, model.parameters + d).response(s)) for d in (step, -step)
+        )
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-8)
 
 
@@ -67,19 +71,20 @@ def test_motion_model_bandwidth_matches_closed_form():
     zeta = 0.8
     ratio = np.sqrt(1.0 - 2.0 * zeta**2 + np.sqrt((1.0 - 2.0 * zeta**2) ** 2 + 1.0))
     assert SECOND.bandwidth() == pytest.approx(12.0 * ratio, rel=1e-9)
-    assert Model(BY_NAME["ideal"], np.array([0.01])).bandwidth() == np.inf
+    assert MotionModel(BY_NAME["ideal"], np.array([0.01])).bandwidth() == np.inf
 
 
 @pytest.mark.parametrize("name", ("ideal", "first_order", "second_order", "third_order"))
 def test_choose_takes_the_smallest_sufficient_order(name):
     numbers = {"ideal": [], "first_order": [np.log(0.022)], "second_order": [np.log(75.0), np.log(0.8)],
                "third_order": [np.log(0.008), np.log(110.0), np.log(0.5)]}[name]  # fmt: skip
-    exact = lines_of(Model(BY_NAME[name], np.array([*numbers, 0.0044])))
+    exact = lines_of(MotionModel(BY_NAME[name], np.array([*numbers, 0.0044])))
     rng = np.random.default_rng(1)
     noise = rng.standard_normal((2, len(exact))) * exact.std / np.sqrt(2.0)
-    noisy = Lines(exact.frequency, exact.command, exact.output + noise[0] + 1j * noise[1], exact.std, 0.001,
-                  "linear", 0)  # fmt: skip
-    chosen, candidates = choose(noisy)
+    noisy = SpectralLines(
+        exact.frequency, exact.command, exact.output + noise[0] + 1j * noise[1], exact.std, 0.001, "linear", 0
+    )
+    chosen, candidates = choose_structure(noisy)
     assert chosen.fit.model.structure.name == name
     assert chosen.fit.chi2 / chosen.fit.freedom == pytest.approx(1.0, abs=0.35)
     for larger in candidates:
@@ -94,9 +99,11 @@ def errors(repeats):
     shape = 11, len(wave)
     for seed in range(repeats):
         noisy = steady + 5e-6 * np.random.default_rng(seed).standard_normal(shape)
-        spectrum = frf.periodic(np.broadcast_to(wave, shape), noisy, np.ones(shape, bool), T)
-        lines = Lines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
-        best = fit(SECOND.structure, lines)
+        spectrum = frf.average_periods(np.broadcast_to(wave, shape), noisy, np.ones(shape, bool), T)
+        lines = SpectralLines(
+            spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0
+        )
+        best = fit_structure(SECOND.structure, lines)
         scores.append((best.model.parameters - SECOND.parameters) / best.std)
     return np.sqrt(np.mean(np.square(scores), axis=0)), np.mean(np.abs(scores) < 1.96, axis=0)
 
@@ -120,11 +127,11 @@ def test_local_polynomial_spectrum_estimates_response_from_chirp():
     command = 1e-3 * np.sin(2.0 * np.pi * (0.3 * time + (20.0 - 0.3) * time**2 / (2.0 * time[-1])))
     actual = campaigns._position(campaigns.Plant(kind.rig), command, 4.3)
     noisy = actual + 1e-6 * np.random.default_rng(0).standard_normal(len(actual))
-    spectrum = frf.spectrum(command, noisy, np.ones(len(command), bool), T, 500)
+    spectrum = frf.compute_spectrum(command, noisy, np.ones(len(command), bool), T, 500)
     assert spectrum.periods == 0 and spectrum.frequency.min() < 3.0 and spectrum.frequency.max() > 17.0
-    lines = Lines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
+    lines = SpectralLines(spectrum.frequency, spectrum.command, spectrum.output, spectrum.std, T, "linear", 0)
     assert np.sqrt(np.mean(np.abs(SECOND.predict(lines) / spectrum.output - 1.0) ** 2)) < 4e-3
-    best = fit(BY_NAME["second_order"], lines).model
+    best = fit_structure(BY_NAME["second_order"], lines).model
     assert best.delay == pytest.approx(0.0043, abs=2e-5)
     assert np.exp(best.parameters[0]) / (2.0 * np.pi) == pytest.approx(12.0, rel=3e-3)
 
@@ -133,7 +140,7 @@ def test_motion_fit_is_unbiased_with_lost_rows():
     campaign = campaigns.campaign("jitter", 2, speeds=(), rest=0)
     (run,) = campaign.runs
     assert 0.98 < run.valid.mean() < 1.0
-    result = free_motion.estimate([run], campaign.timing)
+    result = free_motion.fit_free_motion([run], campaign.timing)
     assert result.model.structure.name == "second_order" and result.left < 1.5
     assert abs(result.model.delay - 0.0043) < 2e-5
     assert result.noise_std == pytest.approx(5e-6, rel=0.02)
@@ -145,7 +152,7 @@ def test_spectrum_detects_nonlinearity_at_unexcited_lines():
     depth = run.position_measured - run.position_measured.mean()
     for power, which in ((3, "odd"), (2, "even")):
         bent = run.position_measured + 0.02 * depth**power / np.std(depth) ** (power - 1)
-        spectrum = frf.spectrum(run.position_desired, bent, run.valid, 0.001, 500)
+        spectrum = frf.compute_spectrum(run.position_desired, bent, run.valid, 0.001, 500)
         flagged, other = (spectrum.excess[0], spectrum.excess[1]) if which == "odd" else spectrum.excess[::-1]
         assert flagged > 20.0 and other < 2.0
 
@@ -155,9 +162,9 @@ def test_motion_model_limits_poles_beyond_all_lines(logarithms):
     """A pole of 1e134 rad/s made the motion overflow; at the frequencies of the lines nothing changes."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])
-    bounded = rational._with_slow_poles(structure, asked)
+    bounded = rational._limit_fast_poles(structure, asked)
     s = 2j * np.pi * np.array([0.5, 5.0, 50.0])
-    responses = [rational.Model(structure, values).response(s) for values in (bounded, asked)]
+    responses = [rational.MotionModel(structure, values).response(s) for values in (bounded, asked)]
     np.testing.assert_allclose(*responses, rtol=1e-3)
-    fastest = np.abs(np.roots(rational.Model(structure, bounded).fraction[1])).max()
-    assert fastest <= 1.001 / rational.SHORTEST
+    fastest = np.abs(np.roots(rational.MotionModel(structure, bounded).fraction[1])).max()
+    assert fastest <= 1.001 / rational.MIN_TIME_CONSTANT

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning.identification.noise import at_rest, autoregression, steps
+from tuning.identification.noise import detect_quantum, estimate_noise, fit_whitening_filter
 
 
 @pytest.mark.parametrize("quantum", (0.0, 0.5, 3.0, 8.0))
@@ -13,7 +13,7 @@ def test_at_rest_noise_and_bias_lie_within_their_errors_for_any_quantum(quantum)
     for seed in range(20):
         signal = 1.3 + 2.67 * np.random.default_rng(seed).standard_normal(3000)
         readings = quantum * np.round(signal / quantum) if quantum else signal
-        result = at_rest(readings)
+        result = estimate_noise(readings)
         assert result.quantum == pytest.approx(quantum, rel=1e-12)
         scores.append([(result.mean - 1.3) / result.mean_std, (result.std - 2.67) / result.std_std])
     rms = np.sqrt(np.mean(np.square(scores), axis=0))
@@ -24,7 +24,7 @@ def test_at_rest_noise_and_bias_lie_within_their_errors_for_any_quantum(quantum)
 def test_at_rest_estimates_noise_smaller_than_the_quantum():
     """Rounding alone would turn 0.3 of a quantum into 0.42."""
     readings = 0.5 * np.round((0.21 + 0.15 * np.random.default_rng(0).standard_normal(20_000)) / 0.5)
-    result = at_rest(readings)
+    result = estimate_noise(readings)
     assert result.std == pytest.approx(0.15, rel=0.03) and result.mean == pytest.approx(0.21, abs=0.01)
 
 
@@ -32,25 +32,25 @@ def test_at_rest_whitens_coloured_noise():
     rng, scores = np.random.default_rng(1), []
     for _ in range(20):
         drive = rng.standard_normal(6000) * np.sqrt(1.0 - 0.6**2)
-        result = at_rest(0.5 * lfilter([1.0], [1.0, -0.6], drive)[1000:])
+        result = estimate_noise(0.5 * lfilter([1.0], [1.0, -0.6], drive)[1000:])
         scores.append([result.mean / result.mean_std, (result.std - 0.5) / result.std_std])
         assert result.pole == pytest.approx(0.6, abs=0.1)
         assert result.innovation == pytest.approx(0.5 * 0.8, rel=0.05)
     assert np.all(np.sqrt(np.mean(np.square(scores), axis=0)) < 1.6)
-    assert autoregression(rng.standard_normal(5000)) == (1.0,)
+    assert fit_whitening_filter(rng.standard_normal(5000)) == (1.0,)
 
 
 def test_steps_finds_quantum_on_both_sides_of_a_dead_zone():
     force = 0.5 * np.round(20.0 * np.random.default_rng(0).standard_normal(4000))
     dead = np.sign(force) * np.maximum(0.0, np.abs(force) - 3.7)
-    assert steps(force) == pytest.approx(0.5) and steps(dead) == pytest.approx(0.5)
-    assert steps(np.random.default_rng(0).standard_normal(4000)) == 0.0
-    assert steps(np.zeros(100)) == 0.0
+    assert detect_quantum(force) == pytest.approx(0.5) and detect_quantum(dead) == pytest.approx(0.5)
+    assert detect_quantum(np.random.default_rng(0).standard_normal(4000)) == 0.0
+    assert detect_quantum(np.zeros(100)) == 0.0
 
 
 def test_at_rest_gives_no_noise_for_mostly_zero_readings():
     signal = 0.5 * np.random.default_rng(0).standard_normal(1000)
     dead = np.sign(signal) * np.maximum(0.0, np.abs(signal) - 4.0)
-    result = at_rest(dead)
+    result = estimate_noise(dead)
     assert result.silent and result.std_std == np.inf and result.filter == (1.0,)
-    assert not at_rest(signal).silent
+    assert not estimate_noise(signal).silent

@@ -5,15 +5,22 @@ import numpy as np
 import pytest
 
 import jaxhil as package
-from tuning.cli.commands.identify import PLOTS, _entry
-from tuning.identification.estimate import Options, identify
-from tuning.plots.identification import bode, compare, contacts, delay, draw, residuals
+from tuning.cli.commands.identify import PLOTS, _estimate_entry
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.plots.identification import (
+    draw_identification,
+    plot_bode,
+    plot_contacts,
+    plot_estimates,
+    plot_force_delay,
+    plot_residuals,
+)
 
 
 @pytest.fixture(scope="module")
 def identified():
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012), seconds=20.0)
-    return identify(campaign, options=Options(law="kelvin_voigt", order=2, hold_out=0.0))
+    return identify(campaign, options=IdentificationOptions(law="kelvin_voigt", order=2, hold_out=0.0))
 
 
 def line(axes, label):
@@ -22,7 +29,7 @@ def line(axes, label):
 
 
 def test_bode_plot_shows_response_of_the_rig(identified):
-    size, phase, off, coherence = bode(identified.motion).axes
+    size, phase, off, coherence = plot_bode(identified.motion).axes
     frequency, measured = line(size, "measured")
     s, w = 2j * np.pi * frequency, 2.0 * np.pi * 12.0
     # Linear interpolation between ticks adds no delay and attenuates by sinc^2.
@@ -35,23 +42,23 @@ def test_bode_plot_shows_response_of_the_rig(identified):
 
 
 def test_contact_plots_show_touches_and_residuals(identified):
-    left, right = delay(identified.contact, 0.0037).axes
+    left, right = plot_force_delay(identified.contact, 0.0037).axes
     profile = line(left, "profile of the likelihood")
     assert profile[1].max() == 1.0 and abs(profile[0][np.argmax(profile[1])] - 3.7) < 0.5
     assert line(left, "prior")[0][0] == pytest.approx(3.7) and "correlation 0." in right.get_title()
-    panels = contacts(identified.contact).axes
+    panels = plot_contacts(identified.contact).axes
     assert len(panels) == 6 and panels[0].get_title() == "touch 0" and panels[2].get_title() == "touch 2"
     for axes, speed in zip(panels[:3], (0.003, 0.006, 0.012), strict=True):
         measured, model = line(axes, "measured")[1], line(axes, "model")[1]
         assert np.nanstd(measured - model) < 0.7 and model.max() > 3e3 * speed
-    over_time, _, correlations, _ = residuals(identified.contact).axes
+    over_time, _, correlations, _ = plot_residuals(identified.contact).axes
     shown = line(over_time, "all touches")[1]
     assert 0.9 < shown.std() < 1.1 and np.abs(line(correlations, "correlation")[1]).max() < 0.1
 
 
 def test_comparison_plot_shows_prior_beside_estimates(identified):
-    entries = [_entry(estimate, package.load("rig-300kg")) for estimate in identified.estimates]
-    (axes,) = compare(entries).axes
+    entries = [_estimate_entry(estimate, package.load("rig-300kg")) for estimate in identified.estimates]
+    (axes,) = plot_estimates(entries).axes
     names = [tick.get_text() for tick in axes.get_yticklabels()]
     row = next(i for i, name in enumerate(names) if name.startswith("rig.simulator.delay"))
     share, rows = line(axes, "prior")
@@ -62,11 +69,11 @@ def test_comparison_plot_shows_prior_beside_estimates(identified):
 
 @pytest.mark.slow
 def test_identification_plots_are_reproducible(identified, tmp_path):
-    from jaxhil.simulation.contact_plot import save
+    from jaxhil.simulation.contact_plot import save_figure
 
-    entries = [_entry(estimate, None) for estimate in identified.estimates]
+    entries = [_estimate_entry(estimate, None) for estimate in identified.estimates]
     for again in ("one", "other"):
-        for name, figure in draw(identified, entries).items():
-            save(figure, tmp_path / again / name)
+        for name, figure in draw_identification(identified, entries).items():
+            save_figure(figure, tmp_path / again / name)
     for name in PLOTS:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuning.identification import free_motion, validation
-from tuning.identification.records import Run, Timing
+from tuning.identification.records import CampaignTiming, LoggedRun
 
 PERIOD = 0.001
 PUBLISHED = 183.8, 48.6  # rad/s, poles of the model without delay that was published with the data
@@ -17,9 +17,9 @@ def press():
     with np.load(Path(__file__).parent / "data" / "press_0A.npz") as data:
         command, position = (1e-6 * np.cumsum(data[name].astype(float)) for name in ("command", "position"))
     rows = len(command)
-    run = Run("free", "press_0A", np.arange(rows), 0.0, command, position, None, None, None,
+    run = LoggedRun("free", "press_0A", np.arange(rows), 0.0, command, position, None, None, None,
               np.ones(rows, bool), None, None)  # fmt: skip
-    return free_motion.estimate([run], Timing(PERIOD, "linear", 0, "tick"))
+    return free_motion.fit_free_motion([run], CampaignTiming(PERIOD, "linear", 0, "tick"))
 
 
 def error(press, response):
@@ -45,5 +45,5 @@ def test_press_data_error_of_published_model_without_delay_is_four_times_larger(
 
 
 def test_press_data_friction_is_detected(press):
-    misfit = validation.of_motion(press, 3.0)[0]
+    misfit = validation.check_motion_model(press, 3.0)[0]
     assert misfit.name == "motion model" and misfit.there and misfit.effect > 0.01

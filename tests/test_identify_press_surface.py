@@ -8,15 +8,15 @@ import pytest
 from campaign_rigs import commanded
 
 from jaxhil.errors import InputError
-from tuning.identification import contact
-from tuning.identification.motion import Motion
-from tuning.identification.noise import at_rest
-from tuning.identification.press import known_bias
-from tuning.identification.rational import STRUCTURES, Model
-from tuning.identification.records import Timing
+from tuning.identification import contact_fit
+from tuning.identification.motion import MotionResponse
+from tuning.identification.noise import estimate_noise
+from tuning.identification.press_bias import find_bias_prior
+from tuning.identification.rational import STRUCTURES, MotionModel
+from tuning.identification.records import CampaignTiming
 
-TIMING = Timing(0.001, "linear", 0, "tick", None)
-MODEL = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+TIMING = CampaignTiming(0.001, "linear", 0, "tick", None)
+MODEL = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 KIND = campaigns.KINDS["clean"]
 
 
@@ -32,12 +32,12 @@ def ramp(begin, deepest=0.001, seconds=4.0):
 
 
 def rest(noise=1.0, bias=0.0):
-    return at_rest(bias + 0.5 * noise * np.random.default_rng(0).standard_normal(3000))
+    return estimate_noise(bias + 0.5 * noise * np.random.default_rng(0).standard_normal(3000))
 
 
 def fit(run, noise):
-    pieces = contact.pieces(run, TIMING.control_period)
-    return contact.estimate(pieces, MODEL, TIMING, noise, "kelvin_voigt")
+    pieces = contact_fit.split_long_run(run, TIMING.control_period)
+    return contact_fit.fit_contact(pieces, MODEL, TIMING, noise, "kelvin_voigt")
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_press_from_outside_estimates_its_own_bias():
 
 
 def bias_of(runs, noise=None, plane=None):
-    return known_bias(runs, Motion(MODEL, runs, TIMING, 0.022), noise, plane)
+    return find_bias_prior(runs, MotionResponse(MODEL, runs, TIMING, 0.022), noise, plane)
 
 
 def test_press_needs_bias_only_for_unknown_surface():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tuning.identification import free_motion
-from tuning.identification.motion import Motion
-from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.motion import MotionResponse
+from tuning.identification.rational import STRUCTURES, MotionModel
 
 NAMES = (
     "frequency",
@@ -29,7 +29,7 @@ MOTION, PROFILED = slice(0, 3), 3
 
 def readings(runs, timing, numbers, noise, touching=None):
     """Return positions and forces of the touches over their noise, and the rows in contact."""
-    motion = Motion(Model(STRUCTURES[2], numbers[MOTION]), runs, timing, 0.022)
+    motion = MotionResponse(MotionModel(STRUCTURES[2], numbers[MOTION]), runs, timing, 0.022)
     position, velocity = motion.at(numbers[3])
     force = numbers[5] * (position - numbers[4]) + numbers[6] * velocity
     if touching is None:
@@ -47,7 +47,9 @@ def test_joint_fit_is_not_much_more_precise_than_stages(name, seconds):
     campaign = campaigns.campaign(name, 0, speeds=(), seconds=seconds, rest=0)
     timing, noise = campaign.timing, kind.rig["force_sensor"]["noise_std"]
     free = np.zeros((8, 8))
-    free[MOTION, MOTION] = np.linalg.inv(free_motion.estimate(list(campaign.runs), timing, 2).covariance)
+    free[MOTION, MOTION] = np.linalg.inv(
+        free_motion.fit_free_motion(list(campaign.runs), timing, 2).covariance
+    )
     runs = campaigns._touch_runs(kind, np.random.default_rng(0), campaigns.SPEEDS)
     touching = readings(runs, timing, TRUE, noise)[1]
     slopes = np.array([

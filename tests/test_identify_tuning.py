@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxhil.mechanism.file import from_builtins, to_builtins
-from jaxhil.simulation.building import build_loop
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.identification.estimate import Options, identify
+from tuning.identification.identify import IdentificationOptions, identify
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 PHASES = 511
@@ -40,12 +40,12 @@ def truth_within_bound(truth, identified):
     """
     off = force_age(identified) - force_age(truth)
     shift = math.copysign(1.2 * LEAST_DEVIATION, off)
-    raw = to_builtins(truth)
+    raw = to_plain_data(truth)
     raw["rig"]["force_sensor"]["delay"] += shift
     raw["contact"]["damping"] = [
         b + k * shift for b, k in zip(truth.contact.damping, truth.contact.stiffness, strict=True)
     ]
-    return from_builtins(raw, "along the ridge")
+    return from_plain_data(raw, "along the ridge")
 
 
 def force_age(mechanism):
@@ -61,8 +61,10 @@ def force_age(mechanism):
 ))  # fmt: skip
 def test_gains_tuned_on_identified_file_lose_little_on_true_rig(name, compensator, press):
     truth = campaign_rigs.mechanism(name)
-    result = identify(campaigns.campaign(name, 70_000, press=press), options=Options(law="kelvin_voigt"))
-    identified = from_builtins(result.mechanism, "identified")
+    result = identify(
+        campaigns.campaign(name, 70_000, press=press), options=IdentificationOptions(law="kelvin_voigt")
+    )
+    identified = from_plain_data(result.mechanism, "identified")
     asked = [truth, identified]
     if name == "lagging" and not press:
         asked.append(truth_within_bound(truth, identified))
@@ -81,11 +83,11 @@ def test_gains_tuned_on_identified_file_lose_little_on_true_rig(name, compensato
 
 def with_noise(name):
     """Return the true rig with the noise of its sensors."""
-    raw, sensors = to_builtins(ambiguous.truth(name)), ambiguous.KINDS[name].rig
+    raw, sensors = to_plain_data(ambiguous.truth(name)), ambiguous.KINDS[name].rig
     raw["rig"]["force_sensor"]["noise_std"] = sensors["force_sensor"]["noise_std"]
     position = {"delay": sensors["position_sensor"].get("delay", 0.0)}
     raw["rig"]["position_sensor"] = {**position, "noise_std": sensors["position_sensor"]["noise_std"]}
-    return from_builtins(raw, name)
+    return from_plain_data(raw, name)
 
 
 GOOD, TRIED = 40, 80
@@ -104,10 +106,10 @@ def test_gains_tuned_on_files_with_good_verdict_lose_little(monkeypatch):
     for number in range(TRIED):
         name = HARDLY_TOLD[number % len(HARDLY_TOLD)]
         campaign = ambiguous.campaign(monkeypatch, name, 90_000 + number)
-        result = identify(campaign, ambiguous.prior(name), Options(seed=number))
+        result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=number))
         if not result.good:
             continue
-        truth, written = ambiguous.truth(name), from_builtins(result.mechanism, "identified")
+        truth, written = ambiguous.truth(name), from_plain_data(result.mechanism, "identified")
         if name not in best:
             # With noise, tuning takes the quietest gains within the limit, as on the file.
             gains = tuning.tune(with_noise(name), "response_error", validation=32).gains

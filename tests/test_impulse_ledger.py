@@ -13,7 +13,7 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.laws.impulse_ledger.contact_model.rig import DELAY, PARAMETERS, ContactModel, features, slope
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 

@@ -8,14 +8,14 @@ from scipy.stats import qmc
 
 from tuning.statistics.intervals import (
     Estimate,
-    Running,
+    SequentialState,
     binomial_interval,
     confidence_sequence,
-    enough,
+    estimate_sequence_scenarios,
+    is_narrow_enough,
     lognormal_interval,
     replicate_interval,
-    scenarios_needed,
-    updated,
+    update_sequence,
 )
 
 BAR = 0.935  # required coverage over repeated sweeps, for stated 95 %
@@ -137,7 +137,7 @@ def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, 
     failures = np.cumsum(rng.binomial(100, probability, (1000, 150)), axis=1)
     number = np.broadcast_to(100 * np.arange(1, 151), failures.shape)
     looks = of_each(confidence_sequence, failures, number)
-    # `updated` does this look by look; here for all sweeps at once.
+    # `update_sequence` does this look by look; here for all sweeps at once.
     low, high = np.maximum.accumulate(looks.low, axis=1), np.minimum.accumulate(looks.high, axis=1)
     assert np.mean(np.any(low > high, axis=1)) < 0.01
     narrow = (high - low <= width) & (low <= high)
@@ -154,36 +154,36 @@ def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, 
     assert coverage >= BAR
     assert 0.7 * width < mean <= width
     # The forecast has the right order of magnitude.
-    assert 0.7 < needed / scenarios_needed(probability, width) < 1.4
+    assert 0.7 < needed / estimate_sequence_scenarios(probability, width) < 1.4
     # Repeat one of the sweeps look by look.
-    running = Running()
+    running = SequentialState()
     for added in np.diff(failures[0], prepend=0):
-        if enough(running, width):
+        if is_narrow_enough(running, width):
             break
-        running = updated(running, int(added), 100)
+        running = update_sequence(running, int(added), 100)
     assert (running.number, running.low, running.high) == (number[stop][0], low[stop][0], high[stop][0])
 
 
 def test_updated_intersects_looks_and_restarts_on_contradiction():
     failures, number = walks(0.3, repeats=1, looks=50)
-    running = Running()
+    running = SequentialState()
     for added in np.diff(failures[0], prepend=0):
-        running = updated(running, int(added), 25)
+        running = update_sequence(running, int(added), 25)
     looks = confidence_sequence(failures[0], number[0])
     assert (running.failures, running.number) == (failures[0, -1], 1250)
     assert (running.low, running.high) == (np.max(looks.low), np.min(looks.high))
     # These cannot be Bernoulli trials: none fails, then all do.
-    contradiction = updated(updated(Running(), 0, 1000), 1000, 1000)
+    contradiction = update_sequence(update_sequence(SequentialState(), 0, 1000), 1000, 1000)
     last = confidence_sequence(1000, 2000)
     assert (contradiction.low, contradiction.high) == (last.low, last.high)
-    assert Running() == Running(0, 0, 0.0, 1.0, 0.95)
+    assert SequentialState() == SequentialState(0, 0, 0.0, 1.0, 0.95)
 
 
 def test_scenarios_needed_is_the_smallest_sufficient_number():
-    needed = scenarios_needed(0.01, 0.001)
+    needed = estimate_sequence_scenarios(0.01, 0.001)
     assert confidence_sequence(0.01 * needed, needed).width <= 0.001
     assert confidence_sequence(0.01 * 0.9 * needed, 0.9 * needed).width > 0.001
-    assert scenarios_needed(0.0, 1.0) == 1
+    assert estimate_sequence_scenarios(0.0, 1.0) == 1
 
 
 def scrambled(region, dimensions, points, replicates, rng):
@@ -284,7 +284,7 @@ def test_lognormal_interval_covers_the_mean(variation, replicates):
         (lambda: confidence_sequence(1, 2, level=1.0), "level: found 1.0"),
         (lambda: replicate_interval([3], 10), "replicates: found 1"),
         (lambda: replicate_interval(3, 10), "replicates: found 0"),
-        (lambda: scenarios_needed(0.1, 0.0), "width"),
+        (lambda: estimate_sequence_scenarios(0.1, 0.0), "width"),
     ),
 )
 def test_intervals_reject_impossible_counts(wrong, words):

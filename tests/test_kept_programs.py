@@ -17,15 +17,15 @@ import pytest
 from compiling import programs_of
 
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
-from jaxhil.files import read_sealed
+from jaxhil.files import read_checksummed
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation import kept_programs, one_axis, sources
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.compile_cache import ENDING
-from jaxhil.simulation.environment import CACHE, TICKS, program_folder
-from jaxhil.simulation.kept_programs import compiled
+from jaxhil.simulation import cached_programs, one_axis, source_fingerprint
+from jaxhil.simulation.cached_programs import load_or_compile
+from jaxhil.simulation.compile_cache import EXECUTABLE_SUFFIX
+from jaxhil.simulation.jax_environment import CACHE_VARIABLE, TICK_OPTIONS, program_folder
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.sixdof.building import build_scenarios as six_axes_scenarios
 
@@ -64,19 +64,19 @@ VALUES = np.array([1.0, 2.0, 4.0, 8.0])
 
 @pytest.fixture(autouse=True)
 def as_for_users(monkeypatch):
-    monkeypatch.setattr(kept_programs, "compiled", compiled)
-    monkeypatch.setattr(kept_programs, "program_folder", program_folder)
+    monkeypatch.setattr(cached_programs, "load_or_compile", load_or_compile)
+    monkeypatch.setattr(cached_programs, "program_folder", program_folder)
     traced.clear()
     yield
-    kept_programs._programs.clear()
+    cached_programs._programs.clear()
 
 
-def run(folder, static=STATIC, values=VALUES, options=TICKS, function=sums):
+def run(folder, static=STATIC, values=VALUES, options=TICK_OPTIONS, function=sums):
     """Run the program as a new process would."""
-    kept_programs._programs.clear()
-    kept_programs.program_folder = lambda: folder
+    cached_programs._programs.clear()
+    cached_programs.program_folder = lambda: folder
     more = ({"factor": jnp.array(3.0)},) if function is sums else ()
-    return kept_programs.run(function, static, jnp.asarray(values), *more, options=options)
+    return cached_programs.run_cached(function, static, jnp.asarray(values), *more, options=options)
 
 
 def check(result, total=31.0):
@@ -127,13 +127,13 @@ def test_program_file_with_flipped_bit_costs_only_tracing_time(tmp_path, number)
         harmed[bit // 8] ^= 1 << int(bit % 8)
         file.write_bytes(harmed)
         check(run(tmp_path))
-        assert traced and read_sealed(file) is not None
+        assert traced and read_checksummed(file) is not None
 
 
 @where_kept
 def test_program_without_its_compiled_code_is_rebuilt(tmp_path):
     run(tmp_path)
-    for file in Path(str(program_folder())).glob(f"jit_sums-*{ENDING}"):
+    for file in Path(str(program_folder())).glob(f"jit_sums-*{EXECUTABLE_SUFFIX}"):
         file.unlink()
     check(run(tmp_path))
     assert len(traced) == 2
@@ -150,10 +150,10 @@ def test_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
     check(run(tmp_path, options={}))
     with jax.default_matmul_precision("highest"):
         check(run(tmp_path))
-    monkeypatch.setattr(kept_programs, "versions", lambda: {"jax": "another"})
+    monkeypatch.setattr(cached_programs, "dependency_versions", lambda: {"jax": "another"})
     check(run(tmp_path))
-    monkeypatch.setattr(kept_programs, "versions", sources.versions)
-    monkeypatch.setattr(kept_programs, "xla_flags", lambda: "--xla_cpu_enable_fast_min_max=true")
+    monkeypatch.setattr(cached_programs, "dependency_versions", source_fingerprint.dependency_versions)
+    monkeypatch.setattr(cached_programs, "active_xla_flags", lambda: "--xla_cpu_enable_fast_min_max=true")
     check(run(tmp_path))
     assert len(traced) == len(list(tmp_path.iterdir())) == 8
 
@@ -189,7 +189,7 @@ def test_program_is_not_cached_if_jax_does_not_name_the_processor(tmp_path, monk
     def not_there(made_of):
         raise AttributeError
 
-    monkeypatch.setattr(kept_programs, "_name", not_there)
+    monkeypatch.setattr(cached_programs, "_hash_program", not_there)
     for _ in range(2):
         check(run(tmp_path))
     assert len(traced) == 2 and not list(tmp_path.iterdir())
@@ -201,8 +201,8 @@ def test_program_cache_in_unwritable_folder_costs_no_result(tmp_path):
 
 def test_program_is_rebuilt_if_settings_change_between_calls(tmp_path, monkeypatch):
     """Use one process, which keeps what it has read from the cache."""
-    monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
-    again = partial(kept_programs.run, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})
+    monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)
+    again = partial(cached_programs.run_cached, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})
     for precision in ("highest", "default"):
         with jax.default_matmul_precision(precision):
             check(again())
@@ -220,23 +220,23 @@ def test_program_with_user_registered_law_in_arguments_is_not_cached(tmp_path, m
     """Cover laws that arguments contain, as scenarios in six axes do."""
     scenarios = six_axes_scenarios(load_any("petals").mechanism)
     groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
-    monkeypatch.setattr(kept_programs, "program_folder", lambda: tmp_path)
+    monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)
     for _ in range(2):
-        kept_programs._programs.clear()
-        kept_programs.run(phases, 1, scenarios._replace(groups=groups))
+        cached_programs._programs.clear()
+        cached_programs.run_cached(phases, 1, scenarios._replace(groups=groups))
     assert (len(traced), len(list(tmp_path.iterdir()))) == ((2, 0) if isinstance(law, Mine) else (1, 1))
 
 
 def test_user_defined_named_tuple_is_foreign():
-    assert kept_programs.is_foreign((1, Sums(1, (2,))))  # pyright: ignore[reportArgumentType]
-    assert not kept_programs.is_foreign((1, ("two", None, KelvinVoigt())))
+    assert cached_programs.has_user_objects((1, Sums(1, (2,))))  # pyright: ignore[reportArgumentType]
+    assert not cached_programs.has_user_objects((1, ("two", None, KelvinVoigt())))
 
 
 def test_external_calls_of_a_program_are_all_listed():
     text = """%0 = stablehlo.custom_call @lapack_dpotrf_ffi(%1)
     %2 = stablehlo.custom_call @xla.sdy.Sharding(%0)
     %3 = stablehlo.custom_call @"my-own, one"(%2) %4 = stablehlo.custom_call @cu$other(%3)"""
-    assert kept_programs.calls_of(text) == {
+    assert cached_programs.find_calls(text) == {
         "lapack_dpotrf_ffi",
         "xla.sdy.Sharding",
         "my-own, one",
@@ -252,7 +252,7 @@ def test_program_that_cannot_be_cached_costs_no_result(tmp_path, monkeypatch, st
     def fails(*arguments, **named):
         raise error
 
-    monkeypatch.setattr(kept_programs, step, fails)
+    monkeypatch.setattr(cached_programs, step, fails)
     check(run(tmp_path))
     assert not list(tmp_path.iterdir())
 
@@ -261,7 +261,7 @@ SOLVES = """
 import sys
 from functools import partial
 from pathlib import Path
-from jaxhil.simulation.environment import prepare
+from jaxhil.simulation.jax_environment import prepare
 prepare()
 import jax, jax.numpy as jnp, numpy as np
 from jaxhil.simulation import kept_programs
@@ -278,7 +278,7 @@ def test_cached_program_solves_equations_in_process_that_traced_none(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
     run = partial(subprocess.run, [sys.executable, str(script)], capture_output=True, text=True, check=True)
-    outputs = [run(env={**os.environ, CACHE: str(tmp_path)}).stdout for _ in range(2)]
+    outputs = [run(env={**os.environ, CACHE_VARIABLE: str(tmp_path)}).stdout for _ in range(2)]
     assert outputs == ["traced\n[0.25 2.  ]\n", "[0.25 2.  ]\n"]
 
 
@@ -290,10 +290,10 @@ def test_cached_batch_has_same_bits_and_is_not_recompiled(tmp_path, monkeypatch,
     loop = build_loop(mechanism, "phase_lead", scenarios)
     gains = {name: np.full(lanes, value) for name, value in literature_gains(mechanism, "phase_lead").items()}
     wanted = one_axis.evaluate(loop, gains, scenarios)
-    monkeypatch.setattr(kept_programs, "program_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(cached_programs, "program_folder", lambda: str(tmp_path))
     made = []
     for _ in range(3):
-        kept_programs._programs.clear()
+        cached_programs._programs.clear()
         outcome = one_axis.evaluate(loop, gains, scenarios)
         jax.tree.map(np.testing.assert_array_equal, outcome, wanted)
         made.append(programs_of("run_tiles"))

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import lambertw
 from six_axes import FULL, ideal_sensor, lanes, meeting, place, plain_body, second_order
 
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof.axes import actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.kinematics import TaskSpace, moving
@@ -51,7 +51,7 @@ def scenario(delays):
     """Return a scenario with a motion simulator that is late and nothing else."""
     late = lanes(delays, BATCH)
     free = late + jnp.inf
-    simulator = MotionSimulator(jnp.zeros((0, 6, 1)), jnp.ones((1, 6, 1)), late, free, free)
+    simulator = MotionSimulatorBatch(jnp.zeros((0, 6, 1)), jnp.ones((1, 6, 1)), late, free, free)
     bodies, start = started()
     return Scenario(
         bodies, start, (), (latch(),), simulator, TaskSpace(), ideal_sensor(jnp.zeros(1)),

@@ -16,11 +16,16 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, probe_figures, probed_scenarios
+from tuning.transparency.probes import (
+    LANES_PER_SCENARIO,
+    ProbedScenarios,
+    build_probed_scenarios,
+    compute_probe_metrics,
+)
 
 pytestmark = pytest.mark.slow
 LAW, SEED = "impulse_ledger", 0xACC  # of scenarios that nothing else was tuned or evaluated on
@@ -70,14 +75,14 @@ def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
     """Run four contacts at 5 mm/s, next to the same ones with the surface where it is specified."""
     clean = ("rig.force_sensor.noise_std=0.0",) if noise == "none" else ()
     mechanism = load(f"suite-{suite}", [*PLANE, *clean, f"approach.contacts={CONTACTS}"]).mechanism
-    probed = probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
+    probed = build_probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
     in_place = probed.scenarios._replace(contact_plane=0 * probed.scenarios.contact_plane)
     gains = literature_gains(mechanism, LAW)
     copies = copies_of(probed, outcome_of(mechanism, gains, probed.scenarios))
     assert np.all(copies.good[..., 0])
     first, fourth = left(copies.error[0, :, 0]), left(copies.error[3, :, 0])
     specified = left(copies_of(probed, outcome_of(mechanism, gains, in_place)).error[3, :, 0])
-    figures = {name: estimate.value for name, estimate in probe_figures(probed, copies).items()}
+    figures = {name: estimate.value for name, estimate in compute_probe_metrics(probed, copies).items()}
     printed(suite, "noise", noise, *first, "fourth", *fourth, "as specified", *specified, figures)
     assert first[0] < RMS and first[1] < PERCENTILE and first[2] < LARGEST
     assert fourth[0] < specified[0] + 0.05

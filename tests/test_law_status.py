@@ -19,15 +19,15 @@ from rig_lock_step import controller
 
 from jaxhil import laws
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import load, to_builtins
+from jaxhil.mechanism.file import load, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig import Controller
-from jaxhil.rig.faults import LAW_IN_DOUBT, RESTITUTION, names
+from jaxhil.rig.faults import LAW_IN_DOUBT, RESTITUTION, fault_names
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.rig.law_status import (
-    DOUBTFUL,
     IDENTIFIED,
+    MAX_DOUBTFUL_SHARE,
     NOISY,
     NOT_REACHED,
     OUT_OF_CONTACT,
@@ -42,7 +42,7 @@ from jaxhil.rig.law_status import (
     contact_record,
 )
 from jaxhil.rig.limits import NO_LIMITS
-from tuning.rig.plant import Plant
+from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import NumericalModel
 
 LAW = "impulse_ledger"
@@ -87,7 +87,7 @@ class Ran(NamedTuple):
 
 def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
     """Simulate one contact in lock-step with the rig's plant, until both have been outside for a while."""
-    plant, model = Plant(mechanism, seed), NumericalModel(to_builtins(mechanism))
+    plant, model = RigHardware(mechanism, seed), NumericalModel(to_plain_data(mechanism))
     period, quiet, entered = law.control_period, 0, False
     surface = min(mechanism.rig.contact_plane, 0.0)
     position, velocity = model.start
@@ -140,7 +140,9 @@ def test_contact_status_is_the_status_of_most_ticks(name, limits):
     law, result = ran(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
     assert (record.number, record.status) == (1, wanted)
-    assert law.status == "ok" and names(law.seen) == ([] if wanted == "identified" else ["law_in_doubt"])
+    assert law.status == "ok" and fault_names(law.seen) == (
+        [] if wanted == "identified" else ["law_in_doubt"]
+    )
     (raised,) = np.nonzero(result.faults) if wanted != "identified" else ([len(result.faults)],)
     assert len(raised) == 1
     statuses = result.said[: raised[0]]
@@ -278,7 +280,7 @@ def test_restitution_trip_reports_status_of_the_law():
     assert law.status.endswith(", law too short)")
 
 
-@pytest.mark.parametrize("name", [name for name in laws.names() if name != LAW])
+@pytest.mark.parametrize("name", [name for name in laws.built_in_compensators() if name != LAW])
 def test_laws_without_status_report_none(name):
     mechanism = load("suite-noisy").mechanism
     law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
@@ -337,7 +339,7 @@ def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = (
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
 def test_share_of_doubtful_ticks_separates_short_contacts(suite):
-    """Print the share of ticks in doubt, and check the gap that contains `DOUBTFUL`.
+    """Print the share of ticks in doubt, and check the gap that contains `MAX_DOUBTFUL_SHARE`.
 
     A contact is too short if the law says so on any tick.
     """
@@ -356,11 +358,11 @@ def test_share_of_doubtful_ticks_separates_short_contacts(suite):
         f"{suite}: {len(known)} contacts that are not too short, in doubt on up to "
         f"{np.max(known):.2f} of their ticks"
     )
-    assert np.max(known) < DOUBTFUL
+    assert np.max(known) < MAX_DOUBTFUL_SHARE
     if np.any(short):
         least, most = np.quantile(doubt[short > 0], [0.0, 0.05])
         print(f"{int(np.sum(short))} that are, on {least:.2f} and more, all but a twentieth on {most:.2f}")
-        assert most > DOUBTFUL
+        assert most > MAX_DOUBTFUL_SHARE
 
 
 def test_contact_that_seems_to_add_energy_is_unexplained():

@@ -7,11 +7,11 @@ import pytest
 from lanes import QUICK
 from scipy.optimize import lsq_linear
 
-from tuning.optimisation.levenberg_marquardt import _with_jacobian, solve
-from tuning.optimisation.solution import STATUSES
-from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
+from tuning.optimisation.levenberg_marquardt import _with_jacobian, solve_least_squares
+from tuning.optimisation.solution import SOLVER_STATUSES
+from tuning.optimisation.unit_box import GainBounds, to_coordinates, to_gains
 
-BOUNDS = Bounds(np.array([0.0, 1e-3]), np.array([2.0, 10.0]), np.array([0.0, 1.0]))
+BOUNDS = GainBounds(np.array([0.0, 1e-3]), np.array([2.0, 10.0]), np.array([0.0, 1.0]))
 
 
 def distance(static, gains, arguments):
@@ -23,26 +23,28 @@ def blows_up(static, gains, arguments):
 
 
 def solved(residuals, targets, starts, steps):
-    bounds = Bounds(*(np.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
+    bounds = GainBounds(*(np.tile(leaf, (len(starts), 1)) for leaf in BOUNDS))
     coordinates = to_coordinates(np.array(starts), bounds)
-    return solve(residuals, 10.0, np.array(targets), bounds, coordinates, np.array(steps), longest=64, tile=2)
+    return solve_least_squares(
+        residuals, 10.0, np.array(targets), bounds, coordinates, np.array(steps), longest=64, tile=2
+    )
 
 
 def test_least_squares_finds_minimum_of_every_problem():
     targets = [[0.7, 0.2], [0.7, 0.2], [1.2, 3.0]]
     solution = solved(distance, targets, [[0.1, 0.01], [1.9, 5.0], [1.0, 1.0]], 60)
     np.testing.assert_allclose(to_gains(np.asarray(solution.coordinates), BOUNDS), targets, rtol=1e-4)
-    assert [STATUSES[i] for i in solution.status] == ["converged"] * 3
+    assert [SOLVER_STATUSES[i] for i in solution.status] == ["converged"] * 3
     history = np.asarray(solution.history)
     assert (np.diff(history, axis=1) <= 0).all()
     np.testing.assert_allclose(history[:, -1], solution.loss)
 
 
 def test_gain_with_equal_bounds_stays_fixed():
-    bounds = Bounds(np.array([[0.4, 1e-3]] * 2), np.array([[0.4, 10.0]] * 2), np.array([[1.0, 1.0]] * 2))
+    bounds = GainBounds(np.array([[0.4, 1e-3]] * 2), np.array([[0.4, 10.0]] * 2), np.array([[1.0, 1.0]] * 2))
     arguments, starts = np.array([[0.7, 0.2]] * 2), np.array([[0.4, 1.0], [0.4, 5.0]])
     coordinates = to_coordinates(starts, bounds)
-    solution = solve(distance, 10.0, arguments, bounds, coordinates, np.array(30))
+    solution = solve_least_squares(distance, 10.0, arguments, bounds, coordinates, np.array(30))
     np.testing.assert_allclose(
         to_gains(np.asarray(solution.coordinates), bounds), [[0.4, 0.2]] * 2, rtol=1e-4
     )
@@ -55,10 +57,10 @@ def tilted(static, gains, arguments):
 
 
 def test_minimum_on_bounds_is_that_of_bounded_linear_least_squares():
-    bounds = Bounds(*(np.full((4, 2), leaf) for leaf in (0.0, 1.0, 0.0)))
+    bounds = GainBounds(*(np.full((4, 2), leaf) for leaf in (0.0, 1.0, 0.0)))
     targets = np.array([[2.0, -0.3], [0.5, 3.0], [-1.0, -2.0], [0.2, 0.6]])
     starts = np.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])
-    solution = solve(tilted, None, targets, bounds, starts, np.array(30))
+    solution = solve_least_squares(tilted, None, targets, bounds, starts, np.array(30))
     matrix = np.array([[1.0, 0.9], [0.9, 1.0], [0.1, -0.1]])
     for target, result, curvature in zip(targets, solution.coordinates, solution.curvature, strict=True):
         best = lsq_linear(matrix, matrix @ target, bounds=(0, 1), tol=1e-12).x
@@ -70,10 +72,12 @@ def test_gain_without_influence_stays():
     def blind(static, gains, arguments):
         return gains[:, :1] - arguments
 
-    bounds = Bounds(*(jnp.array([[leaf] * 2]) for leaf in (0.0, 1.0, 0.0)))
-    solution = solve(blind, None, jnp.array([[0.7]]), bounds, jnp.array([[0.1, 0.3]]), jnp.array(30))
+    bounds = GainBounds(*(jnp.array([[leaf] * 2]) for leaf in (0.0, 1.0, 0.0)))
+    solution = solve_least_squares(
+        blind, None, jnp.array([[0.7]]), bounds, jnp.array([[0.1, 0.3]]), jnp.array(30)
+    )
     np.testing.assert_allclose(solution.coordinates, [[0.7, 0.3]], rtol=1e-6)
-    assert [STATUSES[i] for i in solution.status] == ["converged"]
+    assert [SOLVER_STATUSES[i] for i in solution.status] == ["converged"]
 
 
 def test_least_squares_without_progress_has_converged():
@@ -82,15 +86,17 @@ def test_least_squares_without_progress_has_converged():
     def rippled(static, gains, arguments):
         return jnp.concatenate([gains - 2.0, 1e-3 * jnp.sin(1e6 * gains)], axis=1)
 
-    bounds = Bounds(*(jnp.array([[leaf]]) for leaf in (0.0, 1.0, 0.0)))
-    solution = solve(rippled, None, jnp.zeros((1, 1)), bounds, jnp.array([[0.5]]), jnp.array(30))
-    assert [STATUSES[i] for i in solution.status] == ["converged"]
+    bounds = GainBounds(*(jnp.array([[leaf]]) for leaf in (0.0, 1.0, 0.0)))
+    solution = solve_least_squares(
+        rippled, None, jnp.zeros((1, 1)), bounds, jnp.array([[0.5]]), jnp.array(30)
+    )
+    assert [SOLVER_STATUSES[i] for i in solution.status] == ["converged"]
     assert solution.steps[0] < 20
 
 
 def test_least_squares_reports_too_few_steps_and_nonfinite_start():
     solution = solved(blows_up, [[0.7, 0.2]] * 2, [[0.1, 0.01], [1.9, 5.0]], 2)
-    assert [STATUSES[i] for i in solution.status] == ["step limit", "not finite"]
+    assert [SOLVER_STATUSES[i] for i in solution.status] == ["step limit", "not finite"]
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])

@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.causality import check_rows_of, integrator_of_all, rows_ahead
+from tuning.identification.logs.row_convention import (
+    check_row_convention,
+    detect_common_integrator,
+    detect_reading_offset,
+)
 
 SPEEDS = (0.003, 0.006, 0.012) * 2
 
@@ -39,16 +43,16 @@ KINDS = ["noisy", *(pytest.param(one, marks=pytest.mark.slow) for one in campaig
 def test_noise_shows_the_tick_of_a_rows_readings(kind):
     for ahead, row in ((-1, "after"), (0, "tick"), (1, "sent")):
         runs, timing = runs_of(kind, ahead)
-        assert rows_ahead(runs) == ahead
-        check_rows_of(runs, replace(timing, row=row))
+        assert detect_reading_offset(runs) == ahead
+        check_row_convention(runs, replace(timing, row=row))
         for other in {"tick", "sent", "after"} - {row}:
             with pytest.raises(InputError, match=f'timing.row: found "{other}", but .* row = "{row}"'):
-                check_rows_of(runs, replace(timing, row=other))
+                check_row_convention(runs, replace(timing, row=other))
     # Rows with the next tick's readings look as if the controller took a tick to compute.
     runs, timing = runs_of(kind, -1)
-    check_rows_of(runs, replace(timing, computing_delay=1))
+    check_row_convention(runs, replace(timing, computing_delay=1))
     with pytest.raises(InputError, match=r'or computing_delay = 1 or .* rig.integrator is "explicit_euler"'):
-        check_rows_of(runs, timing)
+        check_row_convention(runs, timing)
 
 
 def test_contact_shows_tick_of_readings_if_rig_is_driven_before_and_after():
@@ -61,7 +65,7 @@ def test_contact_shows_tick_of_readings_if_rig_is_driven_before_and_after():
         force = np.concatenate([noise[0], run.force_measured, noise[1]])
         x = np.concatenate([before, run.position_desired, after])
         runs[at] = replace(run, position_desired=x, force_measured=force, valid=np.ones(len(x), bool))
-    assert rows_ahead(runs) == -1
+    assert detect_reading_offset(runs) == -1
 
 
 def test_explicit_integrator_answers_a_tick_late():
@@ -69,19 +73,19 @@ def test_explicit_integrator_answers_a_tick_late():
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
     moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]
-    result = integrator_of_all(moved, 1e-3)
-    assert result == "explicit_euler" and integrator_of_all(runs[:0], 1e-3) is None
-    check_rows_of(moved, timing, result)
-    with pytest.raises(InputError, match=r'"sent", but .* allowed row = "tick" or computing_delay = 1$'):
-        check_rows_of(moved, replace(timing, row="sent"), result)
+    result = detect_common_integrator(moved, 1e-3)
+    assert result == "explicit_euler" and detect_common_integrator(runs[:0], 1e-3) is None
+    check_row_convention(moved, timing, result)
+    with pytest.raises(InputError, match=r'"sent", but .* expected row = "tick" or computing_delay = 1$'):
+        check_row_convention(moved, replace(timing, row="sent"), result)
 
 
 def test_tick_of_readings_is_not_reported_without_noise_or_enough_runs():
     (run, *others), timing = runs_of("clean")
-    assert rows_ahead([run, *others]) == 0
-    assert rows_ahead([run]) is None and rows_ahead([]) is None
+    assert detect_reading_offset([run, *others]) == 0
+    assert detect_reading_offset([run]) is None and detect_reading_offset([]) is None
     steady = [replace(one, force_measured=one.position_measured * 1e5) for one in (run, *others)]
     smooth = [replace(one, force_measured=one.position_desired * 1e5) for one in (run, *others)]
-    assert rows_ahead(smooth) is None
-    assert rows_ahead(steady) in (None, 0)
-    check_rows_of(smooth, replace(timing, row="sent"))
+    assert detect_reading_offset(smooth) is None
+    assert detect_reading_offset(steady) in (None, 0)
+    check_row_convention(smooth, replace(timing, row="sent"))

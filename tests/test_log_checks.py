@@ -76,8 +76,8 @@ def test_wrong_sign_or_mass_of_force_command_is_detected(tmp_path):
         ({"position_measured": {"column": "xm", "sign": -1}}, "found one that moves against"),
         ({"position_desired": "xm", "position_measured": "xd"}, "one that follows (are the two swapped?)"),
         ({"position_desired": {"column": "xd", "unit": "mm"}}, "found a stroke of 1.27e-06"),
-        ({"position_desired": {"column": "xd", "scale": 1e3}}, "found a stroke of 1.27 m, allowed"),
-        ({"position_measured": "still"}, "found 0 m in every row, allowed"),
+        ({"position_desired": {"column": "xd", "scale": 1e3}}, "found a stroke of 1.27 m, expected"),
+        ({"position_measured": "still"}, "found 0 m in every row, expected"),
         ({"force_measured": "still"}, "force_measured: found 0 N in every row"),
         ({"position_desired": "still"}, "nothing excites the motion"),
     ],
@@ -128,7 +128,7 @@ def test_commands_and_forces_of_another_rate_are_detected(tmp_path, every):
         return np.repeat(values[::every], every)[: len(values)]
 
     path = write_csv(tmp_path / "a.csv", sway() | {"xd": held(sway()["xd"])})
-    assert f"position_desired: found one that changes every {every} rows, allowed one" in message(
+    assert f"position_desired: found one that changes every {every} rows, expected one" in message(
         path, "free"
     )
     assert read(path, "free", timing={"command_hold": "zoh"}).runs[0].kind == "free"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.clock import LOT, counted, ticks_of
+from tuning.identification.logs.clock import PHASE_CHUNK_ROWS, assign_ticks, number_rows
 
 PERIOD = 1e-3
 
@@ -21,7 +21,7 @@ def stamps(rows=20_000, jitter=0.0, drift=0.0, lost=(), seed=0):
 def test_every_row_gets_its_tick(jitter, drift):
     lost = [5, 700, 701, 702, 703, *range(3000, 3060), 12_000, 12_002, 19_998]
     times, tick = stamps(jitter=jitter, drift=drift, lost=lost)
-    result = ticks_of(times, PERIOD, "a")
+    result = assign_ticks(times, PERIOD, "a")
     np.testing.assert_array_equal(result.tick, tick)
     assert result.clock.lost == len(lost)
     # The slope of a line through n points that scatter by s has a standard deviation of s sqrt(12 / n^3) / T.
@@ -33,14 +33,14 @@ def test_rows_with_a_stamp_in_a_neighbouring_tick_stay_in_order():
     times, tick = stamps(jitter=0.0)
     times[100] += 0.55 * PERIOD
     times[5000] -= 0.6 * PERIOD
-    np.testing.assert_array_equal(ticks_of(times, PERIOD, "a").tick, tick)
+    np.testing.assert_array_equal(assign_ticks(times, PERIOD, "a").tick, tick)
 
 
 def test_few_rows_and_counted_rows_get_their_ticks():
-    for rows in (2, LOT - 1, LOT, LOT + 1, 2 * LOT + 1):
+    for rows in (2, PHASE_CHUNK_ROWS - 1, PHASE_CHUNK_ROWS, PHASE_CHUNK_ROWS + 1, 2 * PHASE_CHUNK_ROWS + 1):
         times, tick = stamps(rows)
-        np.testing.assert_array_equal(ticks_of(times, PERIOD, "a").tick, tick)
-    result = counted(7, PERIOD)
+        np.testing.assert_array_equal(assign_ticks(times, PERIOD, "a").tick, tick)
+    result = number_rows(7, PERIOD)
     assert result.tick.tolist() == [*range(7)] and result.clock.jitter == result.clock.lost == 0
 
 
@@ -50,15 +50,15 @@ def test_unusable_stamps_are_refused():
     cases = [
         (
             1e3 * times,
-            "time: found rows 1 s apart, allowed the control period, 0.001 s (is the unit of time right?)",
+            "time: found rows 1 s apart, expected the control period, 0.001 s (is the unit of time right?)",
         ),
-        (slower[:2900], "row 1537: time: found rows 0.002 s apart, allowed one rate, 0.001 s, all along"),
+        (slower[:2900], "row 1537: time: found rows 0.002 s apart, expected one rate, 0.001 s, all along"),
         (np.where(np.arange(3000) == 9, times[3], times), "row 10: time: found 12.303 s after 12.308 s"),
         (stamps(3000, jitter=4e-4)[0], "time: found"),
         # Stay within a tenth of the period, where phases of row groups could be taken for their neighbours'.
-        (0.98 * times, "time: found rows 0.00098 s apart, allowed the control period, 0.001 s"),
+        (0.98 * times, "time: found rows 0.00098 s apart, expected the control period, 0.001 s"),
     ]
     for given, reason in cases:
         with pytest.raises(InputError) as caught:
-            ticks_of(given, PERIOD, "a.csv")
+            assign_ticks(given, PERIOD, "a.csv")
         assert str(caught.value).startswith("a.csv: ") and reason in str(caught.value)

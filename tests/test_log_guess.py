@@ -6,8 +6,8 @@ from log_cases import sway, touches, write_csv
 
 from jaxhil.errors import InputError
 from tuning.identification.logs.campaign import read_campaign
-from tuning.identification.logs.guess import draft
 from tuning.identification.logs.mapping import load_mapping
+from tuning.identification.logs.mapping_draft import draft_mapping
 
 LOG = touches(1)
 NAMES = [
@@ -26,7 +26,7 @@ def test_draft_mapping_reads_its_logs(tmp_path, names, factors):
     free = sway() | {"F": 0.3 * np.random.default_rng(0).standard_normal(800)}
     columns = [free[name] * factor for name, factor in zip(("t", "xd", "xm", "F"), factors, strict=True)]
     other = write_csv(tmp_path / "morning.csv", dict(zip(names, columns, strict=True)))
-    text = draft([day, other])
+    text = draft_mapping([day, other])
     (tmp_path / "map.toml").write_text(text.replace("# [bodies]", "[bodies]").replace("# equ", "equ"))
     result = read_campaign([day, other], load_mapping(tmp_path / "map.toml"))
     assert [run.kind for run in result.runs] == ["contact", "free"]
@@ -48,12 +48,12 @@ def test_draft_mapping_recognises_own_columns_and_refuses_unknown_ones(tmp_path)
     )
     columns = (LOG["t"], LOG["F"], LOG["Fc"], LOG["xd"], LOG["vd"], LOG["xm"], np.zeros(600))
     path = write_csv(tmp_path / "run.csv", dict(zip((*names, "contact"), columns, strict=True)))
-    text = draft([path])
+    text = draft_mapping([path])
     for name in names:
         assert f'{name} = {{ column = "{name}"' in text
     assert 'contact_index = { column = "contact" }' in text
     path = write_csv(tmp_path / "a.csv", {"a": LOG["t"], "b": LOG["xd"]})
     with pytest.raises(InputError, match="found no column named like position_desired among a, b"):
-        draft([path])
+        draft_mapping([path])
     with pytest.raises(InputError, match="logs: found none"):
-        draft([])
+        draft_mapping([])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from log_cases import read, sway, touches, write_csv
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.guess import draft
+from tuning.identification.logs.mapping_draft import draft_mapping
 
 CELLS = [
     "",
@@ -79,7 +79,7 @@ def check(kind, changes, timing):
         path = write_csv(Path(folder) / "a.csv", LOGS[kind])
         path.write_bytes(mutated(path.read_bytes(), changes))
         with suppress(InputError):
-            assert draft([path]).startswith("# A draft")
+            assert draft_mapping([path]).startswith("# A draft")
         try:
             result = read(path, kind, timing=timing)
         except InputError as error:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from log_cases import CHANNELS, mapping, read, touches, write_csv
 
 from jaxhil.errors import InputError
-from tuning.identification.logs.joining import join
+from tuning.identification.logs.resampling import resample_to_rows
 
 PERIOD, ROWS = 1e-3, 2000
 
@@ -29,7 +29,7 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
     columns["force_measured"] = columns["position_measured"]
     clocks = dict.fromkeys(columns, sampled if stamps is None else stamps) | {"position_desired": rows}
     named = {"position_desired": "xd", "position_measured": "xm", "force_measured": "F"}
-    result, times, notes = join("a", columns, clocks, named, PERIOD)
+    result, times, notes = resample_to_rows("a", columns, clocks, named, PERIOD)
     kept = result["position_desired"].astype(int)
     assert len(times) == len(kept) == len(result["position_measured"])
     assert np.all(np.isin(times, rows))
@@ -95,14 +95,14 @@ def test_gap_in_a_channel_drops_its_rows():
         ),
         (
             2 * PERIOD * np.arange(ROWS),
-            "stamps of 'F': found readings 0.002 s apart, allowed the control period",
+            "stamps of 'F': found readings 0.002 s apart, expected the control period",
         ),
         (
             100 + PERIOD * np.arange(ROWS),
             "found no time at which all channels were read ('xd' 0 to 1.999 s, 'F' 100",
         ),
-        (PERIOD * np.arange(ROWS - 1), "stamps of 'F': found 1999, allowed 2000, one a row"),
-        (None, "column 'F': found no stamps, allowed some"),
+        (PERIOD * np.arange(ROWS - 1), "stamps of 'F': found 1999, expected 2000, one a row"),
+        (None, "column 'F': found no stamps, expected some"),
     ],
 )
 def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
@@ -110,7 +110,7 @@ def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
     columns = {"position_desired": rows, "force_measured": rows}
     with pytest.raises(InputError) as caught:
         named = {"position_desired": "xd", "force_measured": "F"}
-        join("a", columns, {"position_desired": rows, "force_measured": stamps}, named, PERIOD)
+        resample_to_rows("a", columns, {"position_desired": rows, "force_measured": stamps}, named, PERIOD)
     assert str(caught.value).startswith("a: ") and reason in str(caught.value)
 
 
@@ -119,7 +119,7 @@ def test_channels_that_hold_their_value_are_not_interpolated():
     columns = {"position_desired": rows, "contact_index": np.repeat([0.0, 3.0], ROWS // 2)}
     columns["mode"] = np.array(["free"] * (ROWS // 2) + ["contact"] * (ROWS // 2), object)
     clocks = {"position_desired": rows, "contact_index": rows - 4e-4, "mode": rows + 3e-4}
-    result, _, _ = join("a", columns, clocks, {name: name for name in columns}, PERIOD)
+    result, _, _ = resample_to_rows("a", columns, clocks, {name: name for name in columns}, PERIOD)
     assert set(result["contact_index"]) == {0.0, 3.0} and set(result["mode"]) == {"free", "contact"}
 
 
@@ -158,7 +158,7 @@ def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
 
 
 def test_channel_stamps_require_stamps_of_the_rows():
-    with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', allowed none"):
+    with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', expected none"):
         mapping(time={"rate": 1000.0}, force_measured={"column": "F", "time": "tF"})
 
 
@@ -211,7 +211,7 @@ def test_any_clock_is_joined_or_refused_in_one_line(place, value, count, rate, w
         rows[whose][place % len(rows[whose])] = value
     columns = {name: np.zeros(len(one)) for name, one in rows.items()}
     try:
-        result, times, _ = join("a", columns, rows, {name: name for name in rows}, PERIOD)
+        result, times, _ = resample_to_rows("a", columns, rows, {name: name for name in rows}, PERIOD)
     except InputError as error:
         assert str(error).isprintable() and str(error).startswith("a: ")
         return

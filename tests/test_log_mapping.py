@@ -7,7 +7,7 @@ import pytest
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load
 from tuning.identification.logs.campaign import read_campaign
-from tuning.identification.logs.mapping import load_mapping, mapping_of, si
+from tuning.identification.logs.mapping import get_si_conversion, load_mapping, parse_mapping
 
 FULL = {
     "schema": "jaxhil/log/1",
@@ -49,11 +49,11 @@ def changed(path, value):
 
 
 def test_mapping_number_is_sign_times_scaled_reading_and_offset_in_unit():
-    channels = mapping_of(FULL, "map").channels
-    assert si(channels.position_desired, "position_desired") == (-1e-3, -2e-3)
-    assert si(channels.position_measured, "position_measured") == (1e-6, 0.0)
-    assert si(channels.force_measured, "force_measured") == (4.4482216152605, 0.0)
-    assert si(channels.force_command, "force_command") == (1.0, 0.0)
+    channels = parse_mapping(FULL, "map").channels
+    assert get_si_conversion(channels.position_desired, "position_desired") == (-1e-3, -2e-3)
+    assert get_si_conversion(channels.position_measured, "position_measured") == (1e-6, 0.0)
+    assert get_si_conversion(channels.force_measured, "force_measured") == (4.4482216152605, 0.0)
+    assert get_si_conversion(channels.force_command, "force_command") == (1.0, 0.0)
 
 
 def test_mapping_file_is_equivalent_to_its_table(tmp_path):
@@ -72,8 +72,8 @@ def test_mapping_file_is_equivalent_to_its_table(tmp_path):
     assert result.channels.time.rate == 500.0 and result.channels.time.column is None
     assert result.runs[0].files == ["*.csv"] and result.timing.row == "tick"
     assert result.runs[0].names(tmp_path / "x.csv") and not result.runs[0].names(tmp_path / "x.mf4")
-    assert mapping_of(FULL, "map").runs[1].names(tmp_path / "day1" / "x.mf4")
-    with pytest.raises(InputError, match=r"none.toml: found no such file, allowed a mapping file"):
+    assert parse_mapping(FULL, "map").runs[1].names(tmp_path / "day1" / "x.mf4")
+    with pytest.raises(InputError, match=r"none.toml: found no such file, expected a mapping file"):
         load_mapping(tmp_path / "none.toml")
     path.write_text("schema = ")
     with pytest.raises(InputError, match="not valid TOML"):
@@ -83,36 +83,36 @@ def test_mapping_file_is_equivalent_to_its_table(tmp_path):
 @pytest.mark.parametrize(
     ("path", "value", "reason"),
     [
-        (("schema",), "jaxhil/mechanism/1", "schema: found 'jaxhil/mechanism/1', allowed jaxhil/log/1"),
-        (("channels", "position_desire"), "x", "position_desire: found an unknown key, allowed one of"),
+        (("schema",), "jaxhil/mechanism/1", "schema: found 'jaxhil/mechanism/1', expected jaxhil/log/1"),
+        (("channels", "position_desire"), "x", "position_desire: found an unknown key, expected one of"),
         (("channels", "position_desired"), None, "channels.position_desired: found nothing"),
-        (("channels", "time"), {}, "channels.time: found neither, allowed either a column"),
+        (("channels", "time"), {}, "channels.time: found neither, expected either a column"),
         (("channels", "time"), {"column": "t", "rate": 1.0}, "channels.time: found both"),
-        (("channels", "time", "unit"), "mm", "time.unit: found 'mm', allowed one of s, ms, us, ns"),
-        (("channels", "force_measured", "unit"), "mm", "found 'mm', allowed one of N, kN, mN, lbf, counts"),
+        (("channels", "time", "unit"), "mm", "time.unit: found 'mm', expected one of s, ms, us, ns"),
+        (("channels", "force_measured", "unit"), "mm", "found 'mm', expected one of N, kN, mN, lbf, counts"),
         (("channels", "position_desired", "unit"), "mmm", "did you mean mm"),
-        (("channels", "position_measured", "scale"), None, "scale: found none, allowed how much a count is"),
-        (("channels", "position_desired", "sign"), 0, "sign: found 0, allowed 1 or -1"),
-        (("channels", "position_desired", "sign"), 2, "sign: found 2, allowed an integer from -1 to 1"),
+        (("channels", "position_measured", "scale"), None, "scale: found none, expected how much a count is"),
+        (("channels", "position_desired", "sign"), 0, "sign: found 0, expected 1 or -1"),
+        (("channels", "position_desired", "sign"), 2, "sign: found 2, expected an integer from -1 to 1"),
         (("channels", "position_desired", "scale"), 0, "scale: found 0.0"),
         (("channels", "position_desired", "offset"), float("inf"), "offset: found inf"),
-        (("channels", "mode", "values"), {"3": "docking"}, "values.3: found 'docking', allowed one of"),
-        (("timing", "row"), "next", "timing.row: found 'next', allowed one of after, sent, tick"),
+        (("channels", "mode", "values"), {"3": "docking"}, "values.3: found 'docking', expected one of"),
+        (("timing", "row"), "next", "timing.row: found 'next', expected one of after, sent, tick"),
         (("timing", "control_period"), 0, "control_period: found 0"),
         (("bodies", "equivalent_mass"), 3.0, "bodies: found chaser_mass and equivalent_mass and target_mass"),
         (("text", "delimiter"), ";;", "delimiter: found ';;'"),
         (("runs",), [], "runs: found a list of 0 entries"),
-        (("runs", 0, "kind"), "fre", "runs[0].kind: found 'fre', allowed one of contact, free"),
-        (("runs", 0, "end"), 0.5, "runs[0].end: found 0.5, allowed a number > begin, 1 s"),
+        (("runs", 0, "kind"), "fre", "runs[0].kind: found 'fre', expected one of contact, free"),
+        (("runs", 0, "end"), 0.5, "runs[0].end: found 0.5, expected a number > begin, 1 s"),
         (("runs", 0, "files"), [], "runs[0].files: found a list of 0 entries"),
-        (("channels",), "x", "channels: found 'x', allowed a table"),
-        (("channels", "time"), [1], "channels.time: found [1], allowed a table"),
-        (("runs",), ["x"], "runs[0]: found 'x', allowed a table"),
+        (("channels",), "x", "channels: found 'x', expected a table"),
+        (("channels", "time"), [1], "channels.time: found [1], expected a table"),
+        (("runs",), ["x"], "runs[0]: found 'x', expected a table"),
     ],
 )  # fmt: skip
 def test_unusable_mapping_is_refused(path, value, reason):
     with pytest.raises(InputError) as caught:
-        mapping_of(changed(path, value), "map.toml")
+        parse_mapping(changed(path, value), "map.toml")
     assert str(caught.value).startswith("map.toml: ") and reason in str(caught.value)
     assert str(caught.value).isprintable()
 
@@ -125,17 +125,17 @@ def test_value_missing_from_mapping_and_prior_is_refused(tmp_path):
         (changed(("timing",), None), "timing.control_period: found nothing"),
         (
             changed(("channels", "time"), {"rate": 999.0}),
-            "channels.time.rate: found 999 Hz, allowed 1 / control_period",
+            "channels.time.rate: found 999 Hz, expected 1 / control_period",
         ),
     ]
     for raw, reason in cases:
         with pytest.raises(InputError, match=reason):
-            read_campaign([log], mapping_of(raw, "map"))
+            read_campaign([log], parse_mapping(raw, "map"))
     prior = load("varying").mechanism
     bare = {key: one for key, one in FULL.items() if key not in ("bodies", "timing", "text")}
     with pytest.raises(InputError, match=r"free_1.csv: found no line of columns' names"):
-        read_campaign([log], mapping_of(bare, "map"), prior)
+        read_campaign([log], parse_mapping(bare, "map"), prior)
     with pytest.raises(
-        InputError, match=r"x.csv: found a log that no run names, allowed 'free_\*.csv', 'day1"
+        InputError, match=r"x.csv: found a log that no run names, expected 'free_\*.csv', 'day1"
     ):
-        read_campaign([tmp_path / "x.csv"], mapping_of(FULL, "map"))
+        read_campaign([tmp_path / "x.csv"], parse_mapping(FULL, "map"))

@@ -104,7 +104,7 @@ def test_log_runs_are_cut_by_begin_and_end_by_mode_and_by_index(tmp_path):
         ("free", 600, 600),
     ]
     assert set(pair[0].contact_index) == {4}
-    with pytest.raises(InputError, match=r"a.csv: row 601: mode: found '7', allowed one of 0, free, press"):
+    with pytest.raises(InputError, match=r"a.csv: row 601: mode: found '7', expected one of 0, free, press"):
         read(path, mode={"column": "state", "values": {"0": "contact"}})
 
 
@@ -143,17 +143,17 @@ def edit(path: Path, row: int, cell: int, text: str) -> Path:
 @pytest.mark.parametrize(
     ("row", "cell", "text", "reason"),
     [
-        (30, 1, "nan", "row 30: position_desired: found nan, allowed a finite number"),
+        (30, 1, "nan", "row 30: position_desired: found nan, expected a finite number"),
         (30, 1, "inf", "row 30: position_desired: found inf"),
         (30, 0, "nan", "row 30: time: found nan"),
         (30, 1, "", "row 30: position_desired: found nan"),
         (30, 1, "12,5", "Row #31: Expected 6 columns, got 7"),
         (30, 1, "abc", "Row #31: CSV conversion error to double: invalid value 'abc'"),
-        (1, 1, "abc", "column 'xd': found 'abc', allowed numbers"),
-        (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, allowed time that increases"),
+        (1, 1, "abc", "column 'xd': found 'abc', expected numbers"),
+        (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, expected time that increases"),
         (30, 0, "0.028", "row 30: time: found 0.028 s after 0.028 s"),
-        (0, 1, "xdd", "found none of this name, allowed t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
-        (0, 2, "xd", "column 'xd': found 2, allowed one"),
+        (0, 1, "xdd", "found none of this name, expected t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
+        (0, 2, "xd", "column 'xd': found 2, expected one"),
     ],
 )  # fmt: skip
 def test_unusable_cells_are_refused(tmp_path, row, cell, text, reason):
@@ -169,10 +169,10 @@ def test_unusable_log_files_are_refused(tmp_path):
     cases = {
         "none.csv": "found no such file",
         "folder": "found a name that ends in ''",
-        "a.docx": "found a name that ends in '.docx', allowed .csv",
+        "a.docx": "found a name that ends in '.docx', expected .csv",
         "empty.csv": "found no line of columns' names",
-        "names.csv": "found 0 rows, allowed at least 200",
-        "short.csv": "found 100 rows, allowed at least 200",
+        "names.csv": "found 0 rows, expected at least 200",
+        "short.csv": "found 100 rows, expected at least 200",
         "torn.parquet": "cannot be read",
         "torn.csv": "cannot be read",
     }

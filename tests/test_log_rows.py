@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from log_cases import MASS, PERIOD, touches
 
-from tuning.identification.logs.rows import SHORT, stretches
+from tuning.identification.logs.lost_rows import MAX_RECONSTRUCTED_ROWS, split_at_gaps
 
 LOG = touches(2, noise=2.0)
 CHANNELS = {
@@ -21,7 +21,7 @@ def cut(lost, without=(), cuts=()):
     rows = np.setdiff1d(np.arange(1200), lost)
     channels = {name: None if name in without else LOG[column][rows] for name, column in CHANNELS.items()}
     channels["contact_index"] = np.repeat([0, 1], 600)[rows]
-    return stretches(rows, channels, np.array(cuts, int), PERIOD, MASS)
+    return split_at_gaps(rows, channels, np.array(cuts, int), PERIOD, MASS)
 
 
 @pytest.mark.parametrize(("lost", "error"), [(1, 1e-17), (2, 1e-17), (3, 1e-8)])
@@ -46,7 +46,9 @@ def test_lost_commands_without_the_model_are_mostly_restored_by_a_cubic():
 
 
 def test_log_is_divided_at_longer_gaps_and_cuts():
-    first, second, third = cut(np.arange(300, 300 + SHORT + 1), cuts=[700 - SHORT - 1])
+    first, second, third = cut(
+        np.arange(300, 300 + MAX_RECONSTRUCTED_ROWS + 1), cuts=[700 - MAX_RECONSTRUCTED_ROWS - 1]
+    )
     assert [(one.tick[0], one.tick[-1]) for one in (first, second, third)] == [
         (0, 299),
         (304, 699),

@@ -8,10 +8,10 @@ from log_cases import MASS, PERIOD, mapping, read, touches, write_csv
 
 from jaxhil.errors import InputError
 from tuning.identification.logs.campaign import read_campaign
-from tuning.identification.logs.model_motion import check_command
-from tuning.identification.logs.rows import Stretch, integrator_of
-from tuning.identification.logs.scale_fit import scale
-from tuning.identification.logs.scales import likely_lengths, likely_units
+from tuning.identification.logs.force_command_check import check_command
+from tuning.identification.logs.lost_rows import LogSegment, detect_integrator
+from tuning.identification.logs.scale_fit import fit_scale
+from tuning.identification.logs.scales import ask_for_length_unit, ask_for_unit
 
 LBF, INCH = 4.4482216152605, 0.0254
 LOG = touches(2, noise=0.3)
@@ -165,7 +165,7 @@ def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lo
     valid = np.random.default_rng(seed).uniform(size=len(x)) >= lost
     force = np.where(valid, factor * log["Fc"], np.nan)
     channels = {"position_desired": x, "velocity_desired": log["vd"], "force_command": force}
-    stretch = Stretch(np.arange(len(x)), channels, valid)
+    stretch = LogSegment(np.arange(len(x)), channels, valid)
     touched = np.flatnonzero(log["Fc"])
     contacts = [(int(touched[0]), int(touched[-1]) + 1)]
     try:
@@ -186,7 +186,7 @@ def test_integrator_is_recognised_under_rounding(quantum):
     ways = {name: -1.1e-3 + PERIOD * np.cumsum(np.append(0.0, step)) for name, step in ways.items()}
     for name, position in ways.items():
         coarse = quantum * np.round(position / quantum) if quantum else position
-        assert integrator_of(coarse, v, PERIOD) == name
+        assert detect_integrator(coarse, v, PERIOD) == name
 
 
 def test_scale_and_its_error_cover_the_truth():
@@ -194,16 +194,16 @@ def test_scale_and_its_error_cover_the_truth():
     unit = np.sin(np.arange(400) / 20.0)
     for _ in range(300):
         noise = np.convolve(random.standard_normal(407), np.ones(8), "valid")
-        fit = scale(2.0 * unit + noise, unit, 8)
+        fit = fit_scale(2.0 * unit + noise, unit, 8)
         off.append((fit.slope - 2.0) / fit.error)
     assert 0.6 < np.std(off) < 1.3
-    assert scale(np.zeros(9), np.ones(9)) is None and scale(np.ones(9), np.zeros(9)) is None
+    assert fit_scale(np.zeros(9), np.ones(9)) is None and fit_scale(np.ones(9), np.zeros(9)) is None
 
 
 def test_units_are_named_by_their_factors():
-    assert likely_units((0.225,), 0.02) == " (force in lbf, read as N?)"
-    assert likely_units((1.3,), 0.02) == likely_units((-4.448,), 0.02) == ""
-    assert likely_lengths(1 / 25.4, 0.01) == " (in in, read as mm?)"
+    assert ask_for_unit((0.225,), 0.02) == " (force in lbf, read as N?)"
+    assert ask_for_unit((1.3,), 0.02) == ask_for_unit((-4.448,), 0.02) == ""
+    assert ask_for_length_unit(1 / 25.4, 0.01) == " (in in, read as mm?)"
 
 
 def test_campaign_of_several_files_names_the_wrong_one(tmp_path):

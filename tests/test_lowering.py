@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from jax import export
 
-from jaxhil.laws.compensators import COMPENSATORS, SIX_AXES, literature_gains
+from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load_any
-from jaxhil.rig_models import rig_model
-from jaxhil.simulation import environment
-from jaxhil.simulation.environment import ROLLOUT, flags, known_options
+from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation import jax_environment
 from jaxhil.simulation.evaluation import run_tiles
+from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, build_xla_flags, supported_options
 from tuning.caches import program_cache
-from tuning.gains.rounds import prepare_solver
+from tuning.gains.multistart_solver import compile_solver
 from tuning.gains.tasks import build_task
 
 LEVEL = "--xla_backend_optimization_level"
@@ -33,7 +33,7 @@ def calls(function, *arguments):
 
 def case(name, compensator):
     mechanism = load_any(name).mechanism
-    model = rig_model(mechanism)
+    model = choose_rig_model(mechanism)
     scenarios = model.scenarios(mechanism)
     return (
         model,
@@ -67,8 +67,8 @@ def test_batch_lowers_for_cuda_without_external_calls():
 def test_tuning_lowers_for_cuda(monkeypatch):
     """Lower the whole solver; the card's own Cholesky decomposition computes its steps."""
     programs = []
-    monkeypatch.setattr(program_cache, "prepare", lambda *program: programs.append(program))
-    prepare_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
+    monkeypatch.setattr(program_cache, "prepare_program", lambda *program: programs.append(program))
+    compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
     ((function, static, arguments, _),) = programs
     result = calls(lambda arguments: tuple(function(static, arguments)), arguments)
     assert result == CHOLESKY
@@ -89,7 +89,7 @@ def test_every_law_and_its_derivatives_lower_for_cuda(name, compensator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compensator", SIX_AXES)
+@pytest.mark.parametrize("compensator", SIX_AXIS_COMPENSATORS)
 def test_six_axes_and_their_derivatives_lower_for_cuda(compensator):
     """Solve six equations in six unknowns by the card's own routine."""
     assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
@@ -97,9 +97,9 @@ def test_six_axes_and_their_derivatives_lower_for_cuda(compensator):
 
 
 def test_compiler_options_for_cpus_go_to_cpus_only(monkeypatch):
-    assert known_options(ROLLOUT) == ROLLOUT
+    assert supported_options(ROLLOUT_OPTIONS) == ROLLOUT_OPTIONS
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert known_options(ROLLOUT) == {}
+    assert supported_options(ROLLOUT_OPTIONS) == {}
 
 
 @pytest.mark.parametrize(
@@ -107,6 +107,6 @@ def test_compiler_options_for_cpus_go_to_cpus_only(monkeypatch):
 )
 def test_less_optimisation_is_asked_of_the_cpu_compiler_only(monkeypatch, plugin, platforms, given):
     """Cover a jax plugin, as a graphics card needs one, that jax is not told to leave out."""
-    monkeypatch.setattr(environment, "find_spec", {"jax_plugins": plugin}.get)
+    monkeypatch.setattr(jax_environment, "find_spec", {"jax_plugins": plugin}.get)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
-    assert (LEVEL in flags("")) == given
+    assert (LEVEL in build_xla_flags("")) == given

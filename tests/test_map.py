@@ -15,8 +15,8 @@ import tuning
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.stability_map import grid
-from tuning.stability_map.closed_forms import characteristic_root, critical_delay, series
-from tuning.stability_map.contact_growth import LINEAR_COMPENSATORS, growth
+from tuning.stability_map.closed_forms import critical_delay, restitution_by_root, restitution_by_series
+from tuning.stability_map.contact_growth import LINEAR_COMPENSATORS, compute_growth
 
 SOFT = {  # one contact of about 4.8 s; the other motions are almost uniform on this scale
     "approach.contacts": 1, "contact.stiffness": [150.0], "contact.damping": [0.4], "uncertainty": {},
@@ -56,7 +56,7 @@ def simulated_growth(run, period):
 @pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
 def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, changes):
     mechanism = jaxhil.load("varying", SOFT | changes)
-    result = growth(
+    result = compute_growth(
         mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
     )
     run = jaxhil.simulate(mechanism, compensator)
@@ -68,11 +68,11 @@ def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, chan
 def test_map_derivatives_by_gains_are_finite_differences():
     mechanism = jaxhil.load("varying", {"uncertainty": {}})
     gains, scenarios = literature_gains(mechanism, "phase_lead"), build_scenarios(mechanism)
-    slopes = growth(mechanism, "phase_lead", gains, scenarios).by_gain
+    slopes = compute_growth(mechanism, "phase_lead", gains, scenarios).by_gain
     for name, value in gains.items():
         step, at = 1e-3 * value, {}
         for side in (-2, -1, 1, 2):
-            moved = growth(mechanism, "phase_lead", gains | {name: value + side * step}, scenarios)
+            moved = compute_growth(mechanism, "phase_lead", gains | {name: value + side * step}, scenarios)
             at[side] = moved.spectral_radius
         # The error is of fourth order in the step; a smaller step would leave no digits of an eigenvalue.
         difference = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * step)
@@ -81,11 +81,15 @@ def test_map_derivatives_by_gains_are_finite_differences():
 
 def test_growth_agrees_with_closed_forms():
     phases = np.array([0.02, 0.05, 0.2, 0.7])
-    assert series(phases) == pytest.approx([delayed_restitution(phase) for phase in phases], abs=1e-6)
-    assert np.isnan(series(np.array([-0.1, 1.5]))).all() and series(np.zeros(1)) == pytest.approx(1)
+    assert restitution_by_series(phases) == pytest.approx(
+        [delayed_restitution(phase) for phase in phases], abs=1e-6
+    )
+    assert np.isnan(restitution_by_series(np.array([-0.1, 1.5]))).all() and restitution_by_series(
+        np.zeros(1)
+    ) == pytest.approx(1)
     # s^2 = -omega^2 e^(-s tau), time in units of 1/omega: growth and oscillation give the root back.
     for phase in phases:
-        ratio = math.log(characteristic_root(phase)) / math.pi
+        ratio = math.log(restitution_by_root(phase)) / math.pi
         root = solved_root(phase)
         assert root.real / abs(root.imag) == pytest.approx(ratio, rel=1e-9)
     mass, stiffness, damping = 350.0, 1.2e5, np.array([100.0, 3000.0])
@@ -160,8 +164,8 @@ def test_map_has_the_requested_axes(ideal):
         (("contact.stiffness=-1:1", "rig.force_sensor.delay"), "contact.stiffness[0]: found -1.0"),
         (("contact.stiffness[3]", "rig.force_sensor.delay"), "--x contact.stiffness[3]: found a value"),
         (("contact.stiffness", "contact.stiffness"), "--y: found contact.stiffness"),
-        (("contact.stiffness", "rig.force_sensor.bias"), "allowed rig.force_sensor.bias=LOW:HIGH"),
-        (("contact.stiffness", "gains.lead"), "--y: found 'gains.lead', allowed no gain"),
+        (("contact.stiffness", "rig.force_sensor.bias"), "expected rig.force_sensor.bias=LOW:HIGH"),
+        (("contact.stiffness", "gains.lead"), "--y: found 'gains.lead', expected no gain"),
         (("contact.stiffness", "rig.simulator.time_constant"), "found no value"),
     ],
 )
@@ -187,7 +191,7 @@ def test_map_reaches_theoretical_limits_at_small_control_periods():
     for _ in range(30):
         middle = (low + high) / 2
         scenarios = build_scenarios(mechanism, {"rig.force_sensor.delay": np.array([middle])})
-        grows = growth(mechanism, "none", {}, scenarios).spectral_radius > 1
+        grows = compute_growth(mechanism, "none", {}, scenarios).spectral_radius > 1
         low, high = (low, middle) if grows else (middle, high)
     print(f"\ncritical delay {1e3 * low:.6f} ms, by item 5 {1e3 * limit:.6f} ms")
     assert low == pytest.approx(limit, rel=1e-3)
@@ -220,10 +224,10 @@ def test_map_on_a_cluster_is_the_same_to_the_bit(tmp_path):
 
 
 def test_interrupted_map_resumes(tmp_path, monkeypatch):
-    monkeypatch.setattr(grid, "PART", 128)
+    monkeypatch.setattr(grid, "MAX_TILE_RUNS", 128)
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 8}
     whole = tuning.map("varying", **asked, folder=tmp_path / "whole")
-    run_part, runs = grid.run_part, []
+    run_part, runs = grid.run_tile, []
 
     def interrupted(*part):
         if len(runs) == 2:
@@ -232,11 +236,11 @@ def test_interrupted_map_resumes(tmp_path, monkeypatch):
         return run_part(*part)
 
     with monkeypatch.context() as patched:
-        patched.setattr(grid, "run_part", interrupted)
+        patched.setattr(grid, "run_tile", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tuning.map("varying", **asked, folder=tmp_path / "map")
-    monkeypatch.setattr(grid, "run_part", lambda *part: runs.append(part) or run_part(*part))
+    monkeypatch.setattr(grid, "run_tile", lambda *part: runs.append(part) or run_part(*part))
     again = tuning.map("varying", **asked, folder=tmp_path / "map", resume=True)
     assert again.document == whole.document
-    assert len(runs) == -(-grid.runs(8) // 128)
+    assert len(runs) == -(-grid.count_runs(8) // 128)
     assert not (tmp_path / "map" / ".pieces").exists()

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanism_table import FULL, LAYERED, OF_OTHERS, changed, leaves, refusal, tables
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from jaxhil.mechanism.structs import Bodies, Mechanism, numeric_keys, value_at
 
 REQUIRED = [
@@ -49,7 +49,7 @@ MAY_BE_INFINITE = [
 
 
 def test_mechanism_table_is_read_value_by_value():
-    mechanism = from_builtins(FULL, "f")
+    mechanism = from_plain_data(FULL, "f")
     for path in leaves():
         if path != "uncertainty":
             node = FULL
@@ -67,7 +67,7 @@ def test_mechanism_keys_have_their_defaults():
     raw = {"schema": FULL["schema"], "name": "n", "bodies": {"equivalent_mass": 1}}
     raw |= {"approach": {"velocity": 1}, "contact": {"law": "linear", "stiffness": 5}}
     raw |= {"rig": {"control_period": 0.001, "simulator": {"model": "ideal"}}}
-    mechanism = from_builtins(raw, "f")
+    mechanism = from_plain_data(raw, "f")
     assert mechanism.source == "assumed" and mechanism.uncertainty == {}
     assert (mechanism.approach.contacts, mechanism.approach.phase) == (1, 1 / 3)
     contact, rig = mechanism.contact, mechanism.rig
@@ -97,7 +97,7 @@ def test_missing_key_is_named(path):
 
 @pytest.mark.parametrize("path", sorted(set(leaves()) - set(REQUIRED)))
 def test_other_keys_may_be_missing(path):
-    assert isinstance(from_builtins(changed({path: ...}), "f"), Mechanism)
+    assert isinstance(from_plain_data(changed({path: ...}), "f"), Mechanism)
 
 
 @pytest.mark.parametrize("path", [*leaves(), *(table[:-1] for table in tables() if table)])
@@ -108,7 +108,7 @@ def test_wrong_type_is_named(path, value):
     if path == "rig.force_sensor.bias" and isinstance(value, float):
         value = "text"
     message = refusal(changed({path: value}))
-    assert f": {path}" in message and ", allowed " in message
+    assert f": {path}" in message and ", expected " in message
 
 
 @pytest.mark.parametrize("table", [*tables()])
@@ -138,7 +138,7 @@ def test_numbers_must_be_finite_unless_the_key_allows(path, value):
         base["bodies"] = {"chaser_mass": 1.0, "target_mass": 1.0}
     raw = changed({path: listed}, base)
     if value == math.inf and path in MAY_BE_INFINITE:
-        assert value_at(from_builtins(raw, "f"), path) == math.inf
+        assert value_at(from_plain_data(raw, "f"), path) == math.inf
     else:
         assert f": {path}" in refusal(raw)
 
@@ -162,7 +162,7 @@ def test_zero_and_negative_values_are_accepted_or_refused_by_key(path):
         if (value < 0.0 and not may_be_negative) or path in [*POSITIVE, "contact.exponent"]:
             assert f": {path}" in refusal(raw)
         else:
-            assert isinstance(from_builtins(raw, "f"), Mechanism)
+            assert isinstance(from_plain_data(raw, "f"), Mechanism)
 
 
 @pytest.mark.parametrize(
@@ -191,9 +191,9 @@ def test_zero_and_negative_values_are_accepted_or_refused_by_key(path):
     ],
 )
 def test_edges_of_ranges_are_accepted_and_values_beyond_are_refused(path, inside, outside):
-    assert isinstance(from_builtins(changed({path: inside}), "f"), Mechanism)
+    assert isinstance(from_plain_data(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
-    assert f": {path}" in message and ", allowed " in message
+    assert f": {path}" in message and ", expected " in message
 
 
 @pytest.mark.parametrize(
@@ -207,12 +207,12 @@ def test_edges_of_ranges_are_accepted_and_values_beyond_are_refused(path, inside
 )
 def test_edges_of_ranges_of_another_law_are_accepted_and_beyond_refused(path, inside, outside):
     base = changed({"contact.law": "hunt_crossley"})
-    assert value_at(from_builtins(changed({path: inside}, base), "f"), path) in (inside, [inside])
+    assert value_at(from_plain_data(changed({path: inside}, base), "f"), path) in (inside, [inside])
     assert f": {path}" in refusal(changed({path: outside}, base))
 
 
 def test_contact_depths_must_increase():
-    assert from_builtins(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
+    assert from_plain_data(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
     for wrong in ([0.001, 0.001], [0.0, 0.001], [0.001, -0.1]):
         assert ": contact.depths[" in refusal(changed({**LAYERED, "contact.depths": wrong}))
 
@@ -220,7 +220,7 @@ def test_contact_depths_must_increase():
 @pytest.mark.parametrize("value", [1e-320, -1e-320, 1e-101, 1.1e100, -1.7e308])
 def test_numbers_that_overflow_or_vanish_in_products_are_refused(value):
     message = refusal(changed({"rig.force_sensor.bias": value}))
-    assert f": found {value}, allowed a finite number of N, of a magnitude from 1e-100 to 1e+100" in message
+    assert f": found {value}, expected a finite number of N, of a magnitude from 1e-100 to 1e+100" in message
 
 
 @settings(deadline=None)
@@ -235,27 +235,27 @@ def test_any_value_at_any_key_is_accepted_or_refused_in_one_line(value, data):
     path = data.draw(st.sampled_from([*leaves(), *(table[:-1] for table in tables() if table)]))
     raw = changed({path: value})
     try:
-        mechanism = from_builtins(raw, "some file")
+        mechanism = from_plain_data(raw, "some file")
     except InputError:
         assert path.split(".")[0] in refusal(raw)
     else:
-        assert from_builtins(to_builtins(mechanism), "f") == mechanism
+        assert from_plain_data(to_plain_data(mechanism), "f") == mechanism
 
 
 @settings(deadline=None)
 @given(st.text(), st.integers(3, 80))
 def test_shown_and_one_line_are_short_and_printable(text, limit):
-    assert one_line(text).isprintable()
-    assert one_line(text, limit).isprintable() and len(one_line(text, limit)) <= limit
-    assert shown(text).isprintable() and len(shown(text)) <= 60
-    assert shown([text]).isprintable() and len(shown([text])) <= 60
+    assert to_one_line(text).isprintable()
+    assert to_one_line(text, limit).isprintable() and len(to_one_line(text, limit)) <= limit
+    assert format_value(text).isprintable() and len(format_value(text)) <= 60
+    assert format_value([text]).isprintable() and len(format_value([text])) <= 60
 
 
 def test_shown_handles_values_without_text():
     nested = []
     for _ in range(100_000):
         nested = [nested]
-    assert shown(nested) == "a deeply nested list"
-    assert shown(10**5000) == "a number of thousands of digits"
-    assert shown({"a": 1}) == "a table"
-    assert (shown(None), shown(True), shown(-1.5)) == ("nothing", "true", "-1.5")
+    assert format_value(nested) == "a deeply nested list"
+    assert format_value(10**5000) == "a number of thousands of digits"
+    assert format_value({"a": 1}) == "a table"
+    assert (format_value(None), format_value(True), format_value(-1.5)) == ("nothing", "true", "-1.5")

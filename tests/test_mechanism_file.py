@@ -17,15 +17,15 @@ from msgspec.inspect import ListType, Metadata, StructType, UnionType
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import (
-    DEFAULT,
+    DEFAULT_MECHANISM,
     builtin_names,
     builtin_path,
-    from_builtins,
+    from_plain_data,
     load,
     suite_names,
-    to_builtins,
+    to_plain_data,
 )
-from jaxhil.mechanism.structs import schema_type
+from jaxhil.mechanism.structs import mechanism_type
 from jaxhil.mechanism.toml_table import MAX_BYTES
 
 TEXT = builtin_path("claw-350kg").read_text()
@@ -34,7 +34,7 @@ TEXT = builtin_path("claw-350kg").read_text()
 def test_builtin_mechanisms_are_the_documented_ones():
     names = "claw-350kg layered rattling rig-300kg rod-100n-mm varying"
     assert builtin_names() == names.split()
-    assert load() == load(DEFAULT) == load("varying")
+    assert load() == load(DEFAULT_MECHANISM) == load("varying")
 
 
 SUITES = "damped dead-zone depth-damped elastoplastic fast friction hardening hertz lag layered long"
@@ -47,7 +47,7 @@ def test_suites_are_the_documented_ones():
         mechanism, _, label = load(name)
         assert label == mechanism.name == name
         assert mechanism.source.startswith("assumed: ") and "\n" not in mechanism.source
-        assert mechanism == from_builtins(to_builtins(mechanism), name)
+        assert mechanism == from_plain_data(to_plain_data(mechanism), name)
 
 
 @pytest.mark.parametrize("name", builtin_names())
@@ -171,14 +171,14 @@ def test_damaged_mechanism_file_is_read_or_refused_in_one_line(written, noise, p
 @pytest.mark.parametrize("name", builtin_names())
 def test_mechanism_survives_round_trip_through_json(name):
     mechanism = load(name, ["rig.force_sensor.bias=-0.1", "approach.phase=0.1"]).mechanism
-    text = json.dumps(to_builtins(mechanism), allow_nan=False)
-    assert from_builtins(json.loads(text), "a gain file") == mechanism
+    text = json.dumps(to_plain_data(mechanism), allow_nan=False)
+    assert from_plain_data(json.loads(text), "a gain file") == mechanism
     assert "null" not in text
 
 
 def test_from_builtins_refuses_what_is_no_table():
-    with pytest.raises(InputError, match=r"^a\\nfile: found \[1\], allowed a table$"):
-        from_builtins([1], "a\nfile")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"^a\\nfile: found \[1\], expected a table$"):
+        from_plain_data([1], "a\nfile")  # pyright: ignore[reportArgumentType]
 
 
 def test_mechanism_file_is_read_without_jax():
@@ -203,15 +203,15 @@ def test_every_key_has_a_meaning_and_every_number_a_unit():
             return texts(kind.item_type) if isinstance(kind, ListType) else []
         return [*texts(kind.type), ((kind.extra_json_schema or {}).get("description"), kind.extra or {})]
 
-    described = {path: texts(kind) for path, kind in keys(schema_type())}
+    described = {path: texts(kind) for path, kind in keys(mechanism_type())}
     assert "rig.force_sensor.delay" in described and len(described) > 40
     for path, result in described.items():
         assert any(meaning for meaning, _ in result), path
     assert any(extra.get("unit") == "s" for _, extra in described["rig.force_sensor.delay"])
     for path, message in (
-        ("rig.control_period=1", "found 1, allowed a number > 0 s and <= 0.1 s"),
-        ("rig.force_sensor.delay=2", "found 2, allowed a number from 0 to 1 s"),
-        ("rig.force_sensor.bias=x", "found 'x', allowed a finite number of N"),
-        ("contact.damping=[-1]", "found -1, allowed a number >= 0 N s/m"),
+        ("rig.control_period=1", "found 1, expected a number > 0 s and <= 0.1 s"),
+        ("rig.force_sensor.delay=2", "found 2, expected a number from 0 to 1 s"),
+        ("rig.force_sensor.bias=x", "found 'x', expected a finite number of N"),
+        ("contact.damping=[-1]", "found -1, expected a number >= 0 N s/m"),
     ):
         assert message in file_refusal("varying", [path])

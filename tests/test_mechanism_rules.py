@@ -17,7 +17,7 @@ from mechanism_table import (
     refusal,
 )
 
-from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from jaxhil.mechanism.rules import is_hurwitz
 from jaxhil.mechanism.structs import value_at
 
@@ -34,17 +34,17 @@ ELASTOPLASTIC = {
 def test_contact_law_requires_its_key_and_checks_its_range(contact):
     name, key = contact["contact.law"], list(contact)[1]
     drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
-    mechanism = from_builtins(changed({**contact, **drawn}), "f")
+    mechanism = from_plain_data(changed({**contact, **drawn}), "f")
     assert value_at(mechanism, key) == contact[key]
     message = refusal(changed({k: value for k, value in contact.items() if k != key}))
-    assert f": {key}: found nothing, allowed a number >" in message and f"(law {name} needs it)" in message
+    assert f": {key}: found nothing, expected a number >" in message and f"(law {name} needs it)" in message
     for value in (0.99 if "ratio" in key else 0.0, math.inf, "1", [1.0]):
         assert f": {key}: found " in refusal(changed({**contact, key: value}))
     message = refusal(changed({key: contact[key]}))
-    assert f": {key}: found {contact[key]}, allowed nothing (only for law " in message and name in message
+    assert f": {key}: found {contact[key]}, expected nothing (only for law " in message and name in message
     others = ["contact.reference_depth", "contact.unloading_ratio"]
     other = others[key == others[0]]
-    assert f": {other}: found 2.0, allowed nothing" in refusal(changed({**contact, other: 2.0}))
+    assert f": {other}: found 2.0, expected nothing" in refusal(changed({**contact, other: 2.0}))
     low = {key: {"distribution": "uniform", "low": 0.0, "high": 2.0}}
     assert f': uncertainty."{key}": found values as far as 0' in refusal(
         changed({**contact, "uncertainty": low})
@@ -54,32 +54,32 @@ def test_contact_law_requires_its_key_and_checks_its_range(contact):
 @pytest.mark.parametrize("path", OF_OTHERS)
 def test_keys_of_other_laws_and_models_are_refused(path):
     message = refusal(changed({path: OF_OTHERS[path]}))
-    assert f": {path}: found {OF_OTHERS[path]}, allowed nothing (" in message
+    assert f": {path}: found {OF_OTHERS[path]}, expected nothing (" in message
     uncertain = {path: {"distribution": "uniform", "factor": [0.5, 1.5]}}
     assert f': uncertainty."{path}": found ' in refusal(changed({"uncertainty": uncertain}))
 
 
 def test_unused_keys_of_a_law_may_be_at_their_default():
     for law in (HARDENING, LAYERED):
-        assert from_builtins(changed({**law, "contact.exponent": 1.5, "contact.tension": False}), "f")
+        assert from_plain_data(changed({**law, "contact.exponent": 1.5, "contact.tension": False}), "f")
         for key, value, only in (
             ("contact.exponent", 1.4, "hunt_crossley or depth_damped"),
             ("contact.tension", True, "kelvin_voigt"),
         ):
             message = refusal(changed({**law, key: value}))
-            assert f": {key}: found {str(value).lower()}, allowed nothing (only for law {only})" in message
+            assert f": {key}: found {str(value).lower()}, expected nothing (only for law {only})" in message
     drawn = {"contact.exponent": {"distribution": "uniform", "low": 1.0, "high": 2.0}}
     assert '"contact.exponent": found a key only for law hunt' in refusal(changed({"uncertainty": drawn}))
 
 
 def test_preloaded_contact_has_no_damping():
     message = refusal(changed({"contact.law": "preloaded", "contact.damping": [3.0]}))
-    assert ": contact.damping: found [3.0], allowed 0 (law preloaded dissipates by friction)" in message
+    assert ": contact.damping: found [3.0], expected 0 (law preloaded dissipates by friction)" in message
 
 
 def test_elastoplastic_contact_has_no_damping():
     message = refusal(changed({**ELASTOPLASTIC, "contact.damping": [0.0, 3.0]}))
-    assert ": contact.damping: found [0.0, 3.0], allowed 0 (law elastoplastic" in message
+    assert ": contact.damping: found [0.0, 3.0], expected 0 (law elastoplastic" in message
     drawn = {"contact.damping": {"distribution": "uniform", "low": 0.0, "high": 2.0}}
     assert "found an uncertain damping" in refusal(changed({**ELASTOPLASTIC, "uncertainty": drawn}))
 
@@ -122,8 +122,8 @@ def test_keys_that_contradict_each_other_are_refused(changes, key):
     ],
 )
 def test_mechanism_with_other_law_or_model_survives_round_trip(changes):
-    mechanism = from_builtins(changed(changes), "f")
-    assert from_builtins(to_builtins(mechanism), "f") == mechanism
+    mechanism = from_plain_data(changed(changes), "f")
+    assert from_plain_data(to_plain_data(mechanism), "f") == mechanism
 
 
 @pytest.mark.parametrize(
@@ -148,16 +148,16 @@ def test_both_positions_start_inside_the_gap(changes, lag):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
     changes = changes | {"rig.contact_plane": ...}
-    assert from_builtins(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
+    assert from_plain_data(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
     message = refusal(changed(changes | {"contact.clearance": start * (1 - 1e-9)}))
-    assert ": contact.clearance: found " in message and f"allowed a clearance > {start:g}" in message
+    assert ": contact.clearance: found " in message and f"expected a clearance > {start:g}" in message
 
 
 def test_velocity_limit_below_the_approach_speed_is_refused():
     path = "rig.simulator.velocity_limit"
-    speed = value_at(from_builtins(changed({}), "f"), "approach.velocity")
-    expected = f"allowed a number >= {speed:g} m/s, the approach speed"
-    assert from_builtins(changed({path: speed}), "f")
+    speed = value_at(from_plain_data(changed({}), "f"), "approach.velocity")
+    expected = f"expected a number >= {speed:g} m/s, the approach speed"
+    assert from_plain_data(changed({path: speed}), "f")
     assert f": {path}: found {0.99 * speed!r}, {expected}" in refusal(changed({path: 0.99 * speed}))
     for drawn in (
         {"approach.velocity": {"distribution": "uniform", "low": speed, "high": 1.01 * speed}},
@@ -171,11 +171,11 @@ def test_start_is_clear_of_the_contact_surface(side):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     plane = side * (0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)))
     changes = {"contact.clearance": 0.02}
-    assert from_builtins(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
+    assert from_plain_data(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
     message = refusal(changed(changes | {"rig.contact_plane": plane}))
     assert ": rig.contact_plane: found " in message
-    assert "allowed a number > -0.0197427 and < 0.0197427, the clearance less" in message
-    assert from_builtins(changed({"contact.clearance": math.inf, "rig.contact_plane": plane}), "f")
+    assert "expected a number > -0.0197427 and < 0.0197427, the clearance less" in message
+    assert from_plain_data(changed({"contact.clearance": math.inf, "rig.contact_plane": plane}), "f")
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_transfer_function_is_accepted_or_refused_by_key(numerator, denominator,
     if key:
         assert f": rig.simulator.{key}: found" in refusal(raw)
     else:
-        simulator = from_builtins(raw, "f").rig.simulator
+        simulator = from_plain_data(raw, "f").rig.simulator
         assert simulator.numerator == list(np.trim_zeros(numerator, "f"))
         assert simulator.denominator == list(np.trim_zeros(denominator, "f"))
 

@@ -16,19 +16,19 @@ from jaxhil.mechanism.file import (
     load_any,
     six_axis_names,
     suite_names,
-    to_builtins,
+    to_plain_data,
 )
-from jaxhil.mechanism.json_schema import json_schema
-from jaxhil.mechanism.keys import tables
-from jaxhil.mechanism.structs import MAX_CONTACTS, numeric_keys, says
-from jaxhil.mechanism.template import commented
+from jaxhil.mechanism.json_schema import build_json_schema
+from jaxhil.mechanism.keys import describe_tables
+from jaxhil.mechanism.structs import MAX_CONTACTS, key_metadata, numeric_keys
+from jaxhil.mechanism.template import format_mechanism_file
 
 NAMES = [*builtin_names(), *suite_names()]
 
 
 @pytest.fixture(scope="module")
 def validator():
-    schema = json_schema()
+    schema = build_json_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema)
 
@@ -44,16 +44,18 @@ CORRELATED = {
 @pytest.mark.parametrize("name", [*NAMES, "correlated"])
 def test_new_mechanism_file_is_equivalent_to_its_source(name, written):
     mechanism = load("varying", CORRELATED).mechanism if name == "correlated" else load(name).mechanism
-    text = commented(mechanism)
+    text = format_mechanism_file(mechanism)
     assert load(written(text)).mechanism == mechanism
     assert max(map(len, text.splitlines())) <= 110 or max(map(len, mechanism.source.splitlines())) > 90
 
 
 def test_new_mechanism_file_has_every_key_at_its_default(written):
     """Remove the comment signs: what a comment states as the default is the default."""
-    text = commented(load("rig-300kg").mechanism)
+    text = format_mechanism_file(load("rig-300kg").mechanism)
     defaults = {
-        f"{table.path}.{key.name}".lstrip("."): key.default for table in tables() for key in table.keys
+        f"{table.path}.{key.name}".lstrip("."): key.default
+        for table in describe_tables()
+        for key in table.keys
     }
     shown, path = {}, ""
     for line in text.splitlines():
@@ -65,7 +67,7 @@ def test_new_mechanism_file_has_every_key_at_its_default(written):
     assert set(shown) == {name for name in defaults if '"' not in name}
     assert all(value == defaults[name] for name, (sign, value) in shown.items() if sign)
     # Compare with the file without comment signs, where the law uses the keys.
-    of_laws = {key.name for table in tables() for key in table.keys if key.users}
+    of_laws = {key.name for table in describe_tables() for key in table.keys if key.users}
     live = re.sub(
         r"^#(\w+)( = )", lambda line: line[0] if line[1] in of_laws else line[1] + line[2], text, flags=re.M
     )
@@ -74,13 +76,13 @@ def test_new_mechanism_file_has_every_key_at_its_default(written):
 
 
 def test_new_mechanism_file_explains_itself():
-    text = commented(load("varying").mechanism)
+    text = format_mechanism_file(load("varying").mechanism)
     assert re.search(r"^velocity = 0\.005 +# speed of the first approach: a number > 0 m/s$", text, re.M)
     assert re.search(r"^#tension = false +# whether kelvin_voigt may pull: true or false$", text, re.M)
 
 
 def test_every_key_has_a_description():
-    keys = {f"{table.path}.{key.name}": key for table in tables() for key in table.keys}
+    keys = {f"{table.path}.{key.name}": key for table in describe_tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
     others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # integer keys
     assert numbers - others == set(numeric_keys())
@@ -97,7 +99,7 @@ class _Silent(msgspec.Struct):
 
 
 class _Unitless(msgspec.Struct):
-    drag: Annotated[float, says("of the air", ge=0.0)] | None = None
+    drag: Annotated[float, key_metadata("of the air", ge=0.0)] | None = None
 
 
 @pytest.mark.parametrize(
@@ -106,7 +108,7 @@ class _Unitless(msgspec.Struct):
 )
 def test_key_without_meaning_or_unit_is_refused(kind, reason):
     with pytest.raises(ValueError, match=reason):
-        tables(kind)
+        describe_tables(kind)
 
 
 @pytest.mark.parametrize("name", [*NAMES, *six_axis_names()])
@@ -127,7 +129,7 @@ def test_schema_accepts_builtins(validator, name):
     ],
 )
 def test_schema_refuses_what_the_reader_refuses(validator, table, key, value):
-    document = to_builtins(load("varying").mechanism)
+    document = to_plain_data(load("varying").mechanism)
     document[table][key] = value
     assert not validator.is_valid(document)
 
@@ -145,7 +147,7 @@ def test_schema_refuses_what_the_reader_refuses(validator, table, key, value):
     ],
 )
 def test_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, value):
-    document = to_builtins(load_any("probe-drogue").mechanism)
+    document = to_plain_data(load_any("probe-drogue").mechanism)
     assert validator.is_valid(document)
     *tables, key = path
     functools.reduce(dict.__getitem__, tables, document)[key] = value
@@ -153,7 +155,7 @@ def test_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, val
 
 
 def test_schema_accepts_units_and_numbers_for_lists(validator):
-    document = to_builtins(load("varying").mechanism)
+    document = to_plain_data(load("varying").mechanism)
     document["contact"]["stiffness"] = 1e5
     validator.validate(document)
     sensor = validator.schema["$defs"]["ForceSensor"]["properties"]

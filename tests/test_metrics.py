@@ -13,11 +13,11 @@ import pytest
 from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, validated
 
 from jaxhil.laws.simulation_base import Signals
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
-from jaxhil.simulation.metrics import collect, empty_metrics
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.metrics import empty_metrics, store_metrics
 from jaxhil.simulation.scenario import build_scenarios
-from jaxhil.simulation.watch import build_rules, fresh_watch, record_contact
+from jaxhil.simulation.watch import build_end_conditions, fresh_watch, record_contact
 
 PARSED = validated(mechanism({}))
 SCENARIO = join([build_scenarios(PARSED)])
@@ -28,7 +28,7 @@ BEFORE, AFTER = 5, 40  # ticks without force
 @partial(jax.jit, compiler_options=QUICK)
 def excess(commands, touching):
     """Return the excess variation [N] of commands (ticks,), while the mechanism touches or not."""
-    rules = build_rules(SCENARIO)
+    rules = build_end_conditions(SCENARIO)
     zeros = jnp.zeros(1)
 
     def tick(watch, now):
@@ -40,7 +40,7 @@ def excess(commands, touching):
 
     watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)
-    metrics = collect(SCENARIO, empty_metrics(LOOP, 4, zeros), watch, index, watch.over, index, index)
+    metrics = store_metrics(SCENARIO, empty_metrics(LOOP, 4, zeros), watch, index, watch.over, index, index)
     return metrics.excess_variation[0, 0]
 
 

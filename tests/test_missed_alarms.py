@@ -7,12 +7,17 @@ import pytest
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.simulation.gain_file import check_document
-from tuning.bundle.summary import alarm_rates
+from tuning.bundle.summary import describe_alarm_rates
 from tuning.gain_file import build_document
-from tuning.reporting.content import _error_margin
+from tuning.reporting.verdict_sections import _error_margin
 from tuning.watchdog.calibration import calibrate
-from tuning.watchdog.fault_runs import BAND, FAULTS, MOST, scenarios_needed
-from tuning.watchdog.verdict import ALLOWED, judged
+from tuning.watchdog.fault_injection import (
+    INJECTED_FAULTS,
+    MAX_FAULT_ERROR,
+    MAX_FAULT_SCENARIOS,
+    count_fault_scenarios,
+)
+from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, add_verdict
 
 LIMIT, NUMBER = 0.02, 64
 # Undelayed, undamped contact: any error comes from the injected fault.
@@ -52,7 +57,7 @@ def test_injected_delay_is_that_of_theory(rates):
     for name in ("force_delay", "simulator_delay"):
         one = fault(rates, name)
         assert one["runs"] == one["scenarios"] == NUMBER and one["counted"] and one["unit"] == "s"
-        assert LIMIT < one["error"] <= BAND * LIMIT
+        assert LIMIT < one["error"] <= MAX_FAULT_ERROR * LIMIT
         # Use the median run; stiffness is spread evenly about the nominal value.
         assert one["size"] == pytest.approx(2 / (math.pi * omega) * math.log1p(one["error"]), rel=0.05)
 
@@ -66,7 +71,7 @@ def test_fault_without_effect_is_not_counted(rates):
         "position_delay",
         "simulator_delay",
     }
-    assert any("not counted" in text for text in alarm_rates(rates))
+    assert any("not counted" in text for text in describe_alarm_rates(rates))
 
 
 def test_watchdog_that_sees_every_error_misses_none(rates):
@@ -87,7 +92,7 @@ def test_watchdog_without_a_margin_misses_every_fault():
 def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
     result = calibrated("phase_lead")
     # Nothing is late here: the literature's lead is already 0, and there is nothing to remove.
-    names = [kind.name for kind in FAULTS if kind.name != "gains"]
+    names = [kind.name for kind in INJECTED_FAULTS if kind.name != "gains"]
     assert [run["name"] for run in result["fault_runs"]] == names
     assert fault(result, "force_delay")["runs"] == NUMBER
 
@@ -115,21 +120,24 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
         "missed_alarms": rate(0, 0),
         "fault_runs": [{**one, "counted": counted}],
     }
-    result = judged(rates, ALLOWED, 2048)
-    assert result["verdict"] == verdict and result["fault_runs"][0]["allowed"] == ALLOWED.missed_alarms
+    result = add_verdict(rates, DEFAULT_ALLOWED_RATES, 2048)
+    assert (
+        result["verdict"] == verdict
+        and result["fault_runs"][0]["allowed"] == DEFAULT_ALLOWED_RATES.missed_alarms
+    )
     if verdict == "unknown":
         tells = "about 190 such runs tell, there are 182" if counted else "a sweep of at least "
         assert tells in result["unknown"][0]
     # If too many drawn runs are missed, the result is bad, whatever the injected runs give.
-    missed = judged({**rates, "missed_alarms": rate(50, 100)}, ALLOWED, 2048)
+    missed = add_verdict({**rates, "missed_alarms": rate(50, 100)}, DEFAULT_ALLOWED_RATES, 2048)
     assert missed["verdict"] == "bad"
 
 
 def test_number_of_scenarios_follows_from_the_allowed_rate():
-    assert scenarios_needed(0.02) == 2 * 183
-    assert scenarios_needed(0.5) == 64 == scenarios_needed(1.0) and scenarios_needed(
+    assert count_fault_scenarios(0.02) == 2 * 183
+    assert count_fault_scenarios(0.5) == 64 == count_fault_scenarios(1.0) and count_fault_scenarios(
         1e-6
-    ) == MOST == scenarios_needed(0.0)
+    ) == MAX_FAULT_SCENARIOS == count_fault_scenarios(0.0)
 
 
 def test_good_sweep_has_a_positive_margin():

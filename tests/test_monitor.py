@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import jaxhil as package
-from jaxhil.mechanism.file import from_builtins, to_builtins
+from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from tuning.identification.mechanism_file import to_toml
-from tuning.identification.monitor.figures import BIAS, NAMES, NOISE
-from tuning.identification.monitor.monitor import monitor
-from tuning.identification.monitor.uncertain import uncertain
+from tuning.identification.monitor.metrics import BIAS_INDEX, METRIC_NAMES, NOISE_INDEX
+from tuning.identification.monitor.monitor import monitor_contacts
+from tuning.identification.monitor.uncertain_parameters import list_uncertain_parameters
 
 SPEEDS = (0.006, 0.012) * 3
 STATED = {
@@ -28,7 +28,7 @@ def file_of(kind, stated=None):
     bodies = {"equivalent_mass": kind.mass}
     document = {"schema": "jaxhil/mechanism/1", "name": "known", "bodies": bodies, "rig": kind.rig}
     document |= {"approach": {"velocity": 0.006}, "contact": kind.contact}
-    return from_builtins(document | {"uncertainty": STATED if stated is None else stated}, "known")
+    return from_plain_data(document | {"uncertainty": STATED if stated is None else stated}, "known")
 
 
 def quiet(kind):
@@ -67,10 +67,12 @@ def test_monitor_finds_no_deviation_without_noise(name):
     """Use a file whose laws, lags, latencies and holds are those of the independent rig."""
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
-    result = monitor(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
+    result = monitor_contacts(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
     value = np.array([contact.value for contact in result.contacts])
     is_finite = np.isfinite(value).any(axis=0)
-    assert is_finite[:4].all() and is_finite[BIAS] == (name != "dead_zone") and not is_finite[NOISE]
+    assert (
+        is_finite[:4].all() and is_finite[BIAS_INDEX] == (name != "dead_zone") and not is_finite[NOISE_INDEX]
+    )
     # The generator's lag is a quadrature over a force that begins with a jump.
     allowed = 2e4 if name == "lagging" else 1.0
     bound = allowed * np.array([1e-9, 1e-5, 5e-8, 1e-9, 1e-9, np.inf, 1e-9])
@@ -78,10 +80,10 @@ def test_monitor_finds_no_deviation_without_noise(name):
 
 
 def test_monitor_of_a_matching_rig_scatters_as_predicted():
-    result = monitor(contacts(CLEAN, seed=3), file_of(CLEAN))
+    result = monitor_contacts(contacts(CLEAN, seed=3), file_of(CLEAN))
     assert result.state == "good" and result.alarm is None and result.changes == ()
     z = np.array([contact.z for contact in result.contacts])
-    assert z.shape == (6, len(NAMES)) and 0.7 < z.std() < 1.3
+    assert z.shape == (6, len(METRIC_NAMES)) and 0.7 < z.std() < 1.3
     assert "all of 6 contacts" in result.verdict
 
 
@@ -102,7 +104,7 @@ DAILY = ("delay", "noise")
 def test_monitor_finds_and_names_a_change(what):
     other, name, value, within = CHANGES[what]
     before, after = contacts(CLEAN, seed=1, speeds=SPEEDS[:3]), contacts(other, seed=2, speeds=SPEEDS[:3])
-    result = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
+    result = monitor_contacts(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
     assert (
         result.state == "bad"
         and result.since == 3
@@ -118,7 +120,7 @@ def test_monitor_state_is_watch_if_the_file_covers_the_change():
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
     after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
-    result = monitor(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
+    result = monitor_contacts(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN, wide))
     assert result.state == "watch" and result.since == 6 and "covers it" in result.verdict
 
 
@@ -126,19 +128,19 @@ def test_monitor_correlates_numbers_as_the_file_says():
     wide = STATED | {
         "contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0], "independent": True}
     }
-    document = to_builtins(file_of(campaigns.KINDS["stiffnesses"], wide))
+    document = to_plain_data(file_of(campaigns.KINDS["stiffnesses"], wide))
     document["correlation"] = {
         "keys": ["contact.damping", "rig.force_sensor.delay"],
         "matrix": [[1.0], [0.9, 1.0]],
     }
-    numbers, correlation = uncertain(from_builtins(document, "known"))
+    numbers, correlation = list_uncertain_parameters(from_plain_data(document, "known"))
     place = {(one.path, one.entry): i for i, one in enumerate(numbers)}
     damping, delay = place["contact.damping", None], place["rig.force_sensor.delay", None]
     assert correlation[damping, delay] == pytest.approx(0.9, abs=0.01)
     assert numbers[damping].std == pytest.approx(4.0, rel=0.05)
     assert numbers[place["rig.simulator.delay", None]].std == 2e-5
     one = numbers[place["contact.stiffness", (1,)]]
-    stepped = one.stepped(from_builtins(document, "known")).contact.stiffness
+    stepped = one.step_parameter(from_plain_data(document, "known")).contact.stiffness
     # Of a loguniform number between m/f and m f: m^2 (f^2 - f^-2)/(4 log f) - mean^2.
     mean = (2.0 - 0.5) / np.log(4.0)
     expected = 2.4e5 * np.sqrt((4.0 - 0.25) / (2.0 * np.log(4.0)) - mean**2)
@@ -159,14 +161,14 @@ def written(folder, campaign):
 
 def test_monitor_command_prints_a_verdict_and_returns_its_exit_code(jaxhil, tmp_path):
     known = tmp_path / "known.toml"
-    known.write_text(to_toml(to_builtins(file_of(CLEAN))))
+    known.write_text(to_toml(to_plain_data(file_of(CLEAN))))
     logs = written(tmp_path / "same", contacts(CLEAN, seed=3, speeds=SPEEDS[:3]))
     ran = jaxhil("monitor", known, *logs, "--json")
     assert ran.code == 0 and ran.document["state"] == "good" and ran.document["since"] is None
     assert ran.document["contacts"][2]["log"] == "02.csv" and ran.document["sources"].keys() == {
         path.name for path in logs
     }
-    assert ran.document["contacts"][0]["figures"].keys() == set(NAMES)
+    assert ran.document["contacts"][0]["figures"].keys() == set(METRIC_NAMES)
     other = changed(CLEAN, force_sensor={"delay": 0.0047})
     ran = jaxhil("monitor", known, *written(tmp_path / "later", contacts(other, seed=3, speeds=SPEEDS[:3])))
     assert ran.code == 1 and "Bad: since contact 1 of 3 (00.csv): apparent damping" in ran.out
@@ -175,9 +177,9 @@ def test_monitor_command_prints_a_verdict_and_returns_its_exit_code(jaxhil, tmp_
 
 @pytest.mark.parametrize("arguments, words", (
     (["varying"], "logs: found none"),
-    (["varying", "LOG", "--map", "FREE"], "found no contact, allowed a run of kind contact or tap"),
+    (["varying", "LOG", "--map", "FREE"], "found no contact, expected a run of kind contact or tap"),
     (["nowhere.toml", "LOG"], "nowhere"),
-    (["TWO", "LOG"], "contact.clearance: found 0.02, allowed inf"),
+    (["TWO", "LOG"], "contact.clearance: found 0.02, expected inf"),
     (["FAR", "LOG"], "rig.contact_plane: found 0.05 m, which none of the contacts in the logs goes beyond"),
     (["OTHER", "LOG"], "contact.law: found 'elastoplastic', expected linear, kelvin_voigt"),
 ))  # fmt: skip
@@ -190,12 +192,12 @@ def test_monitor_refuses_unusable_input_in_one_line(jaxhil, tmp_path, arguments,
     mapping.write_text(
         f"schema = 'jaxhil/log/1'\n[channels]\n{channels}[[runs]]\nfiles = '*'\nkind = 'free'\n"
     )
-    two = to_builtins(package.load("varying", {"contact.clearance": 0.02}))
-    other = to_builtins(package.load("varying"))
+    two = to_plain_data(package.load("varying", {"contact.clearance": 0.02}))
+    other = to_plain_data(package.load("varying"))
     law = {"law": "elastoplastic", "unloading_ratio": 2.0, "damping": [0.0], "stiffness": [1e5]}
     other = other | {"contact": law, "uncertainty": {}}
     paths = {"LOG": written(tmp_path / "logs", campaign)[0], "FREE": mapping}
-    far = to_builtins(package.load("varying", {"rig.contact_plane": 0.05}))
+    far = to_plain_data(package.load("varying", {"rig.contact_plane": 0.05}))
     for name, document in (("TWO", two), ("FAR", far), ("OTHER", other)):
         paths[name] = tmp_path / f"{name}.toml"
         paths[name].write_text(to_toml(document))

@@ -10,10 +10,10 @@ import campaigns
 import numpy as np
 import pytest
 
-from jaxhil.mechanism.file import from_builtins
-from tuning.identification.estimate import Options, identify
-from tuning.identification.monitor.figures import NAMES
-from tuning.identification.monitor.monitor import monitor
+from jaxhil.mechanism.file import from_plain_data
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.identification.monitor.metrics import METRIC_NAMES
+from tuning.identification.monitor.monitor import monitor_contacts
 
 pytestmark = pytest.mark.slow
 FILES = 8
@@ -27,8 +27,8 @@ def files():
     result = []
     for seed in range(FILES):
         day = campaigns.campaign("clean", 60_000 + seed)
-        options = Options(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed)
-        result.append(from_builtins(identify(day, options=options).mechanism, "identified"))
+        options = IdentificationOptions(law="kelvin_voigt", order=2, hold_out=0.0, seed=seed)
+        result.append(from_plain_data(identify(day, options=options).mechanism, "identified"))
     return result
 
 
@@ -52,11 +52,11 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
     z, alarms, number = [], 0, 0
     for seed, mechanism in enumerate(files):
         speeds = np.random.default_rng(seed).choice(SPEEDS, 250)
-        result = monitor(contacts("clean", seed, speeds), mechanism)
+        result = monitor_contacts(contacts("clean", seed, speeds), mechanism)
         alarms, number = alarms + (result.alarm is not None), number + len(result.contacts)
         z += [contact.z for contact in result.contacts]
     print(f"{alarms} alarms in {number} contacts")
-    for name, mean, std in zip(NAMES, np.mean(z, axis=0), np.std(z, axis=0), strict=True):
+    for name, mean, std in zip(METRIC_NAMES, np.mean(z, axis=0), np.std(z, axis=0), strict=True):
         print(f"  {name:18s} mean {mean:+.3f}, std {std:.3f} of the predicted")
         assert abs(mean) < 0.2 and abs(std - 1.0) < 0.1
     assert alarms <= number / 500
@@ -68,8 +68,8 @@ def test_monitor_finds_drifts_early(files, number):
     result = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):
         speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)
-        stiffer = monitor(contacts("drifting", seed, speeds), mechanism)
-        later = monitor(delayed(seed, speeds, 0.0006), mechanism)
+        stiffer = monitor_contacts(contacts("drifting", seed, speeds), mechanism)
+        later = monitor_contacts(delayed(seed, speeds, 0.0006), mechanism)
         assert stiffer.state == later.state == "bad"
         assert "stiffness" in {change.name for change in stiffer.changes}
         assert "apparent damping" in {change.name for change in later.changes}

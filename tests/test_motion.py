@@ -7,7 +7,7 @@ import pytest
 
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from jaxhil.simulation.motion import nominal_motion
+from jaxhil.simulation.motion_curves import compute_nominal_motion
 
 MECHANISM = load("varying", ["approach.contacts=2", "contact.damping=[0.0]"]).mechanism
 GAINS = literature_gains(MECHANISM, "response_error")
@@ -21,14 +21,14 @@ LAWS = {
 
 @pytest.fixture(scope="module")
 def pieces():
-    return nominal_motion(MECHANISM, LAWS)
+    return compute_nominal_motion(MECHANISM, LAWS)
 
 
 @pytest.mark.slow
 def test_laws_side_by_side_move_as_each_alone(pieces):
     assert [list(piece.curves) for piece in pieces] == [["in space", *LAWS]] * 2
     for name in ("before", "literature", "tuned"):
-        for piece, alone in zip(pieces, nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
+        for piece, alone in zip(pieces, compute_nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
             np.testing.assert_allclose(
                 piece.curves[name].position, alone.curves[name].position, rtol=1e-9, atol=1e-12
             )

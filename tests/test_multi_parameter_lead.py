@@ -14,7 +14,7 @@ from noise_cases import check_amplification
 from jaxhil.errors import InputError
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.laws.multi_parameter_lead.simulation import pole_placement
-from jaxhil.laws.simulation_base import Constants
+from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.mechanism.file import builtin_names, load
 
 FREQUENCIES = [0.5, 6.0, 18.8, 300.0]
@@ -48,7 +48,7 @@ def test_pole_placement_without_damping_is_the_closed_form(frequency, delay):
 
 @pytest.mark.parametrize("bad", [(0.0, 0.01, 1.0), (1.0, np.inf, 1.0), (1.0, 0.01, 0.0), (1.0, 0.01, np.nan)])
 def test_pole_placement_refuses_what_has_no_pole(bad):
-    with pytest.raises(InputError, match=r"^pole_placement: \w+: found .*, allowed finite numbers > "):
+    with pytest.raises(InputError, match=r"^pole_placement: \w+: found .*, expected finite numbers > "):
         pole_placement(*bad)
 
 
@@ -114,7 +114,7 @@ def test_noise_amplification_of_multi_parameter_lead():
 
 
 def test_phase_lead_is_a_special_case_of_multi_parameter_lead():
-    constants = Constants(jnp.asarray(1e-3), jnp.asarray(jnp.inf))
+    constants = KnownConstants(jnp.asarray(1e-3), jnp.asarray(jnp.inf))
     ours = {"force_gain": 1.0, "force_rate_gain": 0.008, "lead_filter": 0.0013}
     theirs = {"phase_lead": 0.008, "lead_filter": 0.0013}
     result = COMPENSATORS["multi_parameter_lead"].prepare(jax.tree.map(jnp.asarray, ours), constants)

@@ -7,13 +7,13 @@ import pytest
 from lead_cases import lead_task, lead_tasks
 
 from tuning.gains import multistart, scan
-from tuning.gains.multistart import BATCHES, choose_starts, find_gains, finish
-from tuning.gains.objective import RMS, Objective
-from tuning.gains.rounds import Start, solve_tasks
+from tuning.gains.multistart import MAX_START_BATCHES, choose_starts, find_gains, polish_best_starts
+from tuning.gains.multistart_solver import StartResult, solve_tasks
+from tuning.gains.objective import RMS_OBJECTIVE, Objective
+from tuning.gains.search_progress import SearchProgress
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task, spread_points
 from tuning.gains.validation import build_validation
-from tuning.gains.work import Work
 
 SCANNED = TuneSettings().scanned
 FEW = 32  # points of a scan whose result is not tested
@@ -29,11 +29,11 @@ def validation(tasks):
     return build_validation(tasks, 15, 0)
 
 
-def searched(starts, steps, polish, objective=RMS):
+def searched(starts, steps, polish, objective=RMS_OBJECTIVE):
     return TuneSettings(starts=starts, steps=steps, polish=polish, objective=objective, scanned=FEW)
 
 
-def value(validation, index, start, objective=RMS):
+def value(validation, index, start, objective=RMS_OBJECTIVE):
     return validation.losses(objective, [index], start.coordinates[None, None])[0, 0]
 
 
@@ -42,7 +42,7 @@ def test_every_task_is_solved_under_its_own_objective(tasks, validation):
     """Compare the starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
     chosen = choose_starts(validation, 3, 0, several)
-    polished = finish(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
+    polished = polish_best_starts(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
     for i, (objective, end) in enumerate(zip(several, polished, strict=True)):
         np.testing.assert_array_equal(chosen[i], choose_starts(validation, 3, 0, objective)[i])
         assert end is not None
@@ -53,9 +53,9 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
     chosen = choose_starts(validation, 4, seed=3)
     for index, (task, points) in enumerate(zip(tasks, chosen, strict=True)):
         assert validation.gains(index, points[0]) == pytest.approx(task.literature)
-        values = validation.losses(RMS, [index], points[None])[0]
+        values = validation.losses(RMS_OBJECTIVE, [index], points[None])[0]
         looked_at = spread_points(points[0], SCANNED, 3)
-        every = validation.losses(RMS, [index], looked_at[None])[0]
+        every = validation.losses(RMS_OBJECTIVE, [index], looked_at[None])[0]
         # The best gains lie apart from the literature's, and so do those of all tasks from each other.
         assert np.min(every) <= values[1] <= np.quantile(every, 0.05)
         assert (values[1:] < np.median(every)).all()
@@ -67,13 +67,13 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
 @pytest.mark.parametrize("seed", range(4))
 def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
     runs = []
-    work = Work()
+    work = SearchProgress()
     monkeypatch.setattr(work, "ran", runs.append)
     task = build_task(lead_task().mechanism, "phase_lead", 32, 0)
     validation = build_validation([task], 15, 0, work)
     chosen = choose_starts(validation, 4, seed)[0]
     completed, runs[:] = sum(runs), []
-    monkeypatch.setattr(scan, "_sums_squares", lambda *_: False)
+    monkeypatch.setattr(scan, "_is_sum_of_squares", lambda *_: False)
     np.testing.assert_array_equal(chosen, choose_starts(validation, 4, seed)[0])
     assert completed < 0.8 * sum(runs)
 
@@ -83,7 +83,7 @@ def test_best_start_is_polished(tasks, validation):
     """Stop the solver far too early, so that none is at its minimum; if all fail, none is polished."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
-    polished = finish(validation, early, 128, seed=0)
+    polished = polish_best_starts(validation, early, 128, seed=0)
     for index, (own, result) in enumerate(zip(early, polished, strict=True)):
         if index == 1:
             assert result is None
@@ -94,7 +94,7 @@ def test_best_start_is_polished(tasks, validation):
         assert result.rms == pytest.approx(value(validation, index, result), rel=1e-12)
         assert result.gains == validation.gains(index, result.coordinates)
     failed = [[own[0]._replace(rms=np.nan)] for own in early]
-    assert finish(validation, failed, 64, seed=0) == [None] * 3
+    assert polish_best_starts(validation, failed, 64, seed=0) == [None] * 3
 
 
 def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
@@ -117,17 +117,17 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
         heard.append(text)
         shares.append(share)
 
-    validation_observed = build_validation(tasks, 15, 0, Work(tell))
+    validation_observed = build_validation(tasks, 15, 0, SearchProgress(tell))
     result = find_gains(validation_observed, searched(3, 9, 16))
-    assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (BATCHES - 1)
-    assert [len(one.starts) for one in result] == [3, 3 * BATCHES, 3]
-    assert len({text for text in heard if "batch" in text}) == BATCHES - 1
+    assert asked == [[3, 3, 3]] + [[0, 3, 0]] * (MAX_START_BATCHES - 1)
+    assert [len(one.starts) for one in result] == [3, 3 * MAX_START_BATCHES, 3]
+    assert len({text for text in heard if "batch" in text}) == MAX_START_BATCHES - 1
     assert all(0 <= share <= 1 for share in shares) and shares[-1] == 1
     points = np.stack([start.coordinates for start in result[1].starts])
     assert len(np.unique(points, axis=0)) == len(points)
     # Steps cost 1 + 2 evaluations; the scan runs at full cost on at most 32 scenarios; 2 gains are polished.
     assert result[0].evaluations == FEW + 3 * 3 + 32
-    assert result[1].evaluations == BATCHES * (FEW + 3 * 3) + 32
+    assert result[1].evaluations == MAX_START_BATCHES * (FEW + 3 * 3) + 32
 
 
 def test_single_start_is_the_literature_and_is_polished(tasks, validation):
@@ -143,7 +143,7 @@ def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
     """Expect it once, before the first round."""
     done = []
     monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
-    monkeypatch.setattr(multistart, "prepare_solver", lambda *_: None)
+    monkeypatch.setattr(multistart, "compile_solver", lambda *_: None)
     monkeypatch.setattr(multistart, "program_folder", lambda: "somewhere")
     find_gains(validation, searched(1, 2, 0), meanwhile=lambda: done.append("other"))
     assert done == ["other", "round"]
@@ -185,13 +185,16 @@ class Kinked:
 def test_stuck_start_is_searched_further_and_the_others_are_left():
     corner, best = np.array([0.3, 0.3]), np.array([0.8, 0.8])
     starts = [
-        Start("converged", 3, 1.0, [1.0], {"x": 0.8, "y": 0.8}, best),
-        Start("converged", 3, 1.25, [1.25], {"x": 0.3, "y": 0.3}, corner),
-        Start("failed", 3, np.nan, [], {}, corner),
+        StartResult("converged", 3, 1.0, [1.0], {"x": 0.8, "y": 0.8}, best),
+        StartResult("converged", 3, 1.25, [1.25], {"x": 0.3, "y": 0.3}, corner),
+        StartResult("failed", 3, np.nan, [], {}, corner),
     ]
-    freed, evaluations = multistart._freed(Kinked(), 0, starts, 0.02, 0, RMS)  # pyright: ignore[reportArgumentType]
+    freed, evaluations = multistart._restart_stuck_starts(Kinked(), 0, starts, 0.02, 0, RMS_OBJECTIVE)  # pyright: ignore[reportArgumentType]
     assert freed[0] is starts[0] and freed[2] is starts[2]
     assert freed[1].rms < 1.02 and freed[1].history == [1.25, freed[1].rms]
     assert freed[1].gains == {"x": freed[1].coordinates[0], "y": freed[1].coordinates[1]}
-    assert evaluations == multistart.CANDIDATES * multistart.FREEING
-    assert multistart._freed(Kinked(), 0, starts[:1], 0.02, 0, RMS) == (starts[:1], 0)  # pyright: ignore[reportArgumentType]
+    assert evaluations == multistart.CANDIDATES_PER_GENERATION * multistart.RESTART_GENERATIONS
+    assert multistart._restart_stuck_starts(Kinked(), 0, starts[:1], 0.02, 0, RMS_OBJECTIVE) == (
+        starts[:1],
+        0,
+    )  # pyright: ignore[reportArgumentType]

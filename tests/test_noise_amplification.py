@@ -11,8 +11,8 @@ from noise_cases import amplification
 from scipy.signal import bilinear, lfilter
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Constants
-from jaxhil.simulation.building import build_loop
+from jaxhil.laws.simulation_base import KnownConstants
+from jaxhil.simulation.loop_construction import build_loop
 
 NAMES = ("phase_lead", "lead_filter")
 GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
@@ -22,7 +22,7 @@ TICKS, LANES, DEVIATION = 3000, 16, 2.0
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _amplified(compensator, gains, period):
     def value(gains):
-        return COMPENSATORS[compensator].noise_amplification(gains, Constants(period, jnp.inf))
+        return COMPENSATORS[compensator].noise_amplification(gains, KnownConstants(period, jnp.inf))
 
     return value(gains), jax.jacfwd(value)(gains) if gains else {}
 

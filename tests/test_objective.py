@@ -13,25 +13,25 @@ from noise_cases import amplification
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.gains.objective import (
-    FAILED,
-    OBJECTIVES,
-    POWERS,
-    SCALE,
-    TOLERATED,
+    FAILED_CONTACT_ERROR,
+    NORM_POWERS,
+    OBJECTIVE_NAMES,
+    RESIDUAL_SCALE,
+    TOLERATED_ERROR_FACTOR,
     Objective,
-    Problem,
-    Terms,
-    Weights,
-    common_terms,
-    contact_terms,
-    objective_value,
-    residuals,
-    weigh,
+    ObjectiveTerms,
+    ObjectiveWeights,
+    SolverProblem,
+    compute_contact_terms,
+    compute_residuals,
+    evaluate_objective,
+    join_terms,
+    weight_residuals,
 )
 
 NAMES = ("phase_lead", "lead_filter")
@@ -68,7 +68,7 @@ def with_jacobian(static, gains, problems):
     """Return residuals (problems, residuals) and derivatives by all gains (gain's problem, gain, ...)."""
 
     def along(direction):
-        return jax.jvp(lambda gains: residuals(static, gains, problems), (gains,), (direction,))
+        return jax.jvp(lambda gains: compute_residuals(static, gains, problems), (gains,), (direction,))
 
     basis = jnp.eye(gains.size).reshape(-1, *gains.shape)
     value, jacobian = jax.vmap(along, out_axes=(None, 0))(basis)
@@ -78,14 +78,14 @@ def with_jacobian(static, gains, problems):
 def run(batch, gains=GAINS, objective=STATED):
     loop, _, rigs = batch
     objectives = [objective] * len(GAINS) if isinstance(objective, Objective) else objective
-    problems = Problem(rigs, {}, stacked(objectives))
-    static = ONE_AXIS, loop, NAMES, common_terms(objectives)
+    problems = SolverProblem(rigs, {}, stacked(objectives))
+    static = ONE_AXIS, loop, NAMES, join_terms(objectives)
     return [np.asarray(a) for a in with_jacobian(static, jnp.asarray(gains), problems)]
 
 
 def stacked(objectives):
     """Stack the weights of problems."""
-    return Weights(
+    return ObjectiveWeights(
         *(jnp.asarray(column) for column in zip(*(one.weights for one in objectives), strict=True))
     )
 
@@ -120,18 +120,20 @@ def test_residuals_are_those_of_an_evaluation(outcomes, known):
                 [0.004 * (amplification(gains) - 1)],
             ]
         )
-        np.testing.assert_allclose(SCALE * row, expected, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(RESIDUAL_SCALE * row, expected, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", OBJECTIVE_NAMES)
 def test_sum_of_squares_is_the_objective_or_just_above(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
-        terms = contact_terms(outcome)
-        jax.tree.map(np.testing.assert_array_equal, terms, contact_terms(jax.tree.map(jnp.asarray, outcome)))
+        terms = compute_contact_terms(outcome)
+        jax.tree.map(
+            np.testing.assert_array_equal, terms, compute_contact_terms(jax.tree.map(jnp.asarray, outcome))
+        )
         error, excess, swings = (np.asarray(term)[outcome.wanted] for term in terms)
         noise = amplification(gains)
-        value = objective_value(objective, error, excess, noise, swings)
+        value = evaluate_objective(objective, error, excess, noise, swings)
         ours = np.sqrt(sum_of_squares(objective, error, excess, noise, swings))
         if name == "rms":
             np.testing.assert_allclose(ours, value, rtol=1e-12)
@@ -151,8 +153,8 @@ def test_objective_part_of_weight_0_is_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
-    whole, _ = weighed(Terms("rms", True, True, True), stacked([Objective()]), terms, none)
-    plain, _ = weighed(Terms("rms", False, False, False), stacked([Objective()]), terms, none)
+    whole, _ = weighed(ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none)
+    plain, _ = weighed(ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none)
     assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
@@ -163,8 +165,8 @@ def test_objective_weights_are_multiples_of_the_limit():
     for limit in (0.003, 0.01, 0.2):
         for name, value in (("command", excesses), ("chatter", swings), ("noise", np.array([2.5]))):
             objective = Objective(**{f"{name}_weight": 0.4}, limit=limit)
-            whole = objective_value(objective, errors, excesses, 3.5, swings)
-            share = np.sqrt(whole**2 - objective_value(Objective(), errors) ** 2)
+            whole = evaluate_objective(objective, errors, excesses, 3.5, swings)
+            share = np.sqrt(whole**2 - evaluate_objective(Objective(), errors) ** 2)
             assert share == pytest.approx(0.4 * limit * np.sqrt(np.mean(value**2)), rel=1e-9)
             assert (
                 float(getattr(objective.weights, name))
@@ -180,22 +182,22 @@ def test_objective_weights_are_multiples_of_the_limit():
 def test_errors_within_the_tolerance_hardly_count(tolerance):
     errors, excesses = np.random.default_rng(3).normal(scale=0.01, size=45), np.full(45, 0.4)
     objective = Objective("rms", 2.0, 0.2, 0.1, tolerance=tolerance)
-    size = objective_value(Objective("rms", 2.0), errors)
-    counted = size if tolerance == 0 else max(size - tolerance, TOLERATED * size)
+    size = evaluate_objective(Objective("rms", 2.0), errors)
+    counted = size if tolerance == 0 else max(size - tolerance, TOLERATED_ERROR_FACTOR * size)
     expected = np.sqrt(counted**2 + (0.01 * 0.2 * 0.4) ** 2 + (0.01 * 0.1 * 2.0) ** 2)
-    assert objective_value(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
+    assert evaluate_objective(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
     assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
     # Along the errors themselves the derivative is the size, which grows in proportion.
     _, slopes = alone(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
     values, _ = alone(objective, errors, excesses, 3.0)
-    grown = counted if counted <= TOLERATED * size or tolerance == 0 else size
-    assert SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
+    grown = counted if counted <= TOLERATED_ERROR_FACTOR * size or tolerance == 0 else size
+    assert RESIDUAL_SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
 
 
 def test_tolerance_of_0_gives_the_same_objective_in_a_shared_program():
-    terms = common_terms([Objective(tolerance=0.0)])
-    assert terms == common_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
-    assert terms == Terms("rms", True, True, False, tolerance=True)
+    terms = join_terms([Objective(tolerance=0.0)])
+    assert terms == join_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
+    assert terms == ObjectiveTerms("rms", True, True, False, tolerance=True)
     errors = np.random.default_rng(4).normal(size=45)
     values, _ = alone(Objective(tolerance=0.0), errors, np.ones(45), 7.0)
     plain, _ = alone(Objective(), errors)
@@ -204,14 +206,16 @@ def test_tolerance_of_0_gives_the_same_objective_in_a_shared_program():
 
 
 def test_common_terms_are_those_that_any_objective_has():
-    assert common_terms([Objective(), Objective(noise_weight=0.1)]) == Terms("rms", False, True, False, False)
-    assert common_terms([Objective("cvar", 2.0, 0.1)]) == Terms("cvar", True, False, False, False)
-    assert common_terms([Objective(chatter_weight=0.1), Objective()]) == Terms(
+    assert join_terms([Objective(), Objective(noise_weight=0.1)]) == ObjectiveTerms(
+        "rms", False, True, False, False
+    )
+    assert join_terms([Objective("cvar", 2.0, 0.1)]) == ObjectiveTerms("cvar", True, False, False, False)
+    assert join_terms([Objective(chatter_weight=0.1), Objective()]) == ObjectiveTerms(
         "rms", False, False, True, False
     )
-    assert common_terms([Objective()], probed=True) == Terms("rms", False, False, False, True)
+    assert join_terms([Objective()], probed=True) == ObjectiveTerms("rms", False, False, False, True)
     with pytest.raises(ValueError):
-        common_terms([Objective("rms"), Objective("cvar")])
+        join_terms([Objective("rms"), Objective("cvar")])
 
 
 def against_differences(batch, jacobian):
@@ -262,7 +266,7 @@ def test_failed_contacts_count_and_have_no_derivative(batch, known):
     slots = np.reshape(value[:, :-1], (len(GAINS), 3, -1, SCENARIOS))
     slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 3, -1, SCENARIOS))
     contacts = SCENARIOS * 3
-    failed = FAILED / (SCALE * np.sqrt(contacts)) * np.array([np.sqrt(2.0), 0.3, 0.05])
+    failed = FAILED_CONTACT_ERROR / (RESIDUAL_SCALE * np.sqrt(contacts)) * np.array([np.sqrt(2.0), 0.3, 0.05])
     np.testing.assert_allclose(
         slots[:, :, :3, SHORT], np.broadcast_to(failed[None, :, None], (len(GAINS), 3, 3)), rtol=1e-14
     )
@@ -277,7 +281,7 @@ def weighed(static, weights, terms, tangents):
 
     def value(error, excess, chatter, noise):
         several = (term[None] for term in (error, excess, chatter, wanted, noise))
-        return weigh(static, weights, *several)[0]
+        return weight_residuals(static, weights, *several)[0]
 
     return jax.jvp(value, (*contacts, noise), tangents)
 
@@ -291,12 +295,12 @@ def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (
     wanted = np.arange(SLOTS) < len(errors)
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
-    static = common_terms([objective])
+    static = join_terms([objective])
     return tuple(map(np.asarray, weighed(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):
-    return SCALE**2 * np.sum(alone(*arguments)[0] ** 2)
+    return RESIDUAL_SCALE**2 * np.sum(alone(*arguments)[0] ** 2)
 
 
 @pytest.mark.parametrize("number, tail", [(1, 1), (19, 1), (20, 1), (21, 2), (40, 2), (41, 3), (140, 7)])
@@ -304,46 +308,50 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
     errors = np.random.default_rng(number).permutation(np.arange(1, number + 1)) / number
     errors[::2] *= -1
     expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
-    assert objective_value(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
+    assert evaluate_objective(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
     # The solver sees an upper bound: the root of the mean of powers.
-    bound = (np.sum(np.abs(errors) ** POWERS["cvar"]) / tail) ** (1 / POWERS["cvar"])
+    bound = (np.sum(np.abs(errors) ** NORM_POWERS["cvar"]) / tail) ** (1 / NORM_POWERS["cvar"])
     np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), bound**2, rtol=1e-13)
     assert expected <= bound
 
 
 def test_known_errors_have_known_metrics():
     errors = np.array([0.03, -0.04, *[0.0] * 18])
-    assert objective_value(Objective("rms"), errors) == pytest.approx(0.05 / np.sqrt(20), rel=1e-14)
-    assert objective_value(Objective("cvar"), errors) == objective_value(Objective("worst"), errors) == 0.04
+    assert evaluate_objective(Objective("rms"), errors) == pytest.approx(0.05 / np.sqrt(20), rel=1e-14)
+    assert (
+        evaluate_objective(Objective("cvar"), errors)
+        == evaluate_objective(Objective("worst"), errors)
+        == 0.04
+    )
     # Twice the weight on divergence makes it the worst.
     for name in ("cvar", "worst"):
-        assert objective_value(Objective(name, 2.0), errors) == pytest.approx(np.sqrt(2) * 0.03, rel=1e-14)
-    assert objective_value(Objective("worst"), np.array([0.1, np.nan])) == FAILED
+        assert evaluate_objective(Objective(name, 2.0), errors) == pytest.approx(np.sqrt(2) * 0.03, rel=1e-14)
+    assert evaluate_objective(Objective("worst"), np.array([0.1, np.nan])) == FAILED_CONTACT_ERROR
     stated = Objective("worst", 1.0, 0.1, 0.01, limit=1.0)
     excesses = np.array([0.1, 0.3])
     whole = np.sqrt(0.04**2 + 0.01 * (0.01 + 0.09) / 2 + 0.01**2 * 9)
-    assert objective_value(stated, errors, excesses, 4.0) == pytest.approx(whole, rel=1e-14)
-    swings = objective_value(
+    assert evaluate_objective(stated, errors, excesses, 4.0) == pytest.approx(whole, rel=1e-14)
+    swings = evaluate_objective(
         replace(stated, chatter_weight=0.02), errors, excesses, 4.0, np.array([3.0, 1.0])
     )
     assert swings == pytest.approx(np.sqrt(whole**2 + 0.02**2 * 5), rel=1e-14)
     # A command quieter than the measured force gains nothing.
-    assert objective_value(stated, errors, None, 0.5) == 0.04
+    assert evaluate_objective(stated, errors, None, 0.5) == 0.04
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
 
 
 def test_high_norm_approximates_the_worst_error():
     errors = np.random.default_rng(0).normal(size=96)
-    norm = np.sum(np.abs(errors) ** POWERS["worst"]) ** (1 / POWERS["worst"])
+    norm = np.sum(np.abs(errors) ** NORM_POWERS["worst"]) ** (1 / NORM_POWERS["worst"])
     assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
     np.testing.assert_allclose(sum_of_squares(Objective("worst"), errors), norm**2, rtol=1e-13)
     # Neither very large errors nor tiny ones overflow or underflow.
     for size in (1e100, 1e-100):
-        value = SCALE * alone(Objective("worst"), size * errors)[0]
+        value = RESIDUAL_SCALE * alone(Objective("worst"), size * errors)[0]
         np.testing.assert_allclose(np.sqrt(np.sum((value / size) ** 2)), norm, rtol=1e-13)
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", OBJECTIVE_NAMES)
 def test_objective_derivatives_by_the_errors(name):
     objective, generator = Objective(name, 3.0, 0.2, 0.01, 0.03), np.random.default_rng(1)
     errors, excesses = generator.normal(size=45), np.maximum(0, generator.normal(size=45))
@@ -360,7 +368,7 @@ def test_objective_derivatives_by_the_errors(name):
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", OBJECTIVE_NAMES)
 def test_objective_without_any_error_has_a_finite_derivative(name):
     objective = Objective(name, 3.0, 0.2, 0.01, 0.03)
     for largest in (0.0, 0.1):
@@ -374,11 +382,11 @@ def test_objective_without_any_error_has_a_finite_derivative(name):
 @pytest.mark.parametrize(
     "values, message",
     [
-        ({"name": "mean"}, "objective: found 'mean', allowed rms, cvar, worst"),
-        ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, allowed finite numbers > 0"),
-        ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, allowed finite numbers >= 0"),
-        ({"chatter_weight": -0.1}, "objective: chatter_weight: found -0.1, allowed finite numbers >= 0"),
-        ({"command_weight": np.inf}, "objective: command_weight: found inf, allowed finite numbers >= 0"),
+        ({"name": "mean"}, "objective: found 'mean', expected rms, cvar, worst"),
+        ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, expected finite numbers > 0"),
+        ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, expected finite numbers >= 0"),
+        ({"chatter_weight": -0.1}, "objective: chatter_weight: found -0.1, expected finite numbers >= 0"),
+        ({"command_weight": np.inf}, "objective: command_weight: found inf, expected finite numbers >= 0"),
     ],
 )
 def test_unknown_objective_is_refused(values, message):

@@ -10,11 +10,11 @@ import tyro
 
 import tuning
 from jaxhil.errors import InputError
+from tuning.api.options import AllowedValues, add_options, check_options, number_option
+from tuning.api.tune_options import TuneOptions
 from tuning.cli.options import Compare, Sweep, Tune
 from tuning.cli.options_report import Map
 from tuning.cli.options_rig import Export, Verify
-from tuning.front_door.options import Allowed, check_options, number, takes
-from tuning.front_door.tune_options import TuneOptions
 
 COMMANDS = {
     tuning.tune: Tune,
@@ -30,10 +30,10 @@ COMMANDS = {
 class ToyOptions(TuneOptions):
     """Options with one additional option, which is stated here and nowhere else."""
 
-    toys: Annotated[int, number("Toys to play with."), Allowed(1, 3)] = 2
+    toys: Annotated[int, number_option("Toys to play with."), AllowedValues(1, 3)] = 2
 
 
-@takes(ToyOptions)
+@add_options(ToyOptions)
 def play(mechanism: Any, **options: Any) -> ToyOptions:
     """Play.
 
@@ -50,11 +50,11 @@ def test_toy_option_is_stated_once():
     assert tyro.cli(ToyOptions, args=["--toys", "3"]).toys == play("varying", toys=3).toys == 3
     assert inspect.signature(play).parameters["toys"].default == 2 == play("varying").toys
     assert "        toys: Toys to play with.\n" in str(play.__doc__)
-    with pytest.raises(InputError, match=r"^toys: found 4, allowed at most 3$"):
+    with pytest.raises(InputError, match=r"^toys: found 4, expected at most 3$"):
         play("varying", toys=4)
-    with pytest.raises(InputError, match=r"^toys: found 0, allowed an integer >= 1$"):
+    with pytest.raises(InputError, match=r"^toys: found 0, expected an integer >= 1$"):
         play("varying", toys=0)
-    with pytest.raises(InputError, match=r"^toys: found 1\.5, allowed an integer >= 1$"):
+    with pytest.raises(InputError, match=r"^toys: found 1\.5, expected an integer >= 1$"):
         play("varying", toys=1.5)
 
 

@@ -68,7 +68,7 @@ def test_sweep_does_not_use_a_folder_of_the_user(jaxhil, thesis, untouched, tmp_
     write_gain_file(tmp_path / "gains.json", case())
     for more in ((), ("--resume",)):
         ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)
-        refused(ran, "thesis: found '.thesis.docx.1.tmp' and no sweep, allowed an empty folder, or a sweep")
+        refused(ran, "thesis: found '.thesis.docx.1.tmp' and no sweep, expected an empty folder, or a sweep")
 
 
 TUNE = (
@@ -181,7 +181,7 @@ def test_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
         path.symlink_to("/dev/full")
     before = os.lstat(path).st_ino, os.stat("/dev/full").st_ino
     ran = jaxhil("simulate", "rig-300kg", "--plot", path)
-    refused(ran, f"plot.png: cannot be written: found a {kind}, allowed a plain file")
+    refused(ran, f"plot.png: cannot be written: found a {kind}, expected a plain file")
     assert (os.lstat(path).st_ino, os.stat("/dev/full").st_ino) == before
 
 

@@ -13,18 +13,23 @@ from scipy.signal import bilinear, lfilter
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 from tuning.caches import program_cache
 from tuning.gains import pareto_search
-from tuning.gains.objective import Objective, objective_value
-from tuning.gains.pareto import dominated, fronts
-from tuning.gains.pareto_search import ENDS, amplification, has_trade_off, ladder
+from tuning.gains.objective import Objective, evaluate_objective
+from tuning.gains.pareto import compute_fronts, find_dominated
+from tuning.gains.pareto_search import (
+    LADDER_ENDS,
+    build_weight_ladder,
+    compute_noise_amplification,
+    has_noise_trade_off,
+)
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
 from tuning.gains.tune_all import tune_all
-from tuning.gains.validation import VALIDATION_SEED, build_validation
+from tuning.gains.validation import VALIDATION_SEED_OFFSET, build_validation
 
 POINTS = 5
 SETTINGS = TuneSettings(
@@ -51,9 +56,9 @@ def results():
 @pytest.fixture(scope="module")
 def made(results):
     """Return fronts, and the number of programs needed to solve them."""
-    program_cache._program.cache_clear()
-    every = dict(fronts(results, POINTS))
-    count = program_cache._program.cache_info().misses
+    program_cache._load_or_build_program.cache_clear()
+    every = dict(compute_fronts(results, POINTS))
+    count = program_cache._load_or_build_program.cache_info().misses
     return [every[index] for index in range(len(MECHANISMS))], count
 
 
@@ -67,23 +72,23 @@ def errors_of(loop, scenarios, gains):
 
 
 def test_pareto_weights_are_in_units_of_the_objective():
-    light, heavy = ENDS
-    weights = ladder(8, error=0.012, excess=3.0)
+    light, heavy = LADDER_ENDS
+    weights = build_weight_ladder(8, error=0.012, excess=3.0)
     assert weights[0] == 0
     assert 3.0 * weights[1] == pytest.approx(light * 0.012)
     assert 3.0 * weights[-1] == pytest.approx(heavy * 0.012)
     np.testing.assert_allclose(np.diff(np.log(weights[1:])), math.log(heavy / light) / 6, rtol=1e-12)
-    assert ladder(2, 0.012, 3.0) == pytest.approx([0, heavy * 0.004])
+    assert build_weight_ladder(2, 0.012, 3.0) == pytest.approx([0, heavy * 0.004])
     # With next to no noise to begin with, there are still weights, and finite ones.
-    assert np.isfinite(ladder(8, 0.012, 0.0)).all()
+    assert np.isfinite(build_weight_ladder(8, 0.012, 0.0)).all()
 
 
 def test_pareto_point_is_dominated_if_another_is_better_and_none_worse():
     places = [(0.01, 3.0), (0.02, 2.0), (0.02, 2.5), (0.03, 1.0), (0.03, 1.0), (0.04, 1.0)]
-    assert dominated(places) == [False, False, True, False, False, True]
+    assert find_dominated(places) == [False, False, True, False, False, True]
     generator = np.random.default_rng(0)
     places = [tuple(place) for place in generator.integers(0, 6, (60, 2)).astype(float)]
-    beaten = dominated(places)
+    beaten = find_dominated(places)
     for place, lost in zip(places, beaten, strict=True):
         others = [other for other, beat in zip(places, beaten, strict=True) if not beat]
         better = [o for o in others if o != place and o[0] <= place[0] and o[1] <= place[1]]
@@ -98,7 +103,7 @@ def test_noise_amplification_is_that_of_the_lead_filter(compensator):
     impulse[0] = 1
     response = lfilter(*bilinear([0.0077, 1], [0.0017, 1], 1 / 0.002), impulse)
     expected = np.sqrt(np.sum(response**2))
-    assert amplification(mechanism, compensator, gains) == pytest.approx(expected, rel=1e-10)
+    assert compute_noise_amplification(mechanism, compensator, gains) == pytest.approx(expected, rel=1e-10)
 
 
 # These pass the measured force on as it is.
@@ -106,8 +111,8 @@ NO_TRADE_OFF = ["none", "position_lead", "virtual_contact", "passivity", "impuls
 
 
 def test_only_amplifying_laws_have_a_trade_off():
-    assert {name for name in COMPENSATORS if not has_trade_off(name)} == set(NO_TRADE_OFF)
-    assert amplification(load().mechanism, "none", {}) == 1
+    assert {name for name in COMPENSATORS if not has_noise_trade_off(name)} == set(NO_TRADE_OFF)
+    assert compute_noise_amplification(load().mechanism, "none", {}) == 1
 
 
 # Fronts
@@ -116,7 +121,7 @@ def test_only_amplifying_laws_have_a_trade_off():
 @pytest.mark.slow
 def test_metrics_of_every_pareto_point_are_those_of_an_evaluation(results, made):
     for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
-        seed = SETTINGS.seed + VALIDATION_SEED
+        seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
         scenarios = build_scenarios(mechanism, draw(mechanism, SETTINGS.validation, seed), seed)
         loop = build_loop(mechanism, "phase_lead", scenarios)
         for point in (*front.points, front.literature, front.tuned):
@@ -125,12 +130,12 @@ def test_metrics_of_every_pareto_point_are_those_of_an_evaluation(results, made)
             assert point.figures.rms == pytest.approx(rms, rel=1e-9)
             low, high = point.intervals.rms
             assert low < rms < high
-            assert point.cost == amplification(mechanism, "phase_lead", point.gains)
+            assert point.cost == compute_noise_amplification(mechanism, "phase_lead", point.gains)
         assert front.literature.gains == result.literature and front.tuned.gains == result.gains
         assert front.literature.figures == result.figures["literature"]
         assert front.tuned.figures == result.figures["tuned"]
         assert [point.on_front for point in front.points] == [
-            not lost for lost in dominated([point.place for point in front.points])
+            not lost for lost in find_dominated([point.place for point in front.points])
         ]
 
 
@@ -148,11 +153,11 @@ def test_no_pareto_point_is_better_under_another_points_weight(results, made):
         for own, point in zip(errors[:POINTS], front.points, strict=True):
             objective = Objective(noise_weight=point.weight)
             values = [
-                objective_value(objective, error, None, other.cost)
+                evaluate_objective(objective, error, None, other.cost)
                 for error, other in zip(errors, every, strict=True)
             ]
             # As exact as a start's own record: its last step is not in its history.
-            assert objective_value(objective, own, None, point.cost) <= min(values) * (1 + 2e-4)
+            assert evaluate_objective(objective, own, None, point.cost) <= min(values) * (1 + 2e-4)
         weights = [point.weight for point in front.points]
         assert weights[0] == 0 and weights == sorted(weights) and len(weights) == POINTS
         noise = [point.cost for point in front.points]
@@ -167,8 +172,8 @@ def test_weights_of_all_mechanisms_share_one_program(made):
 
 
 def test_pareto_points_start_at_the_results_of_their_neighbours():
-    result = [pareto_search._Candidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
-    assert [[gains["gain"] for gains in own] for own in pareto_search._neighbourhoods(result)] == [
+    result = [pareto_search._LadderCandidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
+    assert [[gains["gain"] for gains in own] for own in pareto_search._collect_neighbour_gains(result)] == [
         [1, 2],
         [2, 1],
         [2, 4],
@@ -178,14 +183,14 @@ def test_pareto_points_start_at_the_results_of_their_neighbours():
 
 def test_result_of_a_start_is_distinguished_from_its_noise():
     task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
-    excess = amplification(task.mechanism, "phase_lead", task.literature) - 1
-    start = pareto_search.Start("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
+    excess = compute_noise_amplification(task.mechanism, "phase_lead", task.literature) - 1
+    start = pareto_search.StartResult("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
     broken = start._replace(rms=math.nan)
-    (one,) = pareto_search._reached_noise(task, 0.003, [broken, start])
+    (one,) = pareto_search._collect_noise_candidates(task, 0.003, [broken, start])
     assert one.excess == pytest.approx(excess) and one.error == pytest.approx(0.02, rel=1e-12)
     assert one.value(0.003) == pytest.approx(start.rms, rel=1e-12)
     # If no result is usable, the literature's gains remain.
-    assert pareto_search._reached_noise(task, 0.003, [broken])[0].gains == task.literature
+    assert pareto_search._collect_noise_candidates(task, 0.003, [broken])[0].gains == task.literature
 
 
 @pytest.mark.slow
@@ -194,7 +199,7 @@ def test_settings_other_than_the_weight_stay(results, monkeypatch):
 
     def solve(tasks, starts, steps, objectives, work):
         seen.append(objectives)
-        return [[pareto_search.Start("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
+        return [[pareto_search.StartResult("made up", 1, 0.1, [0.1], task.literature)] for task in tasks]
 
     monkeypatch.setattr(pareto_search, "solve_tasks", solve)
     objective = Objective("cvar", 3.0, 0.1, 0.5, 0.2)
@@ -202,7 +207,7 @@ def test_settings_other_than_the_weight_stay(results, monkeypatch):
     validation = build_validation(
         [build_task(MECHANISMS[0], "phase_lead", 8, 0)], settings.validation, settings.seed
     )
-    pareto_search.solve_ladders(validation, results[:1], 3, settings)
+    pareto_search.solve_weight_ladders(validation, results[:1], 3, settings)
     for objectives in seen:
         assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
     assert len(seen) == 2  # the second found nothing better

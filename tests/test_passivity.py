@@ -23,7 +23,7 @@ from lanes import (
 
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 
 LAW = COMPENSATORS["passivity"]
 EPSILON = 2.0**-52

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tuning.caches import pieces
-from tuning.caches.pieces import Pieces, decode, encode
+from tuning.caches import checkpoints
+from tuning.caches.checkpoints import Checkpoints, decode_value, encode_value
 
 
 class Point(NamedTuple):
@@ -23,32 +23,32 @@ POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.
 
 
 def test_checkpoint_returns_every_bit():
-    result = decode(encode(NUMBERS), list[float])
+    result = decode_value(encode_value(NUMBERS), list[float])
     assert [struct.pack("d", one) for one in result] == [struct.pack("d", one) for one in NUMBERS]
-    point = decode(encode(POINT), Point)
+    point = decode_value(encode_value(POINT), Point)
     assert type(point) is Point and point.curvature.tobytes() == POINT.curvature.tobytes()
     # A table shows its rows in the order in which they were found.
     assert list(point.gains) == ["z", "a"] and point.weight is None
     for array in (np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), np.empty((0, 2))):
-        again = decode(encode(array), np.ndarray)
+        again = decode_value(encode_value(array), np.ndarray)
         assert again.dtype == array.dtype and again.shape == array.shape and (again == array).all()
-    assert decode(encode(np.float64(0.1)), float) == 0.1
+    assert decode_value(encode_value(np.float64(0.1)), float) == 0.1
 
 
 @pytest.mark.parametrize("thing", [print, object(), np.array([print]), {"a": lambda: 1}])
 def test_checkpoint_of_what_is_no_data_is_not_saved(thing):
     with pytest.raises(TypeError):
-        encode(thing)
+        encode_value(thing)
 
 
 def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch):
     inputs = {"seed": 1, "limit": math.inf, "gains": POINT}
-    Pieces(tmp_path).write("one", inputs, POINT)
-    reader = Pieces(tmp_path, resume=True)
+    Checkpoints(tmp_path).write("one", inputs, POINT)
+    reader = Checkpoints(tmp_path, resume=True)
     assert reader.read("one", dict(reversed(inputs.items())), Point).name == "a"
     assert reader.read("other", inputs, Point) is None and reader.other == []
-    assert Pieces(tmp_path).read("one", inputs, Point) is None
-    assert Pieces().read("one", inputs, Point) is None
+    assert Checkpoints(tmp_path).read("one", inputs, Point) is None
+    assert Checkpoints().read("one", inputs, Point) is None
     for changed in ({**inputs, "seed": 2}, {**inputs, "limit": 1.0}, {**inputs, "gains": POINT[:3]}):
         assert reader.read("one", changed, Point) is None
     assert reader.other == ["one"] * 3
@@ -56,13 +56,13 @@ def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch)
     assert reader.read("one", inputs, int) is None
     for name in ("sources_sha256", "versions", "xla_flags"):
         with monkeypatch.context() as patched:
-            patched.setattr(pieces, name, lambda: "others")
+            patched.setattr(checkpoints, name, lambda: "others")
             assert reader.read("one", inputs, Point) is None
     assert reader.read("one", inputs, Point) is not None
 
 
 def test_checkpoint_with_a_flipped_bit_is_not_used(tmp_path):
-    Pieces(tmp_path).write("one", 1, POINT)
+    Checkpoints(tmp_path).write("one", 1, POINT)
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
     places = np.random.default_rng(0).integers(0, 8 * len(content), 1000)
@@ -70,17 +70,17 @@ def test_checkpoint_with_a_flipped_bit_is_not_used(tmp_path):
         flipped = bytearray(content)
         flipped[folder // 8] ^= 1 << folder % 8
         path.write_bytes(flipped)
-        assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
+        assert Checkpoints(tmp_path, resume=True).read("one", 1, Point) is None
     for length in (0, 1, 64, 65, 66, len(content) - 1):
         path.write_bytes(content[:length])
-        assert Pieces(tmp_path, resume=True).read("one", 1, Point) is None
+        assert Checkpoints(tmp_path, resume=True).read("one", 1, Point) is None
 
 
 def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
     made = []
 
     def run(stop, resume=True):
-        journal = Pieces(tmp_path, resume).journal("work", "inputs")
+        journal = Checkpoints(tmp_path, resume).journal("work", "inputs")
         for number in range(4):
             if number == stop:
                 return None
@@ -104,7 +104,7 @@ def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
 def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
     (tmp_path / "taken").touch()
     for folder in (tmp_path / "taken", tmp_path / "link"):
-        checkpoints = Pieces(folder)
+        checkpoints = Checkpoints(folder)
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
         if folder.name == "link":
             folder.symlink_to(tmp_path / "elsewhere")
@@ -117,10 +117,10 @@ def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
 
 
 def test_checkpoint_names_that_look_alike_are_distinguished(tmp_path):
-    written = Pieces(tmp_path)
+    written = Checkpoints(tmp_path)
     names = ["a b", "a-b", "../a", "A" * 300, "A" * 301, "ä", "ö"]
     for number, name in enumerate(names):
         written.write(name, 0, number)
     assert written.unwritten == [] and len(list(tmp_path.iterdir())) == len(names)
-    reader = Pieces(tmp_path, resume=True)
+    reader = Checkpoints(tmp_path, resume=True)
     assert [reader.read(name, 0, int) for name in names] == list(range(len(names)))

@@ -10,13 +10,13 @@ from lanes import as_arrays, join, nominal_gains, run_rollout, validated
 from rig_lock_step import closed_loop
 
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import builtin_names, from_builtins, load
+from jaxhil.mechanism.file import builtin_names, from_plain_data, load
 from jaxhil.rig import COMPENSATORS
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.rig.plant import Plant
-from tuning.rig.propagation import split_delay
+from tuning.rig.discretisation import split_delay
+from tuning.rig.plant import RigHardware
 
 # One of each motion simulator, hold, law and sensor fault, and several contacts.
 AGAINST_THE_ORACLE = (
@@ -105,7 +105,7 @@ SIMULATORS = {
 
 
 def on_rig(simulator, **rig):
-    return from_builtins(
+    return from_plain_data(
         {
             "schema": "jaxhil/mechanism/1",
             "name": "case",
@@ -125,7 +125,7 @@ def test_plant_follows_uniform_motion_with_a_constant_lag(model, latency):
     mechanism = on_rig(
         {**simulator, "delay": 0.0037}, command_latency=latency, position_sensor={"delay": 0.0009}
     )
-    plant, velocity = Plant(mechanism), 0.005
+    plant, velocity = RigHardware(mechanism), 0.005
     plant.begin(-1.0, velocity, -1.0, 0)
     lag += 0.0037 + 0.0009 + latency * 0.001
     for tick in range(300):
@@ -136,7 +136,7 @@ def test_plant_follows_uniform_motion_with_a_constant_lag(model, latency):
 
 def test_plant_follows_a_staircase_in_its_steady_state():
     mechanism = on_rig({**SIMULATORS["second order"][0], "delay": 0.0037}, command_hold="zoh")
-    plant, velocity = Plant(mechanism), 0.005
+    plant, velocity = RigHardware(mechanism), 0.005
     plant.begin(-1.0, velocity, -1.0, 0)
     readings = []
     for tick in range(200):
@@ -154,13 +154,13 @@ def test_plant_splits_delays_at_the_ticks(delay, intervals, place):
 def test_plant_sensors_in_free_flight_have_stated_bias_and_noise():
     sensor = {"noise_std": 0.5, "bias": 2.0}
     mechanism = on_rig({"model": "ideal"}, force_sensor=sensor, position_sensor={"noise_std": 1e-6})
-    plant = Plant(mechanism, seed=3)
+    plant = RigHardware(mechanism, seed=3)
     plant.begin(-1.0, 0.0, -1.0, 0)
     readings = np.array([plant.read() for _ in range(20_000)])
     assert np.mean(readings[:, 0]) == pytest.approx(2.0, abs=5 * 0.5 / 20_000**0.5)
     assert np.std(readings[:, 0]) == pytest.approx(0.5, rel=0.03)
     assert np.std(readings[:, 1]) == pytest.approx(1e-6, rel=0.03)
-    again = Plant(mechanism, seed=3)
+    again = RigHardware(mechanism, seed=3)
     again.begin(-1.0, 0.0, -1.0, 0)
     assert [again.read() for _ in range(3)] == [tuple(row) for row in readings[:3]]
 
@@ -186,7 +186,7 @@ def test_runtime_has_every_law_that_the_plant_runs():
 def test_plant_tick_takes_little_time(name):
     overrides = ("rig.force_sensor.time_constant=0.002",) if name == "lag" else ()
     mechanism = load("varying" if name == "lag" else name, overrides).mechanism
-    plant, velocity = Plant(mechanism), mechanism.approach.velocity
+    plant, velocity = RigHardware(mechanism), mechanism.approach.velocity
     times = []
     for _ in range(20):
         plant.begin(-0.02 * velocity, velocity, -0.02 * velocity, 0)

@@ -11,18 +11,18 @@ import pytest
 from lanes import QUICK
 from matplotlib.colors import to_hex
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.contact_plot import STYLES, contact_plot, save
+from jaxhil.simulation.contact_plot import CURVE_STYLES, plot_contacts, save_figure
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.motion import Curve, Piece, _ideal_curves
+from jaxhil.simulation.motion_curves import Curve, RunMotion, _ideal_curves
 from jaxhil.simulation.outcome import Outcome, parameters_by_slot
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gains.pareto import Front, Point
-from tuning.gains.rounds import Start
+from tuning.gains.multistart_solver import StartResult
+from tuning.gains.pareto import ParetoFront, ParetoPoint
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tune import TuneResult, figures
+from tuning.gains.tune import TuneResult, compute_error_metrics
 from tuning.plots.tuning_results import errors_plot, front_plot, loss_plot
 
 LANES = 40
@@ -52,8 +52,8 @@ def result(error_size=(0.5, 0.05, 0.005)):
             good=wanted,
             unlike=np.zeros(shape, bool),
         )
-    summaries = {name: figures(outcome) for name, outcome in outcomes.items()}
-    starts = [Start("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]
+    summaries = {name: compute_error_metrics(outcome) for name, outcome in outcomes.items()}
+    starts = [StartResult("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]
     return TuneResult(
         "phase_lead", mechanism, {}, {}, summaries, summaries, starts, outcomes, scenarios, TuneSettings()
     )
@@ -67,7 +67,7 @@ def pieces(contacts=2):
         return Curve(0.005 * scale, time, scale * force, 1e-3 * scale * time, force, time)
 
     curves = {"in space": curve(1.0), "before": curve(1.4), "tuned": curve(1.001)}
-    return [Piece(f"contact {n + 1}", (0.0,), curves) for n in range(contacts)]
+    return [RunMotion(f"contact {n + 1}", (0.0,), curves) for n in range(contacts)]
 
 
 def labels(axes):
@@ -104,11 +104,11 @@ def test_contact_frequency_is_that_of_the_linear_contact():
 
 @pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
 def test_error_plot_accepts_any_limit_and_no_errors_at_all(limit, tmp_path):
-    save(errors_plot(result((0.5, 0.0, 0.0)), limit), tmp_path / "errors.png")
+    save_figure(errors_plot(result((0.5, 0.0, 0.0)), limit), tmp_path / "errors.png")
     made = result()
     nothing = {name: one._replace(good=one.good & False) for name, one in made.outcomes.items()}
     made.outcomes.update(nothing)
-    save(errors_plot(made, limit), tmp_path / "nothing.png")
+    save_figure(errors_plot(made, limit), tmp_path / "nothing.png")
 
 
 def test_best_start_stands_out_in_the_plot():
@@ -125,10 +125,10 @@ def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1
 
     def point(error, noise, on_front):
         one = made.figures["tuned"]
-        return Point({}, 0.1, noise, error, one, one, made.intervals, on_front)
+        return ParetoPoint({}, 0.1, noise, error, one, one, made.intervals, on_front)
 
     points = [point(*place, number != 3) for number, place in enumerate(places)]
-    return made, Front(points, point(0.1, 4.0, False), point(0.012, 3.5, False))
+    return made, ParetoFront(points, point(0.1, 4.0, False), point(0.012, 3.5, False))
 
 
 def test_front_plot_has_units_numbers_and_the_literature():
@@ -156,40 +156,40 @@ def test_front_plot_accepts_any_front(limit, tmp_path):
         [((0.5, 1.0),) * 2, ((0.0, 1.0), (2.0, 0.9)), ((1e-3, 40.0), (1.0, 1.0))]
     ):
         made, drawn = front(places)
-        save(front_plot(drawn, made, limit), tmp_path / f"{number}.png")
+        save_figure(front_plot(drawn, made, limit), tmp_path / f"{number}.png")
 
 
 def test_contact_plot_shows_contacts_side_by_side_with_units():
-    figure = contact_plot(pieces(), "title")
+    figure = plot_contacts(pieces(), "title")
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
     # The speed of a curve's approach is stated where it differs visibly.
     assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
     assert len(figure.legends) == 1
-    assert "the first 4 of 6 contacts" in contact_plot(pieces(6), "title").get_suptitle()
+    assert "the first 4 of 6 contacts" in plot_contacts(pieces(6), "title").get_suptitle()
 
 
 def test_measured_signals_are_plotted_on_request():
     def measured(figure):
         return [line for line in figure.axes[0].lines if line.get_label() == "measured"]
 
-    assert not measured(contact_plot(pieces(1), "title"))
-    assert len(measured(contact_plot(pieces(1), "title", sensors="tuned"))) == 1
+    assert not measured(plot_contacts(pieces(1), "title"))
+    assert len(measured(plot_contacts(pieces(1), "title", sensors="tuned"))) == 1
 
 
 def test_name_in_a_plot_is_text_and_no_formula(tmp_path):
-    save(contact_plot(pieces(1), r"$\frac{1$ [bold]"), tmp_path / "plot.png")
+    save_figure(plot_contacts(pieces(1), r"$\frac{1$ [bold]"), tmp_path / "plot.png")
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
 def test_equal_data_give_equal_plot_files(suffix, tmp_path):
     for name in ("one", "two"):
-        save(loss_plot(result()), tmp_path / f"{name}.{suffix}")
+        save_figure(loss_plot(result()), tmp_path / f"{name}.{suffix}")
     assert (tmp_path / f"one.{suffix}").read_bytes() == (tmp_path / f"two.{suffix}").read_bytes()
 
 
 def test_plot_colours_and_line_styles_differ():
-    compared = [STYLES[name] for name in ("before", "literature", "tuned")]
+    compared = [CURVE_STYLES[name] for name in ("before", "literature", "tuned")]
     assert len({to_hex(colour) for colour, _, _ in compared}) == 3
     assert len({line for _, line, _ in compared}) == 3
 
@@ -203,7 +203,7 @@ def test_reference_motion_is_the_ideal_contact(name):
     (curve,) = _ideal_curves(mechanism, scenarios, [until])
     contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
     like = jax.numpy.full(scenarios.phase.shape, velocity)
-    of_law = jax.jit(LAWS[mechanism.contact.law].reference, compiler_options=QUICK)
+    of_law = jax.jit(CONTACT_LAWS[mechanism.contact.law].reference, compiler_options=QUICK)
     reference = of_law(contact, 0 * like + mechanism.bodies.mass, like)
     assert np.max(curve.force) == pytest.approx(float(reference.peak_force[0, 0]), rel=2e-3)
     rebound = -np.diff(curve.position)[-1] / np.diff(curve.time)[-1]
@@ -221,7 +221,7 @@ DRAWING = [
 
 @pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
 def test_plots_have_one_palette_and_units(path):
-    """Expect colours of `contact_plot` or greys; axes have a unit, unless they count."""
+    """Expect colours of `plot_contacts` or greys; axes have a unit, unless they count."""
     counted = ("", "solver step", "contact")
     for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():

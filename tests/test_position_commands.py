@@ -36,7 +36,7 @@ from jaxhil.rig.faults import (
     VELOCITY_LIMIT,
 )
 from jaxhil.rig.gain_file import GainFile
-from jaxhil.rig.limits import LIMITS, complete
+from jaxhil.rig.limits import LIMITS, complete_limits
 from jaxhil.rig.surfaces import deflection
 
 LAWS = ("none", "position_lead", "response_error")
@@ -136,7 +136,7 @@ def runs(draw):
     for name in draw(st.sets(st.sampled_from(sorted(limits)), max_size=3)):
         limits[name] = LIMITS[name].default
     try:
-        limits = complete(limits)
+        limits = complete_limits(limits)
     except ValueError:
         reject()
     row = st.tuples(
@@ -172,7 +172,7 @@ def test_position_command_stays_near_the_drives_for_a_million_ticks(law):
 
 def plain(law: str = "none", **limits: float) -> GainFile:
     gains = {name: entry["value"] for name, entry in GAINS[law].items()}
-    return GainFile(law, gains, PERIOD, math.inf, complete({**LIMITED, **limits}))
+    return GainFile(law, gains, PERIOD, math.inf, complete_limits({**LIMITED, **limits}))
 
 
 @pytest.mark.parametrize("before", [[], [{"desired": -0.02, "measured": -0.02, "x": -0.02}] * 3])

@@ -24,17 +24,17 @@ from lanes import (
 )
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.shared.estimates import simulator_inverse
+from jaxhil.laws.shared.nominal_values import simulator_inverse
 from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.gain_file import check_document
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle.vectors import make_vectors
 from tuning.gain_file import build_document
-from tuning.verification.replay import verify
+from tuning.verification.runtime_replay import verify
 from tuning.watchdog.calibration import calibrate
-from tuning.watchdog.recorded import Scenarios, recorded_chunks
+from tuning.watchdog.recording import ScenarioSelection, record_selection
 
 EXACT = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8}
 PERIODS = np.array([2e-3, 1e-3, 5e-4, 2.5e-4])
@@ -174,7 +174,7 @@ def test_verification_detects_a_wrong_position_command(monkeypatch):
 def test_stroke_and_velocity_limits_apply_to_the_sent_command():
     loaded = loaded_gains()
     result = calibrate(loaded, scenarios=8, limit=1.0)
-    [chunk] = recorded_chunks(loaded, Scenarios("random", 0, 8))
+    [chunk] = record_selection(loaded, ScenarioSelection("random", 0, 8))
     sent, position = (np.where(chunk.signals.live, leaf, np.nan) for leaf in chunk.signals[5:0:-4])
     assert np.nanmax(sent) > np.nanmax(position)
     # Limits keep a margin on every fourth run; the other runs test them.

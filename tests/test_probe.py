@@ -6,7 +6,7 @@ import pytest
 from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_record, run_rollout, validated
 from scipy.integrate import quad
 
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import build_scenarios
 

@@ -13,7 +13,7 @@ from compiling import is_quick
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxhil.contact.laws import HuntCrossley, KelvinVoigt
-from jaxhil.files import read_sealed
+from jaxhil.files import read_checksummed
 from tuning.caches import program_cache
 
 pytestmark = pytest.mark.users_options
@@ -46,14 +46,14 @@ VALUES = {"values": np.array([1.0, 2.0, 4.0, 8.0])}
 
 @pytest.fixture(autouse=True)
 def forgetful():
-    program_cache._program.cache_clear()
+    program_cache._load_or_build_program.cache_clear()
     traced.clear()
 
 
 def run(folder, static=STATIC, arguments=VALUES):
     """Run the program as a new process would."""
-    program_cache._program.cache_clear()
-    result = program_cache.run(sums, static, arguments, folder)
+    program_cache._load_or_build_program.cache_clear()
+    result = program_cache.run_program(sums, static, arguments, folder)
     return float(result.total), np.asarray(result.parts)
 
 
@@ -94,7 +94,7 @@ def check_flips(folder, number, seed):
         total, parts = run(folder)
         assert total == 31.0 and traced
         np.testing.assert_array_equal(parts, 2 * VALUES["values"])
-        assert read_sealed(file) is not None
+        assert read_checksummed(file) is not None
 
 
 def test_program_file_with_flipped_bit_costs_only_tracing_time(tmp_path):

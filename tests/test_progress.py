@@ -21,7 +21,7 @@ def lines(capsys):
 
 
 def test_progress_line_has_work_done_rate_and_remaining_time(clock, capsys):
-    with terminal.progress(64, "mechanisms") as bar:
+    with terminal.show_progress(64, "mechanisms") as bar:
         bar.tell("first", 0)
         clock[0] += 60
         bar.tell("second", 16)
@@ -37,7 +37,7 @@ def test_progress_line_has_work_done_rate_and_remaining_time(clock, capsys):
 
 
 def test_progress_rate_excludes_work_done_before(clock, capsys):
-    with terminal.progress(40, "results") as bar:
+    with terminal.show_progress(40, "results") as bar:
         bar.tell("as kept", 20, 20)
         clock[0] += 100
         bar.tell("more", 30, 20)
@@ -45,14 +45,14 @@ def test_progress_rate_excludes_work_done_before(clock, capsys):
 
 
 def test_progress_of_a_single_item_is_a_share(clock, capsys):
-    with terminal.progress(1, "fronts") as bar:
+    with terminal.show_progress(1, "fronts") as bar:
         clock[0] += 36
         bar.tell("searching", 0.25)
     assert lines(capsys) == ["25 %, 41.7 %/min, 0:01:48 left, searching"]
 
 
 def test_progress_counts_stages_as_they_begin(clock, capsys):
-    with terminal.stages(3) as stages:
+    with terminal.show_stages(3) as stages:
         for text in ("one", "two", "three"):
             stages.begin(text)
             clock[0] += 2
@@ -64,7 +64,7 @@ def test_progress_counts_stages_as_they_begin(clock, capsys):
 
 
 def test_progress_of_short_work_is_not_printed(clock, capsys):
-    with terminal.stages(3) as stages:
+    with terminal.show_stages(3) as stages:
         for text in ("one", "two", "three"):
             stages.turn_to(text)
         clock[0] += 11
@@ -73,9 +73,9 @@ def test_progress_of_short_work_is_not_printed(clock, capsys):
 
 
 def test_progress_is_printed_with_elapsed_time_after_silence(monkeypatch, capsys):
-    monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 0.02)
-    monkeypatch.setattr(terminal, "SECONDS_OF_SILENCE", 0.03)
-    with terminal.progress(10, "scenarios") as bar:
+    monkeypatch.setattr(terminal, "PROGRESS_INTERVAL", 0.02)
+    monkeypatch.setattr(terminal, "MAX_SILENCE", 0.03)
+    with terminal.show_progress(10, "scenarios") as bar:
         bar.tell("compiling", 1)
         time.sleep(0.5)
     result = lines(capsys)
@@ -84,7 +84,7 @@ def test_progress_is_printed_with_elapsed_time_after_silence(monkeypatch, capsys
 
 
 def test_progress_shows_elapsed_time_before_anything_is_known(clock, capsys):
-    with terminal.progress(100, "runs") as bar:
+    with terminal.show_progress(100, "runs") as bar:
         clock[0] += 21
         bar.remind()
         bar.advance(1)
@@ -92,7 +92,7 @@ def test_progress_shows_elapsed_time_before_anything_is_known(clock, capsys):
 
 
 def test_progress_is_silent_unless_requested(clock, capsys):
-    with terminal.progress(2, "parts", shown=False) as bar:
+    with terminal.show_progress(2, "parts", shown=False) as bar:
         bar.advance(1, "one")
         clock[0] += 100
         bar.advance(1, "two")

@@ -6,12 +6,12 @@ from exact_quantile import quantile
 from scipy import stats
 
 from tuning.statistics.quantiles import (
-    BINS,
-    EDGES,
-    RESOLUTION,
+    BIN_COUNT,
+    BIN_EDGES,
+    BIN_RESOLUTION,
     binned_quantile,
-    counts,
-    ranks,
+    compute_order_ranks,
+    count_in_bins,
     replicate_quantile,
 )
 
@@ -20,13 +20,13 @@ from tuning.statistics.quantiles import (
 @pytest.mark.parametrize("order", (0.05, 0.5, 0.95, 0.999))
 def test_quantile_ranks_leave_out_at_most_the_stated_probability(number, order):
     """Use P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
-    low, high = ranks(number, order)
+    low, high = compute_order_ranks(number, order)
     law = stats.binom(number, order)
     below, above = law.cdf(low - 1), law.sf(high - 1)
     assert below <= 0.025 and above <= 0.025
     # No further rank could be left out.
     assert law.cdf(low) >= 0.025 and law.sf(high - 2) >= 0.025
-    wider = ranks(number, order, sequential=True)
+    wider = compute_order_ranks(number, order, sequential=True)
     assert wider[0] <= low and wider[1] >= high
 
 
@@ -35,9 +35,9 @@ def test_quantile_ranks_of_sequences_hold_at_all_numbers_at_once():
     numbers = np.arange(50, 5001, 50)
     for order in (0.5, 0.95):
         below = np.cumsum(rng.binomial(50, order, (1000, len(numbers))), axis=1)
-        low, high = np.array([ranks(int(n), order, sequential=True) for n in numbers]).T
+        low, high = np.array([compute_order_ranks(int(n), order, sequential=True) for n in numbers]).T
         assert np.mean(np.all((low <= below) & (below < high), axis=1)) >= 0.95
-        low, high = np.array([ranks(int(n), order) for n in numbers]).T
+        low, high = np.array([compute_order_ranks(int(n), order) for n in numbers]).T
         assert np.mean(np.all((low <= below) & (below < high), axis=1)) < 0.85
 
 
@@ -50,11 +50,11 @@ def test_quantile_intervals_of_repeated_sweeps_cover(order, capsys):
     for _ in range(1000):
         values = rng.standard_normal(500)
         interval = quantile(values, order)
-        parts = counts(values[:200]) + counts(values[200:])
+        parts = count_in_bins(values[:200]) + count_in_bins(values[200:])
         wider = binned_quantile(parts, order)
-        assert interval.low / (1 + RESOLUTION) < wider.low <= interval.low
-        assert interval.high <= wider.high <= interval.high * (1 + RESOLUTION)
-        assert wider.value == pytest.approx(interval.value, rel=RESOLUTION / 2)
+        assert interval.low / (1 + BIN_RESOLUTION) < wider.low <= interval.low
+        assert interval.high <= wider.high <= interval.high * (1 + BIN_RESOLUTION)
+        assert wider.value == pytest.approx(interval.value, rel=BIN_RESOLUTION / 2)
         exact.append(interval.low <= truth <= interval.high)
         binned.append(wider.low <= truth <= wider.high)
         widths.append(wider.high - wider.low)
@@ -81,7 +81,7 @@ def test_quantile_intervals_of_replicates_cover(order, sampling, capsys):
             points = np.stack([stats.qmc.Sobol(2, rng=rng).random(64) for _ in range(16)])
         else:
             points = rng.random((16, 64, 2))
-        counted = np.stack([counts(values) for values in np.sum(points, axis=-1) - 1])
+        counted = np.stack([count_in_bins(values) for values in np.sum(points, axis=-1) - 1])
         interval = replicate_quantile(counted, order)
         assert interval.low < interval.value < interval.high
         inside.append(interval.low <= truth <= interval.high)
@@ -99,13 +99,13 @@ def test_quantile_intervals_of_replicates_cover(order, sampling, capsys):
 
 
 def test_quantile_of_replicates_without_results_has_no_bound():
-    none = np.stack([counts([np.nan] * 10)] * 4)
+    none = np.stack([count_in_bins([np.nan] * 10)] * 4)
     interval = replicate_quantile(none, 0.5)
-    assert interval.value == np.inf and interval.high == np.inf and interval.low >= EDGES[-2]
-    zero = np.stack([counts([0.0] * 10)] * 4)
-    assert replicate_quantile(zero, 0.5) == (0.0, 0.0, EDGES[0])
-    with pytest.raises(ValueError, match="allowed equal numbers"):
-        replicate_quantile(np.stack([counts([1.0]), counts([1.0, 2.0])]), 0.5)
+    assert interval.value == np.inf and interval.high == np.inf and interval.low >= BIN_EDGES[-2]
+    zero = np.stack([count_in_bins([0.0] * 10)] * 4)
+    assert replicate_quantile(zero, 0.5) == (0.0, 0.0, BIN_EDGES[0])
+    with pytest.raises(ValueError, match="expected equal numbers"):
+        replicate_quantile(np.stack([count_in_bins([1.0]), count_in_bins([1.0, 2.0])]), 0.5)
 
 
 def test_quantile_intervals_cover_ties():
@@ -119,30 +119,32 @@ def test_quantile_intervals_cover_ties():
 
 
 def test_quantile_bins_merge_and_hold_every_error():
-    assert EDGES[0] == 1e-9 and EDGES[-1] >= 1e3 and BINS == len(EDGES) + 1 < 3000
-    assert np.max(EDGES[1:] / EDGES[:-1]) <= 1 + RESOLUTION + 1e-12
+    assert BIN_EDGES[0] == 1e-9 and BIN_EDGES[-1] >= 1e3 and BIN_COUNT == len(BIN_EDGES) + 1 < 3000
+    assert np.max(BIN_EDGES[1:] / BIN_EDGES[:-1]) <= 1 + BIN_RESOLUTION + 1e-12
     rng = np.random.default_rng(3)
-    values = np.concatenate([10 ** rng.uniform(-12, 6, 1000), [0.0, np.nan, np.inf, -np.inf], EDGES, -EDGES])
-    whole = counts(values)
-    assert whole.dtype == np.int64 and whole.shape == (BINS,) and np.sum(whole) == len(values)
+    values = np.concatenate(
+        [10 ** rng.uniform(-12, 6, 1000), [0.0, np.nan, np.inf, -np.inf], BIN_EDGES, -BIN_EDGES]
+    )
+    whole = count_in_bins(values)
+    assert whole.dtype == np.int64 and whole.shape == (BIN_COUNT,) and np.sum(whole) == len(values)
     split = rng.permutation(values)
-    np.testing.assert_array_equal(sum(counts(part) for part in np.split(split, [10, 999])), whole)
-    assert whole[-1] == np.sum(~(np.abs(values) < EDGES[-1]))
-    assert whole[0] == np.sum(np.abs(values) < EDGES[0])
-    np.testing.assert_array_equal(counts(EDGES)[1:], 1)
-    np.testing.assert_array_equal(counts(np.float32([0.5])), counts([0.5]))
+    np.testing.assert_array_equal(sum(count_in_bins(part) for part in np.split(split, [10, 999])), whole)
+    assert whole[-1] == np.sum(~(np.abs(values) < BIN_EDGES[-1]))
+    assert whole[0] == np.sum(np.abs(values) < BIN_EDGES[0])
+    np.testing.assert_array_equal(count_in_bins(BIN_EDGES)[1:], 1)
+    np.testing.assert_array_equal(count_in_bins(np.float32([0.5])), count_in_bins([0.5]))
 
 
 def test_failed_runs_count_as_the_largest_errors():
     values = [1.0] * 90 + [np.nan] * 10
-    for interval in (quantile(values, 0.95), binned_quantile(counts(values), 0.95)):
+    for interval in (quantile(values, 0.95), binned_quantile(count_in_bins(values), 0.95)):
         assert np.isinf(interval.value) and np.isinf(interval.high)
     assert quantile(values, 0.5) == (1.0, 1.0, 1.0)
-    small = binned_quantile(counts(np.zeros(50)), 0.5)
-    assert (small.value, small.low, small.high) == (0.0, 0.0, EDGES[0])
+    small = binned_quantile(count_in_bins(np.zeros(50)), 0.5)
+    assert (small.value, small.low, small.high) == (0.0, 0.0, BIN_EDGES[0])
 
 
-@pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(counts([]), 0.5)))
+@pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(count_in_bins([]), 0.5)))
 def test_quantile_without_values_is_unknown(interval):
     assert np.isnan(interval.value) and interval.low == 0.0 and np.isinf(interval.high)
 
@@ -159,4 +161,4 @@ def test_few_values_do_not_bound_a_far_quantile():
 )
 def test_quantile_refuses_impossible_orders(number, order, level):
     with pytest.raises(ValueError, match="number, order, level: found"):
-        ranks(number, order, level)
+        compute_order_ranks(number, order, level)

@@ -10,22 +10,22 @@ import pytest
 import tuning
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.rig_models import rig_model
-from jaxhil.simulation.building import build_loop
+from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
+from tuning.api import tune_verdict
+from tuning.api.tune_options import TuneOptions
 from tuning.caches import program_cache
-from tuning.caches.pieces import Pieces
-from tuning.front_door import tune_verdict
-from tuning.front_door.tune_options import TuneOptions
-from tuning.gains.noise import amplification
-from tuning.gains.objective import Objective, objective_value
-from tuning.gains.quiet import is_quiet, tolerance_of
+from tuning.caches.checkpoints import Checkpoints
+from tuning.gains.noise import compute_noise_amplification
+from tuning.gains.objective import Objective, evaluate_objective
+from tuning.gains.quiet_gains import compute_training_tolerance, is_quiet_search_needed
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.tune import figures
+from tuning.gains.tune import compute_error_metrics
 from tuning.gains.tune_all import tune_all
-from tuning.gains.validation import VALIDATION_SEED, build_validation
+from tuning.gains.validation import VALIDATION_SEED_OFFSET, build_validation
 
 LAW = "phase_lead"
 LIMIT = 0.06
@@ -60,13 +60,13 @@ def tuned(settings, **options):
 @pytest.fixture(scope="module")
 def quiet():
     """Return the quietest gains, and the number of solver programs they took."""
-    program_cache._program.cache_clear()
+    program_cache._load_or_build_program.cache_clear()
     result = tuned(SETTINGS)
-    return result, program_cache._program.cache_info().misses
+    return result, program_cache._load_or_build_program.cache_info().misses
 
 
 def noise_of(result, gains):
-    return amplification(result.mechanism, LAW, gains) - 1
+    return compute_noise_amplification(result.mechanism, LAW, gains) - 1
 
 
 def most_accurate(result):
@@ -77,7 +77,7 @@ def most_accurate(result):
 def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
     result = quiet[0][0]
     accurate = most_accurate(result)
-    assert result.quiet and accurate.rms < tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    assert result.quiet and accurate.rms < compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     assert result.figures["tuned"].failed == 0 and result.figures["tuned"].rms <= LIMIT
     assert noise_of(result, result.gains) < 0.8 * noise_of(result, accurate.gains)
 
@@ -85,7 +85,7 @@ def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
 def test_gains_of_least_error_stay_if_none_are_within_the_limit(quiet, validation):
     result = quiet[0][1]
     accurate = most_accurate(result)
-    assert not result.quiet and accurate.rms > tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    assert not result.quiet and accurate.rms > compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     found = validation.losses(Objective(), [1], validation.coordinates(1, [result.gains])[None])
     assert found[0, 0] <= accurate.rms * (1 + 1e-9)
 
@@ -113,7 +113,7 @@ def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
     peaks = np.sqrt(np.maximum(0, beside**2 - errors**2))
     noise = np.array([max(0.0, noise_of(result, validation.gains(0, own))) for own in points[0]])
     loudness = np.hypot(noise / max(noise[-1], 1), peaks / max(peaks[-1], 0.5))
-    tolerance = tolerance_of(LIMIT, SETTINGS.scenarios or 0)
+    tolerance = compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     assert errors[-2] <= 1.05 * tolerance
     assert (errors[:-2] <= tolerance).any()
     assert loudness[-2] <= 1.03 * loudness[:-2][errors[:-2] <= tolerance].min()
@@ -122,10 +122,10 @@ def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
 def test_metrics_without_noise_are_those_of_the_mechanism_without_noise(quiet):
     for rig, result in zip(RIGS, quiet[0], strict=True):
         silent = noisy(*rig[:-1], 0.0)
-        seed = SETTINGS.seed + VALIDATION_SEED
+        seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
         scenarios = build_scenarios(silent, draw(silent, SETTINGS.validation, seed), seed)
         outcome = evaluate(build_loop(silent, LAW, scenarios), result.gains, scenarios)
-        expected = figures(outcome)
+        expected = compute_error_metrics(outcome)
         assert result.without_noise.rms == pytest.approx(expected.rms, rel=1e-9)
         assert result.without_noise.failed == expected.failed
         assert result.without_noise.rms != result.figures["tuned"].rms
@@ -133,15 +133,15 @@ def test_metrics_without_noise_are_those_of_the_mechanism_without_noise(quiet):
 
 def test_mechanisms_without_noise_are_tuned_as_if_quiet_was_not_requested():
     silent = load("varying").mechanism
-    assert not is_quiet(build_task(silent, LAW, 4, 0), SETTINGS)
-    assert not is_quiet(build_task(MECHANISMS[0], "position_lead", 4, 0), SETTINGS)
-    assert is_quiet(build_task(MECHANISMS[0], LAW, 4, 0), SETTINGS)
+    assert not is_quiet_search_needed(build_task(silent, LAW, 4, 0), SETTINGS)
+    assert not is_quiet_search_needed(build_task(MECHANISMS[0], "position_lead", 4, 0), SETTINGS)
+    assert is_quiet_search_needed(build_task(MECHANISMS[0], LAW, 4, 0), SETTINGS)
 
 
 @pytest.mark.slow
 def test_cached_quiet_gains_are_the_same(quiet, tmp_path):
-    made = tuned(SETTINGS, pieces=Pieces(tmp_path))
-    again = tuned(SETTINGS, pieces=Pieces(tmp_path, resume=True))
+    made = tuned(SETTINGS, pieces=Checkpoints(tmp_path))
+    again = tuned(SETTINGS, pieces=Checkpoints(tmp_path, resume=True))
     for one, other, reference in zip(made, again, quiet[0], strict=True):
         assert one.gains == other.gains == reference.gains
         assert one.quiet == other.quiet and one.without_noise == other.without_noise
@@ -202,7 +202,7 @@ def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), g
 )
 def test_verdict_names_the_metrics_it_used(changes, good, words):
     result = result_of(**changes)
-    line = tune_verdict.verdict_line(result, 0.01)
+    line = tune_verdict.describe_verdict(result, 0.01)
     assert tune_verdict.is_good(result, 0.01) is good
     assert line.startswith(words)
     assert "sensor noise x 1" in line or "Real contacts" in line
@@ -211,10 +211,10 @@ def test_verdict_names_the_metrics_it_used(changes, good, words):
 def test_warnings_name_peaks_and_noise_beyond_their_bounds():
     def warned(**changes):
         result = result_of(**changes)
-        return tune_verdict.command_warnings(result, tune_verdict.command_figures(result))
+        return tune_verdict.command_warnings(result, tune_verdict.command_metrics(result))
 
     loud = {"gains": (0.004, 0.001)}
-    assert amplification(MECHANISMS[0], LAW, {"phase_lead": 0.004, "lead_filter": 0.001}) > 2
+    assert compute_noise_amplification(MECHANISMS[0], LAW, {"phase_lead": 0.004, "lead_filter": 0.001}) > 2
     assert warned() == ()
     (peaks,) = warned(peaks=(1.6, 1.6))
     assert "1.6 times the ideal contact's peak force" in peaks and "at most 1.5" in peaks
@@ -226,7 +226,7 @@ def test_warnings_name_peaks_and_noise_beyond_their_bounds():
 
 def test_objective_value_of_quiet_gains_is_small_within_the_tolerance():
     within = Objective(tolerance=0.01)
-    assert objective_value(within, np.array([0.005])) == pytest.approx(1e-4)
+    assert evaluate_objective(within, np.array([0.005])) == pytest.approx(1e-4)
 
 
 @pytest.mark.slow
@@ -243,8 +243,8 @@ def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
 def test_scenarios_without_noise_differ_in_their_noise_alone(name):
     sensor = {} if name != "petals" else {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
     mechanism = load_any(name, {**sensor, "rig.force_sensor.delay": 0.003}).mechanism
-    scenarios = rig_model(mechanism).scenarios(mechanism)
-    silent = rig_model(mechanism).without_noise(scenarios)
+    scenarios = choose_rig_model(mechanism).scenarios(mechanism)
+    silent = choose_rig_model(mechanism).without_noise(scenarios)
     noisy = jax.tree.leaves(scenarios)
     changed = [
         (before, after)

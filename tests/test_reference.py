@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import beta
 
-from jaxhil.contact.reference import Reference, hunt_crossley, kelvin_voigt, piecewise_linear
+from jaxhil.contact.ideal_contact import (
+    IdealContact,
+    ideal_hunt_crossley,
+    ideal_kelvin_voigt,
+    ideal_piecewise_linear,
+)
 
 MASS, STIFFNESS, VELOCITY = 325.0, 124355.0, 0.01
 PERIOD = np.sqrt(MASS / STIFFNESS)
@@ -78,11 +83,11 @@ def integrate(force, mass, velocity, time_scale, separation="force"):
             low, high = grid[max(best - 1, 0)], grid[min(best + 1, points - 1)]
             peak = max(peak, forces[best])
         time, start = way.t[-1], way.y[:, -1]
-    return Reference(-start[1], peak * mass * velocity / time_scale, time * time_scale)
+    return IdealContact(-start[1], peak * mass * velocity / time_scale, time * time_scale)
 
 
 def assert_close(result, expected, tolerance):
-    for name, value, target in zip(Reference._fields, result, expected, strict=True):
+    for name, value, target in zip(IdealContact._fields, result, expected, strict=True):
         np.testing.assert_allclose(value, target, rtol=tolerance, atol=0, err_msg=name)
 
 
@@ -109,7 +114,7 @@ KELVIN_VOIGT = [0.0, 1e-6, 0.05, 0.49, 0.5, 0.51, 0.9, 0.97, 0.985, 1.0, 1.015, 
 def test_kelvin_voigt_contact_agrees_with_integration(ratio):
     damping = damping_of(ratio)
     expected = integrate(lambda d, w: STIFFNESS * d + damping * w, MASS, VELOCITY, PERIOD / max(1.0, ratio))
-    result = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
+    result = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
     assert_close(result, expected, 1e-10)
 
 
@@ -117,13 +122,13 @@ def test_kelvin_voigt_contact_agrees_with_integration(ratio):
 def test_kelvin_voigt_contact_with_tension_agrees_with_integration(ratio):
     damping = damping_of(ratio)
     expected = integrate(lambda d, w: STIFFNESS * d + damping * w, MASS, VELOCITY, PERIOD, separation="depth")
-    result = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, True)
+    result = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, True)
     assert_close(result, expected, 1e-10)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.0 + 1e-12, 3.0, 1e8])
 def test_overdamped_contact_with_tension_sticks(ratio):
-    result = evaluate(kelvin_voigt, 1.0, 1.0, 2 * ratio, VELOCITY, True)
+    result = evaluate(ideal_kelvin_voigt, 1.0, 1.0, 2 * ratio, VELOCITY, True)
     assert result.restitution == 0
     assert result.duration == np.inf
     np.testing.assert_allclose(result.peak_force, 2 * ratio * VELOCITY, rtol=1e-15)
@@ -163,13 +168,13 @@ def integrate_hunt_crossley(exponent, onset, stiffness, velocity):
 @pytest.mark.parametrize(("exponent", "onset"), HUNT_CROSSLEY)
 def test_hunt_crossley_contact_agrees_with_integration(exponent, onset):
     expected = integrate_hunt_crossley(exponent, onset, 1e8, VELOCITY)
-    result = evaluate(hunt_crossley, MASS, 1e8, exponent, onset / (1.5 * VELOCITY), VELOCITY)
+    result = evaluate(ideal_hunt_crossley, MASS, 1e8, exponent, onset / (1.5 * VELOCITY), VELOCITY)
     assert_close(result, expected, 1e-9)
 
 
 @pytest.mark.parametrize("onset", [1e-14, 1e-9, 1e-4, 0.1, 1.0, 10.0, 1e3, 1e8])
 def test_hunt_crossley_restitution_solves_the_first_integral(onset):
-    e = evaluate(hunt_crossley, 1.0, 1.0, 1.5, onset / 1.5, 1.0).restitution
+    e = evaluate(ideal_hunt_crossley, 1.0, 1.0, 1.5, onset / 1.5, 1.0).restitution
     if onset < 1e-3:
         np.testing.assert_allclose(1 - e, 2 * onset / 3, rtol=onset, atol=2e-16)
     elif onset < 30:
@@ -182,7 +187,7 @@ def test_hunt_crossley_restitution_solves_the_first_integral(onset):
 def test_undamped_hertz_contact_has_closed_form_duration():
     # Duration 2.9432 (M^2 / (k^2 v))^(1/5) (5/4)^(2/5): the classical Beta-function integral.
     depth = (2.5 * MASS * VELOCITY**2 / 2 / 1e8) ** 0.4
-    result = evaluate(hunt_crossley, MASS, 1e8, 1.5, 0.0, VELOCITY)
+    result = evaluate(ideal_hunt_crossley, MASS, 1e8, 1.5, 0.0, VELOCITY)
     expected = (1.0, 1e8 * depth**1.5, 2 * depth / VELOCITY * beta(0.4, 0.5) / 2.5)
     assert_close(result, expected, 2e-13)
 
@@ -208,7 +213,7 @@ def test_piecewise_linear_contact_agrees_with_integration(slopes, depths, ratio)
     depths = VELOCITY * PERIOD * np.array(depths)
     damping = damping_of(ratio)
     expected = integrate(staircase(slopes, depths, damping), MASS, VELOCITY, PERIOD / max(1.0, ratio))
-    result = evaluate(piecewise_linear, MASS, slopes, depths, damping, VELOCITY)
+    result = evaluate(ideal_piecewise_linear, MASS, slopes, depths, damping, VELOCITY)
     assert_close(result, expected, 1e-9)
 
 
@@ -217,7 +222,7 @@ def test_piecewise_linear_contact_agrees_with_integration(slopes, depths, ratio)
 def test_hunt_crossley_contact_agrees_with_integration_at_random(exponent, onset, velocity):
     onset, velocity = 10**onset, 10**velocity
     expected = integrate_hunt_crossley(exponent, onset, 1e7, velocity)
-    result = evaluate(hunt_crossley, MASS, 1e7, exponent, onset / (1.5 * velocity), velocity)
+    result = evaluate(ideal_hunt_crossley, MASS, 1e7, exponent, onset / (1.5 * velocity), velocity)
     assert_close(result, expected, 1e-9)
 
 
@@ -232,7 +237,7 @@ def test_piecewise_linear_contact_agrees_with_integration_at_random(slopes, step
     depths = VELOCITY * PERIOD * np.cumsum(steps)
     damping = damping_of(10**ratio)
     expected = integrate(staircase(slopes, depths, damping), MASS, VELOCITY, PERIOD / 2)
-    result = evaluate(piecewise_linear, MASS, slopes, depths, damping, VELOCITY)
+    result = evaluate(ideal_piecewise_linear, MASS, slopes, depths, damping, VELOCITY)
     assert_close(result, expected, 1e-9)
 
 
@@ -241,23 +246,23 @@ def test_piecewise_linear_contact_agrees_with_integration_at_random(slopes, step
 def test_piecewise_linear_contact_of_equal_slopes_is_kelvin_voigt(steps, ratio):
     damping = damping_of(10**ratio)
     depths = VELOCITY * PERIOD * np.cumsum(steps) / max(1.0, 10**ratio)
-    whole = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
-    chained = evaluate(piecewise_linear, MASS, [STIFFNESS] * 3, depths, damping, VELOCITY)
+    whole = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
+    chained = evaluate(ideal_piecewise_linear, MASS, [STIFFNESS] * 3, depths, damping, VELOCITY)
     assert_close(chained, whole, 1e-12)
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-12, 1e-3, 0.5, 1 - 1e-9, 1.0, 1 + 1e-9, 7.0, 1e5])
 def test_piecewise_linear_contact_of_one_segment_is_kelvin_voigt(ratio):
     damping = damping_of(ratio)
-    whole = evaluate(kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
-    chained = evaluate(piecewise_linear, MASS, [STIFFNESS], [], damping, VELOCITY)
+    whole = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
+    chained = evaluate(ideal_piecewise_linear, MASS, [STIFFNESS], [], damping, VELOCITY)
     assert_close(chained, whole, 1e-12)
 
 
 @pytest.mark.parametrize("depth", [0.999999999, 1 - 1e-15, 1.0, 1 + 1e-15, 1.000000001])
 def test_piecewise_linear_contact_may_just_reach_a_depth(depth):
     depths = VELOCITY * PERIOD * np.array([0.5, depth])
-    result = evaluate(piecewise_linear, MASS, [STIFFNESS] * 3, depths, 0.0, VELOCITY)
+    result = evaluate(ideal_piecewise_linear, MASS, [STIFFNESS] * 3, depths, 0.0, VELOCITY)
     assert_close(result, (1.0, VELOCITY * np.sqrt(MASS * STIFFNESS), np.pi * PERIOD), 1e-12)
     _, columns = BUFFER(np.array([MASS, *[STIFFNESS] * 3, *depths, 0.0, VELOCITY]))
     assert np.all(np.isfinite(columns))
@@ -278,10 +283,10 @@ def packed(law, *shapes):
     return jax.jit(with_jacobian)
 
 
-FREE = packed(lambda m, k, b, v: kelvin_voigt(m, k, b, v, jnp.array(False)), (), (), (), ())
-HELD = packed(lambda m, k, b, v: kelvin_voigt(m, k, b, v, jnp.array(True)), (), (), (), ())
-POWER = packed(hunt_crossley, (), (), (), (), ())
-BUFFER = packed(piecewise_linear, (), (3,), (2,), (), ())
+FREE = packed(lambda m, k, b, v: ideal_kelvin_voigt(m, k, b, v, jnp.array(False)), (), (), (), ())
+HELD = packed(lambda m, k, b, v: ideal_kelvin_voigt(m, k, b, v, jnp.array(True)), (), (), (), ())
+POWER = packed(ideal_hunt_crossley, (), (), (), (), ())
+BUFFER = packed(ideal_piecewise_linear, (), (3,), (2,), (), ())
 UNIT = [1.0, 1.0, 1.0, 3.0, 0.5, 0.3, 0.5]
 
 DERIVATIVES = [
@@ -355,9 +360,9 @@ def test_ideal_contact_keeps_shape_and_single_precision_of_batches():
     one = jnp.ones_like(batch)
     segments, edges = jnp.stack([one, 3 * one, 5 * one]), jnp.stack([0.3 * one, 0.5 * one])
     calls = (
-        (kelvin_voigt, (one, one, batch, one, batch > 1)),
-        (hunt_crossley, (one, one, 1.5 * one, batch, one)),
-        (piecewise_linear, (one, segments, edges, batch, one)),
+        (ideal_kelvin_voigt, (one, one, batch, one, batch > 1)),
+        (ideal_hunt_crossley, (one, one, 1.5 * one, batch, one)),
+        (ideal_piecewise_linear, (one, segments, edges, batch, one)),
     )
     results = []
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):

@@ -9,8 +9,8 @@ import pytest
 from lanes import QUICK
 from scipy.integrate import solve_ivp
 
-from jaxhil.contact.laws import LAWS, ContactParameters
-from jaxhil.contact.reference_motion import TOLERANCE, integrate_contact
+from jaxhil.contact.ideal_contact_motion import STEP_TOLERANCE, integrate_contact
+from jaxhil.contact.laws import CONTACT_LAWS, ContactParameters
 
 MASS, STIFFNESS, VELOCITY = 350.0, 124355.0, 0.005
 OMEGA = np.sqrt(STIFFNESS / MASS)
@@ -62,9 +62,9 @@ def closed_form(law, parameters, mass, velocity):
     return law.reference(parameters, mass, velocity)
 
 
-def integrated(name, values, tolerance=TOLERANCE, **options):
+def integrated(name, values, tolerance=STEP_TOLERANCE, **options):
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
-    law = LAWS[name]
+    law = CONTACT_LAWS[name]
     parameters = contact(**values)
     if options:
         run = jax.jit(lambda c, m, v: integrate_contact(law, c, m, v, **options), compiler_options=QUICK)
@@ -183,7 +183,7 @@ def test_trajectory_of_linear_contact_is_the_closed_form():
 def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance):
     """Allow for steps with a kink inside: their derivative is that of a slightly different force."""
     name, values = CASES[case]
-    law, parameters = LAWS[name], contact(**values)
+    law, parameters = CONTACT_LAWS[name], contact(**values)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
 
     def derivatives(reference):
@@ -203,7 +203,7 @@ def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance)
 
 
 def test_integrated_contact_in_single_precision_and_under_vmap():
-    law, parameters = LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
+    law, parameters = CONTACT_LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
     mass, velocity = (np.full(LANES, value, np.float32) for value in (MASS, VELOCITY))
 
     def run(damping, mass, velocity):

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
-from test_front_door import KEYS, TWO, refusal
+from test_api import KEYS, TWO, refusal
 
 import jaxhil
 from jaxhil.contact import laws
-from jaxhil.contact.keys import Key
+from jaxhil.contact.keys import ContactKey
 from jaxhil.mechanism.uncertainty import draw
-from tuning.identification import known
-from tuning.rig.plant import Plant
+from tuning.identification import mechanism_models
+from tuning.rig.plant import RigHardware
 from tuning.transparency.damping_perturbations import perturb_damping
 
 
@@ -68,18 +68,18 @@ def test_incomplete_contact_law_is_refused(registered):
     mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
     for needs, method in (
         (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),
-        (lambda: Plant(mechanism), "in_floats"),
-        (lambda: known.contact_law(mechanism.contact), "regression"),
+        (lambda: RigHardware(mechanism), "in_floats"),
+        (lambda: mechanism_models.make_regression_law(mechanism.contact), "regression"),
     ):
         message = refusal(needs)
         assert message.startswith("contact.law: found 'squared_spring', expected a law ")
         assert message.endswith(f"(ContactLaw.{method})")
-    assert "contact.law: found 'none', expected one of linear, " in refusal(laws.contact_law, "none")
+    assert "contact.law: found 'none', expected one of linear, " in refusal(laws.find_contact_law, "none")
 
 
 def test_contact_laws_must_describe_a_shared_key_alike():
-    for law in laws.LAWS.values():
-        assert all(laws.KEYS[key.name] == key for key in law.keys or ())
+    for law in laws.CONTACT_LAWS.values():
+        assert all(laws.CONTACT_KEYS[key.name] == key for key in law.keys or ())
 
 
 def test_unusable_law_is_not_registered(registered):
@@ -103,29 +103,29 @@ def test_unusable_law_is_not_registered(registered):
 
     class OfItsOwnKey(SquaredSpring):
         name = "of_its_own_key"
-        keys = (Key("toy_depth", "of a toy", "m"),)
+        keys = (ContactKey("toy_depth", "of a toy", "m"),)
 
     class Holding(ScaledLead):
         name = "holding"
         table: jnp.ndarray = eqx.field(default_factory=lambda: jnp.ones(3))
 
     for law, message in (
-        (ScaledLead, "found the class ScaledLead, allowed an instance of"),
-        (3, "found 3, allowed an instance of"),
+        (ScaledLead, "found the class ScaledLead, expected an instance of"),
+        (3, "found 3, expected an instance of"),
         (Unnamed(), "Unnamed.name: found"),
         (Taken(), "register phase_lead: name: found the name of another law"),
-        (Boundless(), "gains.toy_lead: found 0, 1, inf, allowed lower <= nominal <= upper"),
+        (Boundless(), "gains.toy_lead: found 0, 1, inf, expected lower <= nominal <= upper"),
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
         (Holding(), "a law holds no arrays"),
-        (OfItsOwnKey(), "keys: found toy_depth, allowed keys that files have: tension, exponent, "),
+        (OfItsOwnKey(), "keys: found toy_depth, expected keys that files have: tension, exponent, "),
     ):
         assert message in refusal(jaxhil.register, law)
-    assert "allowed one of none" in refusal(jaxhil.simulate, "varying", "holding")
+    assert "expected one of none" in refusal(jaxhil.simulate, "varying", "holding")
     assert "a contact law runs in the simulation alone" in refusal(
         jaxhil.register, SquaredSpring(), runtime=ScaledLeadOnTheRig
     )
-    assert "allowed a class" in refusal(
+    assert "expected a class" in refusal(
         jaxhil.register, ScaledLead(), runtime=ScaledLeadOnTheRig({"toy_lead": 0}, 1, 1)
     )
     assert "runtime: found object without step" in refusal(jaxhil.register, ScaledLead(), runtime=object)

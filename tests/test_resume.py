@@ -1,4 +1,4 @@
-"""`jaxhil tune` and `compare` stopped at any moment: resumed, they end as without interruption."""
+"""`jaxhil tune` and `compare_laws` stopped at any moment: resumed, they end as without interruption."""
 
 import json
 import math
@@ -16,11 +16,11 @@ import pytest
 
 from jaxhil.mechanism.file import builtin_path, load
 from jaxhil.mechanism.structs import Mechanism
-from tuning.benchmark import study
-from tuning.benchmark.study import CompareSettings, LawFigures, compare
-from tuning.caches import pieces
-from tuning.caches.pieces import FOLDER, Pieces
-from tuning.gains.common_program import common_programs
+from tuning.benchmark import comparison
+from tuning.benchmark.comparison import CompareSettings, LawMetrics, compare_laws
+from tuning.caches import checkpoints
+from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
+from tuning.gains.common_program import group_by_common_program
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune_all import tune_all
 from tuning.statistics.intervals import Estimate
@@ -52,7 +52,7 @@ def whole(files, tmp_path_factory):
         patched.setattr(terminal, "emit_json", printed.append)
         writes = Writes(patched)
         assert main(["tune", str(files), "-o", str(folder), *TINY]) == 0
-    return outputs(terminal.as_json(printed[0]), folder), writes.number
+    return outputs(terminal.format_json(printed[0]), folder), writes.number
 
 
 def outputs(said, folder):
@@ -74,8 +74,8 @@ class Writes:
 
     def __init__(self, monkeypatch, stop=None, after=False):
         self.number, self.stop, self.after = 0, stop, after
-        self.write = pieces.write_sealed
-        monkeypatch.setattr(pieces, "write_sealed", self)
+        self.write = checkpoints.write_checksummed
+        monkeypatch.setattr(checkpoints, "write_checksummed", self)
 
     def __call__(self, path, content):
         self.number += 1
@@ -109,7 +109,7 @@ def test_resumed_run_ends_as_without_interruption(jaxhil, files, whole, tmp_path
         # Saved results are not computed again.
         assert made == (every - 1 if stop == 2 else 0)
     # Steps are removed, results stay.
-    assert len(list((tmp_path / "2" / FOLDER).iterdir())) == FILES
+    assert len(list((tmp_path / "2" / CHECKPOINT_FOLDER).iterdir())) == FILES
 
 
 @pytest.mark.slow
@@ -139,8 +139,8 @@ def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_
 def test_checkpointed_result_is_the_result(tmp_path, number):
     """Compare all of it to the bit, including what pictures are made of."""
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
-    made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path)))
-    read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Pieces(tmp_path, resume=True)))
+    made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path)))
+    read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path, resume=True)))
     assert made.keys() == read.keys()
     for index, one in made.items():
         assert_same(vars(one), vars(read[index]))
@@ -187,7 +187,7 @@ def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
     """Make up the metrics; group, save and read them as usual."""
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]
-    groups = [[mechanisms[i] for i in group] for group, _ in common_programs(mechanisms)]
+    groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]
     judged = []
 
     def judge(scenes, law, settings, tell):
@@ -196,19 +196,19 @@ def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         figures = {"literature": {"rms": Estimate(0.1, math.nan, 1 / 3)}}
         return [
-            LawFigures(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures) for scene in scenes
+            LawMetrics(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures) for scene in scenes
         ]
 
     def build(mechanisms, settings):
         return [[Scene(one) for one in group] for group in groups if group[0] in mechanisms]
 
-    monkeypatch.setattr(study, "judge_law", judge)
-    monkeypatch.setattr(study, "build_scenes", build)
+    monkeypatch.setattr(comparison, "evaluate_law", judge)
+    monkeypatch.setattr(comparison, "build_scenario_sets", build)
 
     def run(*laws, resume=True, **settings):
         judged.clear()
-        checkpoints = Pieces(tmp_path, resume)
-        result = list(compare(mechanisms, laws, CompareSettings(**settings), 0, pieces=checkpoints))
+        checkpoints = Checkpoints(tmp_path, resume)
+        result = list(compare_laws(mechanisms, laws, CompareSettings(**settings), 0, pieces=checkpoints))
         return sorted(map(repr, result)), [law for law, _ in judged]
 
     with pytest.raises(KeyboardInterrupt):
@@ -229,7 +229,10 @@ def test_killed_process_loses_nothing(jaxhil, files, whole, tmp_path, signal_num
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])}
     for pieces_there in (1, 3, 4):
         with subprocess.Popen(command, env=environment, cwd=HERE, stdout=subprocess.DEVNULL) as process:
-            while process.poll() is None and len(list(out.glob(f"{FOLDER}/**/*.piece"))) < pieces_there:
+            while (
+                process.poll() is None
+                and len(list(out.glob(f"{CHECKPOINT_FOLDER}/**/*.piece"))) < pieces_there
+            ):
                 time.sleep(0.002)
             process.send_signal(signal_number)
     ran = jaxhil("tune", files, "-o", out, *TINY, "--resume")

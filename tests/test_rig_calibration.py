@@ -15,20 +15,26 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.rig.faults import CONTACT_TOO_LONG
 from jaxhil.rig.law_status import UNSTATED
-from jaxhil.rig.limits import LIMITS, complete
+from jaxhil.rig.limits import LIMITS, complete_limits
 from jaxhil.rig.watchdog import Watchdog
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
-from tuning.bundle.bundle import limits_section
+from tuning.bundle.bundle import build_limits_section
 from tuning.gain_file import build_document
-from tuning.sweeps.run import run_sweep
-from tuning.sweeps.store import open_store, read_part
-from tuning.watchdog.alarms import good_runs, judge_chunk
-from tuning.watchdog.audited import audit_contacts, first_reached
-from tuning.watchdog.calibration import calibrate, guard_limits, watchdog_rules
-from tuning.watchdog.expectation import TERMS, Expectation, Features, expected_restitution, fit_expectation
-from tuning.watchdog.extent import extent_of
-from tuning.watchdog.recorded import Scenarios, Signals, recorded_chunks
+from tuning.sweeps.run_sweep import run_sweep
+from tuning.sweeps.store import open_store, read_chunk
+from tuning.watchdog.alarms import evaluate_runs, find_good_runs
+from tuning.watchdog.audit import audit_contacts, find_first_true
+from tuning.watchdog.calibration import build_audit_rules, calibrate, compute_guard_limits
+from tuning.watchdog.expectation import (
+    POLYNOMIAL_TERMS,
+    ContactFeatures,
+    Expectation,
+    expected_restitution,
+    fit_expectation,
+)
+from tuning.watchdog.recording import RecordedSignals, ScenarioSelection, record_selection
+from tuning.watchdog.signal_extremes import find_signal_extremes
 
 DAMPING = {"contact.damping": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
 LIMIT = 0.02
@@ -51,7 +57,7 @@ NOISY_GAP = gains({"clearance": 0.001}, force_sensor=NOISY, contacts=3)
 @functools.cache
 def recorded(sided):
     """Recorded runs of either mechanism."""
-    (chunk,) = recorded_chunks({1: ONE_SIDED, 2: NOISY_GAP}[sided], Scenarios("random", 1, LANES))
+    (chunk,) = record_selection({1: ONE_SIDED, 2: NOISY_GAP}[sided], ScenarioSelection("random", 1, LANES))
     return chunk
 
 
@@ -63,7 +69,7 @@ def calibrated():
 
 def watch(limits, signals, rules, lane):
     """Return (restitution, expected, imbalance, fault) of a lane's contacts by the runtime's watchdog."""
-    watchdog = Watchdog(complete(limits), rules.period, rules.clearance)
+    watchdog = Watchdog(complete_limits(limits), rules.period, rules.clearance)
     result, given = [], 0.0
 
     def note(fault):
@@ -83,7 +89,7 @@ def watch(limits, signals, rules, lane):
 
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
-    rules, _ = watchdog_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
+    rules, _ = build_audit_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
     chunk, slots = recorded(sided), 8
     audited = audit_contacts(chunk.signals, rules, slots)
     limits = {
@@ -96,12 +102,12 @@ def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
         "reference_velocity": 0.004,
         **{f"{name}_lowest": -0.5 for name in ("softness", "speed", "loss")},
         **{f"{name}_highest": 0.5 for name in ("softness", "speed", "loss")},
-        **{f"expected_{term}": 0.9 / 3**index for index, term in enumerate(TERMS)},
+        **{f"expected_{term}": 0.9 / 3**index for index, term in enumerate(POLYNOMIAL_TERMS)},
     }
     expectation = Expectation(
-        {term: limits[f"expected_{term}"] for term in TERMS}, 1e5, 0.004, *[(-0.5, 0.5)] * 3
+        {term: limits[f"expected_{term}"] for term in POLYNOMIAL_TERMS}, 1e5, 0.004, *[(-0.5, 0.5)] * 3
     )
-    features = Features(audited.stiffness, audited.damping, audited.approach)
+    features = ContactFeatures(audited.stiffness, audited.damping, audited.approach)
     expected = expected_restitution(expectation, features, rules.mass)
     contacts = 0
     for lane in range(LANES):
@@ -116,9 +122,9 @@ def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
 
 
 def test_calibration_audits_the_restitution_that_the_loop_reports():
-    rules, distance = watchdog_rules(ONE_SIDED)
+    rules, distance = build_audit_rules(ONE_SIDED)
     chunk = recorded(1)
-    judged = judge_chunk(chunk, rules, distance)
+    judged = evaluate_runs(chunk, rules, distance)
     ended = (judged.status == OK) & (np.abs(judged.error) < 0.1)
     ended = np.logical_and.accumulate(ended, axis=0)
     apart = np.abs(judged.audited.restitution - chunk.contacts.restitution)[ended]
@@ -129,9 +135,9 @@ def test_calibration_audits_the_restitution_that_the_loop_reports():
 def test_audit_of_a_law_with_status_begins_when_the_law_acts():
     """Place the surface 1 mm nearer than specified: neither position ever passes the specified one."""
     nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
-    assert watchdog_rules(nearer)[0].has_status and not watchdog_rules(ONE_SIDED)[0].has_status
-    (chunk,) = recorded_chunks(nearer, Scenarios("random", 1, 8))
-    audited = audit_contacts(chunk.signals, watchdog_rules(nearer)[0], 2)
+    assert build_audit_rules(nearer)[0].has_status and not build_audit_rules(ONE_SIDED)[0].has_status
+    (chunk,) = record_selection(nearer, ScenarioSelection("random", 1, 8))
+    audited = audit_contacts(chunk.signals, build_audit_rules(nearer)[0], 2)
     assert np.all(chunk.signals.position <= 0) and np.all(chunk.signals.measured <= 0)
     np.testing.assert_allclose(audited.restitution, chunk.contacts.restitution[:2], atol=1e-6)
 
@@ -141,7 +147,7 @@ def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
     assert list(limits) == list(LIMITS)
     # The distance from which a rig approaches a surface is not limited.
     assert [name for name, value in limits.items() if value is None] == ["measured_lowest", "command_lowest"]
-    controller = limited_controller(ONE_SIDED, limits_section(limits))
+    controller = limited_controller(ONE_SIDED, build_limits_section(limits))
     assert not controller.tripped
     for name in (
         "force_range",
@@ -156,7 +162,7 @@ def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
 
 
 def test_long_approach_is_no_fault(calibrated):
-    controller = limited_controller(ONE_SIDED, limits_section(calibrated[0].limits))
+    controller = limited_controller(ONE_SIDED, build_limits_section(calibrated[0].limits))
     velocity, period = ONE_SIDED.mechanism.approach.velocity, ONE_SIDED.mechanism.rig.control_period
     for tick in range(5000):
         position = -0.5 + tick * period * velocity
@@ -170,7 +176,7 @@ def test_contacts_without_force_end_though_the_law_output_hardly_decays(calibrat
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
     def faults(output):
-        watchdog = Watchdog(complete(limits), 1e-3, math.inf)
+        watchdog = Watchdog(complete_limits(limits), 1e-3, math.inf)
         result, rate = set(), 2 * math.pi / 0.15
         for tick in range(2000):
             phase, given = rate * 1e-3 * tick, output * 0.99999**tick
@@ -192,11 +198,11 @@ def test_rig_specific_limits_are_preserved_and_count():
 
 def test_controller_stops_bad_runs_and_no_good_run(calibrated):
     (limits, rates), chunk = calibrated
-    rules, distance = watchdog_rules(ONE_SIDED)
-    judged = judge_chunk(chunk, rules, distance)
+    rules, distance = build_audit_rules(ONE_SIDED)
+    judged = evaluate_runs(chunk, rules, distance)
     bad = (judged.status != OK) | ~(np.abs(judged.error) <= LIMIT)
-    first, good = first_reached(bad), good_runs(judged, LIMIT / 2)
-    controller = limited_controller(ONE_SIDED, limits_section(limits))
+    first, good = find_first_true(bad), find_good_runs(judged, LIMIT / 2)
+    controller = limited_controller(ONE_SIDED, build_limits_section(limits))
     stopped = 0
     for lane in range(len(good)):
         tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
@@ -241,22 +247,22 @@ def test_unspecified_damping_is_not_distinguished_from_delay():
 
 def test_undamped_contact_is_expected_to_return_all_energy():
     rng = np.random.default_rng(0)
-    features = Features(*rng.uniform(1.0, 2.0, (3, 100)))
+    features = ContactFeatures(*rng.uniform(1.0, 2.0, (3, 100)))
     fitted = fit_expectation(features, np.ones(100), np.arange(100), 350.0, 1e-4)
-    assert fitted.coefficients == {**dict.fromkeys(TERMS, 0.0), "1": pytest.approx(1.0)}
+    assert fitted.coefficients == {**dict.fromkeys(POLYNOMIAL_TERMS, 0.0), "1": pytest.approx(1.0)}
 
 
 def test_calibration_finds_a_known_polynomial():
     rng = np.random.default_rng(1)
-    features = Features(
+    features = ContactFeatures(
         1e5 * rng.uniform(0.5, 2, 400), 300 * rng.uniform(0.5, 2, 400), rng.uniform(4e-3, 6e-3, 400)
     )
     truth = fit_expectation(features, np.ones(400), np.arange(400), 350.0, 1.0)
-    truth = truth._replace(coefficients=dict(zip(TERMS, 0.8 / 2.0 ** np.arange(11), strict=True)))
+    truth = truth._replace(coefficients=dict(zip(POLYNOMIAL_TERMS, 0.8 / 2.0 ** np.arange(11), strict=True)))
     truth = truth._replace(coefficients={**truth.coefficients, "1": 0.5, "p": -0.05, "z": -1.0})
     expected = expected_restitution(truth, features, 350.0)
     inside = (expected > 0) & (expected < 1)
-    chosen = Features(*(leaf[inside] for leaf in features))
+    chosen = ContactFeatures(*(leaf[inside] for leaf in features))
     fitted = fit_expectation(chosen, expected[inside], np.arange(np.sum(inside)), 350.0, 1e-6)
     again = expected_restitution(fitted, chosen, 350.0)
     assert np.sum(inside) > 300 and np.max(np.abs(again - expected[inside])) < 1e-9
@@ -268,9 +274,9 @@ def test_calibration_runs_a_store_again(tmp_path):
     store = open_store(tmp_path / "store", manifest, resume=False)
     run_sweep(store, lambda *_: None, lambda *_: None)
     loaded = check_document(document)
-    rows = read_part(store, 0)
+    rows = read_chunk(store, 0)
     assert rows is not None
-    (chunk,) = recorded_chunks(loaded, Scenarios(manifest.sampling, manifest.seed, LANES))
+    (chunk,) = record_selection(loaded, ScenarioSelection(manifest.sampling, manifest.seed, LANES))
     for contact in (1, 2):
         assert chunk.contacts.restitution[contact - 1, :32] == pytest.approx(
             rows[f"restitution_{contact}"], abs=1e-12
@@ -279,7 +285,7 @@ def test_calibration_runs_a_store_again(tmp_path):
     limits, rates = calibrate(loaded, store, progress=done.append)
     assert sum(done) == LANES and rates["limit"] == LIMIT and rates["calibrated_on"]["scenarios"] == LANES
     assert limits["equivalent_mass"] == loaded.mechanism.bodies.mass
-    with pytest.raises(InputError, match="--scenarios: found 129, allowed at most the store's 128"):
+    with pytest.raises(InputError, match="--scenarios: found 129, expected at most the store's 128"):
         calibrate(loaded, store, scenarios=129)
     with pytest.raises(InputError, match="gains_sha256"):
         calibrate(ONE_SIDED, store)
@@ -300,10 +306,10 @@ def test_calibration_misses_none_of_a_hundred_thousand_scenarios():
     assert missed["alarms"] == 0 and missed["high"] < 5e-4
     assert false["high"] < 1e-4
     # Compare verdicts by the controller itself, on other draws.
-    rules, distance = watchdog_rules(loaded)
-    controller = limited_controller(loaded, limits_section(limits))
-    (chunk,) = recorded_chunks(loaded, Scenarios("random", 1, 1024))
-    judged = judge_chunk(chunk, rules, distance)
+    rules, distance = build_audit_rules(loaded)
+    controller = limited_controller(loaded, build_limits_section(limits))
+    (chunk,) = record_selection(loaded, ScenarioSelection("random", 1, 1024))
+    judged = evaluate_runs(chunk, rules, distance)
     error = np.abs(judged.error[0])
     for lane in range(1024):
         tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
@@ -317,8 +323,8 @@ def signals(**columns):
     shape = next(iter(columns.values())).shape
     live, begins = np.ones(shape, bool), np.zeros(shape, bool)
     begins[0] = True
-    every: dict = {name: columns.get(name, np.zeros(shape)) for name in Signals._fields[:6]}
-    return Signals(**every, live=live, begins=begins)
+    every: dict = {name: columns.get(name, np.zeros(shape)) for name in RecordedSignals._fields[:6]}
+    return RecordedSignals(**every, live=live, begins=begins)
 
 
 def test_extent_of_a_run_has_its_largest_and_smallest_values():
@@ -330,7 +336,7 @@ def test_extent_of_a_run_has_its_largest_and_smallest_values():
         command=[0.0, 1.0, -1.0, 2.0, 0.0, 0.0],
         sent=[-3.0, -2.5, 2.0, 7.0, 6.0, 5.5],
     )
-    result = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    result = find_signal_extremes(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
     expected = {
         "reading": 9.0,
         "measured_lowest": -4.0,
@@ -356,20 +362,20 @@ def test_extent_counts_missing_force_only_on_the_way_into_a_contact(force, trave
     """Count as the runtime's guard does: a damped mechanism leaves the contact without a force."""
     flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
     made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
-    result = extent_of(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
+    result = find_signal_extremes(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)
     assert float(result.force_stuck[0]) == pytest.approx(travel)
 
 
 def test_margins_are_set_by_good_runs_alone(calibrated):
     _, chunk = calibrated
-    rules, distance = watchdog_rules(ONE_SIDED)
-    judged = judge_chunk(chunk, rules, distance)
+    rules, distance = build_audit_rules(ONE_SIDED)
+    judged = evaluate_runs(chunk, rules, distance)
     one = np.arange(len(judged.index)) == 5
-    limits = guard_limits(ONE_SIDED, judged, one, rules, distance)
+    limits = compute_guard_limits(ONE_SIDED, judged, one, rules, distance)
     assert limits["force_limit"] == 1.5 * np.max(np.abs(chunk.signals.command[chunk.signals.live[:, 5], 5]))
 
 
 @pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
 def test_calibration_refuses_impossible_choices(keywords):
-    with pytest.raises(InputError, match=r"found .*, allowed"):
+    with pytest.raises(InputError, match=r"found .*, expected"):
         calibrate(ONE_SIDED, **keywords)

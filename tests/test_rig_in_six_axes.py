@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from six_axes import ideal_sensor, second_order, springs
 
 import jaxhil as package
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.sixdof.bodies import (
     angular_momentum,
     build_body,
@@ -105,7 +105,7 @@ def simulate(loop, given, points, delays, friction):
     spheres = ChaserSpheres(vector(points[:, None]), none, Plane(flat, up))
     group = ContactGroup(
         spheres,
-        LAWS["kelvin_voigt"],
+        CONTACT_LAWS["kelvin_voigt"],
         springs(STIFFNESS * one, DAMPING * one, one),
         Regularised(friction[None], 2e-3 * one),
     )

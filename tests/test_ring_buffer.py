@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write, write_in_turn
+from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_sample, write_samples
 
 SAMPLES, LANES = 8, 3
 
@@ -16,7 +16,7 @@ def test_ring_buffer_returns_its_last_samples(extra, ticks):
     history = np.random.default_rng(extra).normal(size=(SAMPLES + extra, LANES))
     ring = jnp.zeros((SAMPLES, LANES))
     for tick, sample in enumerate(history):
-        ring = write(ring, jnp.array(tick, jnp.int32), jnp.asarray(sample))
+        ring = write_sample(ring, jnp.array(tick, jnp.int32), jnp.asarray(sample))
     newest = len(history) - 1
     read = look_back(ring, jnp.array(newest, jnp.int32), jnp.array(ticks, jnp.int32))
     np.testing.assert_array_equal(read, history[newest - np.array(ticks), np.arange(LANES)])
@@ -38,8 +38,8 @@ def test_ring_buffer_written_in_turn_or_at_once_is_the_same():
     rings = {name: jnp.asarray(generator.normal(size=(SAMPLES, LANES))) for name in "abc"}
     values = {name: jnp.asarray(generator.normal(size=LANES)) for name in "abc"}
     for tick in (jnp.array(number, jnp.int32) for number in range(2 * SAMPLES)):
-        one_by_one = {name: write(rings[name], tick, values[name]) for name in rings}
-        jax.tree.map(np.testing.assert_array_equal, write_in_turn(rings, tick, values), one_by_one)
+        one_by_one = {name: write_sample(rings[name], tick, values[name]) for name in rings}
+        jax.tree.map(np.testing.assert_array_equal, write_samples(rings, tick, values), one_by_one)
 
 
 def test_ring_buffer_tie_changes_no_value_and_no_derivative():

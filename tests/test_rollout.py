@@ -31,10 +31,10 @@ from lanes import (
 
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT
-from jaxhil.simulation.rollout import rollout, run_contacts, stretch_length
+from jaxhil.simulation.rollout import rollout, run_contacts, segment_length
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import draw_noise
 
@@ -116,7 +116,7 @@ def test_rollout_work_agrees_with_oracle(name):
     "name", [one for one in slow_if_seldom if "clearance" not in CASES[one.values[0]].mechanism["contact"]]
 )
 def test_rollout_first_contact_ends_at_the_oracles_tick(name):
-    ticks, length = cases.loop_contacts(name)[0]["ticks"], stretch_length(cases.batches()[name].loop)
+    ticks, length = cases.loop_contacts(name)[0]["ticks"], segment_length(cases.batches()[name].loop)
     assert 0 < ticks - cases.oracle_contacts(name)[0]["end_tick"] <= length
 
 

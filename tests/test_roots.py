@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhil.simulation.roots import ROUNDING, crossing
+from jaxhil.simulation.roots import ARGUMENT_TOLERANCE, find_sign_change
 
 POWERS = np.array([1.0, 0.5, 0.2, 0.1])
 
@@ -20,12 +20,12 @@ def root_of(height):
         return jnp.where(touching, power, 0) - height
 
     zeros = jnp.zeros_like(POWERS)
-    return crossing(function, height, zeros, zeros + 1, zeros + 1)
+    return find_sign_change(function, height, zeros, zeros + 1, zeros + 1)
 
 
 @pytest.mark.parametrize("height", [0.9, 0.3, 0.1])
 def test_roots_of_powers_are_the_closed_form(height):
     """Cover a contact whose force ends at a power of the depth: its root is next to the surface."""
     result, slope = jax.jvp(root_of, (jnp.asarray(height),), (jnp.ones(()),))
-    np.testing.assert_allclose(result, height ** (1 / POWERS), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(result, height ** (1 / POWERS), rtol=0, atol=ARGUMENT_TOLERANCE)
     np.testing.assert_allclose(slope, height ** (1 / POWERS - 1) / POWERS, rtol=1e-3, atol=1e-6)

@@ -5,10 +5,10 @@ import pytest
 from lead_cases import lead_tasks
 
 from jaxhil.simulation.one_axis import evaluate
-from tuning.gains import rounds
-from tuning.gains.objective import RMS, Objective, objective_value
-from tuning.gains.rounds import GIVEN_UP, solve_tasks
-from tuning.gains.tasks import alike, gain_bounds, spread_points, tuned_names
+from tuning.gains import multistart_solver
+from tuning.gains.multistart_solver import GIVEN_UP, solve_tasks
+from tuning.gains.objective import RMS_OBJECTIVE, Objective, evaluate_objective
+from tuning.gains.tasks import build_gain_bounds, group_by_program, list_tuned_gains, spread_points
 from tuning.gains.validation import build_validation
 from tuning.optimisation.unit_box import to_coordinates
 
@@ -22,17 +22,17 @@ def tasks():
 
 def spread(tasks, number=STARTS):
     """The literature's gains and points around them."""
-    names = tuned_names(tasks)
+    names = list_tuned_gains(tasks)
     starts = []
     for task in tasks:
         first = np.array([task.literature[name] for name in names])
-        starts.append(spread_points(to_coordinates(first, gain_bounds(task, names)), number, 0))
+        starts.append(spread_points(to_coordinates(first, build_gain_bounds(task, names)), number, 0))
     return starts
 
 
 @pytest.fixture(scope="module")
 def solved(tasks):
-    assert alike([task.loop for task in tasks], [task.scenarios for task in tasks]) == [[0, 1, 2]]
+    assert group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks]) == [[0, 1, 2]]
     return solve_tasks(tasks, spread(tasks), STEPS)
 
 
@@ -49,11 +49,13 @@ def test_every_start_is_accounted_for(solved):
             assert (np.diff(start.history) <= 0).all()
             assert start.rms == start.history[-1]
         left = [start for start in starts if start.status == GIVEN_UP]
-        went_on = [start for start in starts if start.steps > rounds.FIRST_ROUND]
-        assert len(left) <= STARTS - rounds.PROMISING
-        assert all(start.steps == rounds.FIRST_ROUND for start in left)
+        went_on = [start for start in starts if start.steps > multistart_solver.STEPS_BEFORE_SELECTION]
+        assert len(left) <= STARTS - multistart_solver.MAX_CONTINUED_STARTS
+        assert all(start.steps == multistart_solver.STEPS_BEFORE_SELECTION for start in left)
         for start in left:
-            assert all(start.rms >= other.history[rounds.FIRST_ROUND - 1] for other in went_on)
+            assert all(
+                start.rms >= other.history[multistart_solver.STEPS_BEFORE_SELECTION - 1] for other in went_on
+            )
     assert any(start.status == GIVEN_UP for starts in solved for start in starts)
 
 
@@ -66,7 +68,7 @@ def test_every_task_ends_as_it_does_alone(tasks, solved):
 
 def test_failed_task_harms_no_other(tasks, solved):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
-    sick = rounds.dataclasses.replace(tasks[1], scenarios=broken)
+    sick = multistart_solver.dataclasses.replace(tasks[1], scenarios=broken)
     starts = solve_tasks([tasks[0], sick, tasks[2]], spread(tasks), STEPS)
     for i in (0, 2):
         assert [start.gains for start in starts[i]] == [start.gains for start in solved[i]]
@@ -75,24 +77,26 @@ def test_failed_task_harms_no_other(tasks, solved):
 
 def test_solver_lowers_the_requested_objective(tasks):
     """Weigh a squared divergence 16 times, so that less diverges; both objectives in one call."""
-    objectives = [RMS, Objective(divergence_weight=16.0)]
+    objectives = [RMS_OBJECTIVE, Objective(divergence_weight=16.0)]
     plain, cautious = (
         min(starts, key=lambda start: start.rms)
         for starts in solve_tasks([tasks[0], tasks[0]], spread([tasks[0], tasks[0]], 2), STEPS, objectives)
     )
     errors = [restitution_errors_of(tasks[0], start.gains) for start in (plain, cautious)]
     for start, objective, own in zip((plain, cautious), objectives, errors, strict=True):
-        assert start.rms == pytest.approx(objective_value(objective, own), rel=1e-9)
+        assert start.rms == pytest.approx(evaluate_objective(objective, own), rel=1e-9)
     assert np.maximum(errors[1], 0).sum() < np.maximum(errors[0], 0).sum()
 
 
 def test_global_search_uses_the_objective_of_the_solver(tasks, solved, validation):
     for index, starts in enumerate(solved):
         coordinates = np.stack([start.coordinates for start in starts])
-        values = validation.losses(RMS, [index], coordinates[None])[0]
+        values = validation.losses(RMS_OBJECTIVE, [index], coordinates[None])[0]
         np.testing.assert_allclose(values, [start.rms for start in starts], rtol=1e-9)
         alone = evaluate(tasks[index].loop, starts[0].gains, tasks[index].scenarios)
-        assert values[0] == pytest.approx(objective_value(RMS, alone.error[alone.wanted]), rel=1e-9)
+        assert values[0] == pytest.approx(
+            evaluate_objective(RMS_OBJECTIVE, alone.error[alone.wanted]), rel=1e-9
+        )
 
 
 def test_every_task_is_searched_under_its_own_objective(tasks, validation):
@@ -104,7 +108,9 @@ def test_every_task_is_searched_under_its_own_objective(tasks, validation):
         np.testing.assert_array_equal(
             together[i], validation.losses(several[task], [task], points[i : i + 1])[0]
         )
-        assert (np.abs(together[i] / validation.losses(RMS, [task], points[i : i + 1])[0] - 1) > 1e-4).any()
+        assert (
+            np.abs(together[i] / validation.losses(RMS_OBJECTIVE, [task], points[i : i + 1])[0] - 1) > 1e-4
+        ).any()
 
 
 def restitution_errors_of(task, gains):
@@ -115,5 +121,5 @@ def restitution_errors_of(task, gains):
 
 def test_long_tasks_are_spread_evenly_over_devices():
     """Divide the slots of a call into one contiguous part for each of the two devices."""
-    np.testing.assert_array_equal(rounds.sharded(8), [0, 2, 4, 6, 1, 3, 5, 7])
-    np.testing.assert_array_equal(rounds.sharded(3), [0, 1, 2])
+    np.testing.assert_array_equal(multistart_solver.assign_to_devices(8), [0, 2, 4, 6, 1, 3, 5, 7])
+    np.testing.assert_array_equal(multistart_solver.assign_to_devices(3), [0, 1, 2])

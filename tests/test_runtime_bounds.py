@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mechanism_table import changed
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.mechanism.file import builtin_names, from_builtins, load, suite_names
+from jaxhil.mechanism.file import builtin_names, from_plain_data, load, suite_names
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.bounds import CONTROL_PERIODS, FORCES
@@ -85,7 +85,7 @@ def test_bounds_admit_gains_of_any_sane_rig(period, mass, frequency, speed, dela
             "uncertainty": {},
         }
     )
-    assert beyond(from_builtins(raw, "rig")) == []
+    assert beyond(from_plain_data(raw, "rig")) == []
 
 
 def test_bounds_are_finite_and_every_limit_has_one_by_default():

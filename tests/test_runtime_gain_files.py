@@ -160,7 +160,7 @@ def test_gain_file_that_does_not_fit_is_refused_by_key(edit, words):
 def test_gain_file_with_delay_of_too_many_periods_is_refused():
     document = gain_document(control_period=1e-5)
     document["gains"]["identification_delay"] |= {"value": 1.5, "upper": 1.5}
-    refused(sign(document), "gains", "periods, allowed 0 to 100000")
+    refused(sign(document), "gains", "periods, expected 0 to 100000")
 
 
 def test_gain_file_schema_and_digest_are_checked_first():

@@ -27,7 +27,7 @@ from jaxhil.rig.faults import (
     STROKE,
     TARE,
     VELOCITY_LIMIT,
-    names,
+    fault_names,
 )
 from jaxhil.rig.limits import LIMITS
 
@@ -38,14 +38,14 @@ def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
         position = start + 5e-6 * n
         assert controller.step(0.0, position, 5e-3, position - 1e-5, n * PERIOD) == 0.0
         assert controller.position_command(position + 5e-6, 5e-3, 0.0) == position + 5e-6
-        assert controller.faults == 0, names(controller.faults)
+        assert controller.faults == 0, fault_names(controller.faults)
     return start + 5e-6 * ticks
 
 
 def test_fault_table_has_one_bit_and_one_name_per_fault():
     assert [fault.bit for fault in FAULTS] == [1 << n for n in range(len(FAULTS))]
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
-    assert names(FORCE_SLEW | TARE) == ["force_slew", "tare"]
+    assert fault_names(FORCE_SLEW | TARE) == ["force_slew", "tare"]
 
 
 BAD_READINGS = {

@@ -80,7 +80,7 @@ def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
         for turn in range(MUTATIONS):
             content, line = mutated(source, files[name])
             (folder / name).write_bytes(content)
-            _, problems = selftest.differences(folder)
+            _, problems = selftest.find_differences(folder)
             messages = [text for other, text in problems if other == name]
             assert len(problems) == len(messages) > 0, (name, line)
             if name != "manifest.json":
@@ -161,7 +161,7 @@ def test_selftest_counts_every_digit_of_every_gain(files, folder):
 
 def test_selftest_names_a_changed_command_and_the_controllers_command(files, folder):
     lines = files["vectors.csv"].decode().split("\n")
-    force = selftest.COLUMNS.split(",").index("force_command")
+    force = selftest.VECTOR_COLUMNS.split(",").index("force_command")
     number = next(n for n, line in enumerate(lines[1:], start=1) if float(line.split(",")[force]) > 1)
     fields = lines[number].split(",")
     expected = fields[force]
@@ -200,7 +200,7 @@ def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, 
     span = max(forces) - min(0.0, *forces)
     tick = max(range(len(forces)), key=lambda index: forces[index] < 0.9 * max(forces) and forces[index])
     rows[tick][-1] = repr(float(rows[tick][-1]) + share * span)
-    text = "\n".join([selftest.COLUMNS, *(",".join(row) for row in rows), ""])
+    text = "\n".join([selftest.VECTOR_COLUMNS, *(",".join(row) for row in rows), ""])
     for name, content in signed({**files, "vectors.csv": text.encode()}, document).items():
         (folder / name).write_bytes(content)
     result, out = run_selftest(folder)
@@ -209,10 +209,10 @@ def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, 
 
 
 def test_selftest_compares_numbers_bit_by_bit():
-    assert selftest.same_bits(float("nan"), -float("nan"))
-    assert not selftest.same_bits(0.0, -0.0)
-    assert not selftest.same_bits(0.1 + 0.2, 0.3)
-    assert not selftest.same_bits(float("nan"), 0.0)
+    assert selftest.are_same_bits(float("nan"), -float("nan"))
+    assert not selftest.are_same_bits(0.0, -0.0)
+    assert not selftest.are_same_bits(0.1 + 0.2, 0.3)
+    assert not selftest.are_same_bits(float("nan"), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -240,9 +240,9 @@ def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
         ("jaxhil_runtime.py", "Controller = 3", "cannot be run: NameError"),
         ("gains.json", "[]", "found a list"),
         ("vectors.csv", "a,b\n", "unknown columns"),
-        ("vectors.csv", selftest.COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
-        ("vectors.csv", selftest.COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event 0.0"),
-        ("vectors.csv", selftest.COLUMNS + "\n", "has no tick"),
+        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
+        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event 0.0"),
+        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n", "has no tick"),
     ]:
         for other, content in signed({**files, name: text.encode()}, document).items():
             (folder / other).write_bytes(content)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.optimisation.sensitivity import RISE, sensitivity
+from tuning.optimisation.sensitivity import LOSS_RISE, compute_gain_tolerance
 
 STIFF_ENOUGH = 0.05  # the box adds its square to the region, relatively
 
@@ -15,15 +15,15 @@ def quadratic():
 
 def test_gains_may_move_as_far_as_the_loss_allows():
     jacobian, loss = np.array([[50.0, 0.0], [0.0, 20.0]]), 0.5
-    result = sensitivity(jacobian, loss)
+    result = compute_gain_tolerance(jacobian, loss)
     # d^2 J^2 / 2 = rise * loss, in a box of one.
-    allowed = np.sqrt(2 * RISE * loss) / np.array([50.0, 20.0])
+    allowed = np.sqrt(2 * LOSS_RISE * loss) / np.array([50.0, 20.0])
     np.testing.assert_allclose(result.alone, 1 / np.hypot(1 / allowed, 1), rtol=1e-12)
     np.testing.assert_allclose(result.together, result.alone, rtol=1e-12)
 
 
 def test_gains_that_compensate_each_other_are_free_together():
-    result = sensitivity(quadratic(), 0.5)
+    result = compute_gain_tolerance(quadratic(), 0.5)
     assert result.alone[0] == pytest.approx(result.alone[1], rel=1e-4)
     assert result.alone[0] < 1e-3
     assert result.together[0] > 30 * result.alone[0]
@@ -36,7 +36,7 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
     # At the optimum of a linear least-squares problem, the residuals are orthogonal to J.
     residuals -= jacobian @ np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
     loss = np.sum(residuals**2) / 2
-    result = sensitivity(jacobian, loss)
+    result = compute_gain_tolerance(jacobian, loss)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     for gain in range(4):
         alone = result.alone[gain] * np.eye(4)[gain]
@@ -45,9 +45,9 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
         for step in (alone, together):
             assert np.max(np.abs(step)) < STIFF_ENOUGH
             moved = np.sum((residuals + jacobian @ step) ** 2) / 2
-            assert moved == pytest.approx((1 + RISE) * loss, rel=RISE * STIFF_ENOUGH**2)
+            assert moved == pytest.approx((1 + LOSS_RISE) * loss, rel=LOSS_RISE * STIFF_ENOUGH**2)
 
 
 def test_fewer_residuals_than_gains_leave_the_rest_free():
-    result = sensitivity(np.array([[3.0, 0.0, 4.0]]), 0.5)
+    result = compute_gain_tolerance(np.array([[3.0, 0.0, 4.0]]), 0.5)
     assert result.together[1] == pytest.approx(1)

@@ -14,7 +14,7 @@ from lanes import SECOND_ORDER, VELOCITY, mechanism, run_rollout
 from jaxhil.laws.none.simulation import NoCompensator
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.metrics import NOT_REACHED, OK
-from jaxhil.simulation.rollout import start
+from jaxhil.simulation.rollout import start_rollout
 
 LATE = 0.011  # s of force delay: uncompensated, a contact ends faster than it begins
 LIMITS = {  # speed [m/s], and whether the limit binds
@@ -140,6 +140,6 @@ def test_loop_without_limits_keeps_no_shortfall_state(batch):
     assert batch.loop.has_limits and not free.loop.has_limits
     for one in (batch, free):
         rig = jax.eval_shape(functools.partial(build_rig_constants, one.loop), one.scenario)
-        run = jax.eval_shape(functools.partial(start, one.loop), rig, one.gains)
+        run = jax.eval_shape(functools.partial(start_rollout, one.loop), rig, one.gains)
         state = run.watch.shortfall, run.state.plant.wanted
         assert [leaf is not None for leaf in state] == [one.loop.has_limits] * 2

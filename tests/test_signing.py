@@ -22,7 +22,7 @@ from test_bundle_checking import flipped, placed
 import tuning
 from jaxhil.errors import InputError
 from tuning.bundle.checking import check_bundle
-from tuning.bundle.signing import signer, verifier
+from tuning.bundle.signing import load_signer, load_verifier
 from tuning.gain_file import write_gain_file
 
 
@@ -48,7 +48,7 @@ def key(tmp_path):
 def folder(key, tmp_path):
     """A signed bundle."""
     files = small_files()
-    signature = signer(key[0])(files["manifest.json"])
+    signature = load_signer(key[0])(files["manifest.json"])
     return placed(tmp_path / "bundle", {**files, "manifest.sig": signature})
 
 
@@ -61,7 +61,7 @@ def test_signature_is_that_of_rfc_8032(tmp_path):
     )
     pair = Ed25519PrivateKey.from_private_bytes(bytes.fromhex(secret))
     (tmp_path / "key.pem").write_bytes(as_private(pair))
-    assert signer(tmp_path / "key.pem")(b"\x72").hex() == signature
+    assert load_signer(tmp_path / "key.pem")(b"\x72").hex() == signature
 
 
 def test_verify_without_key_claims_no_proof(folder):
@@ -76,11 +76,11 @@ def test_verify_without_key_claims_no_proof(folder):
 
 
 def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
-    by_key = verifier(key[1])
+    by_key = load_verifier(key[1])
     assert check_bundle(folder, by_key).signature == "by the key given"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
     result = tuning.verify(folder, key=tmp_path / "other.pem")
-    expected = "manifest.sig: found another, allowed the manifest's by the key given"
+    expected = "manifest.sig: found another, expected the manifest's by the key given"
     assert not result.good and result.reasons == [expected] and result.document["self_test"] == []
     # Reseal after a change, as anybody without the key could: all but the signature fits.
     files = small_files()
@@ -92,7 +92,7 @@ def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
 
 @pytest.mark.parametrize("flips", [60, pytest.param(1000, marks=pytest.mark.slow)])
 def test_verify_detects_any_flipped_bit_of_signature_or_signed_content(key, folder, flips):
-    source, by_key = random.Random(flips), verifier(key[1])
+    source, by_key = random.Random(flips), load_verifier(key[1])
     for turn in range(flips):
         path = folder / ("manifest.sig", "manifest.json")[turn % 2]
         content = path.read_bytes()
@@ -106,7 +106,7 @@ def test_verify_detects_any_flipped_bit_of_signature_or_signed_content(key, fold
 @pytest.mark.parametrize("size", [0, 63, 64, 65])
 def test_invalid_signature_proves_nothing(key, folder, size):
     (folder / "manifest.sig").write_bytes(bytes(size))
-    assert check_bundle(folder, verifier(key[1])).reasons[0].startswith("manifest.sig: found ")
+    assert check_bundle(folder, load_verifier(key[1])).reasons[0].startswith("manifest.sig: found ")
     assert (check_bundle(folder).reasons == []) is run_selftest(folder)[0] is (size <= 64)
 
 
@@ -119,7 +119,7 @@ def test_openssl_makes_the_keys_and_verifies_the_signature(tmp_path):
     ):
         assert subprocess.run(command.split(), cwd=tmp_path, capture_output=True).returncode == 0
     files = small_files()
-    signature = signer(tmp_path / "key.pem")(files["manifest.json"])
+    signature = load_signer(tmp_path / "key.pem")(files["manifest.json"])
     placed(tmp_path, {**files, "manifest.sig": signature})
     proof = "openssl pkeyutl -verify -pubin -inkey public.pem -rawin -in manifest.json -sigfile manifest.sig"
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode == 0
@@ -142,14 +142,14 @@ def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
         (b"x" * 100_000, "a larger file", "a larger file"),
     ]:
         copy.write_bytes(text)
-        for read, result, allowed in [(signer, private, "private"), (verifier, public, "public")]:
+        for read, result, allowed in [(load_signer, private, "private"), (load_verifier, public, "public")]:
             if result is None:
                 read(copy)
                 continue
             with pytest.raises(InputError) as caught:
                 read(copy)
             line = str(caught.value)
-            assert f"kept.pem: found {result}, allowed an Ed25519 {allowed} key" in line and "\n" not in line
+            assert f"kept.pem: found {result}, expected an Ed25519 {allowed} key" in line and "\n" not in line
     ran = jaxhil("verify", folder, "--key", tmp_path / "none.pem")
     assert (ran.code, ran.out) == (2, "") and "none.pem: cannot be read: No such file" in ran.err
     gains = tmp_path / "gains.json"
@@ -163,7 +163,7 @@ def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
 def test_missing_signing_package_is_reported_in_one_line(key, folder, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
-    for read, file in ((signer, key[0]), (verifier, key[1])):
-        with pytest.raises(InputError, match=r"allowed with it: pip install 'jaxhil\[sign\]'"):
+    for read, file in ((load_signer, key[0]), (load_verifier, key[1])):
+        with pytest.raises(InputError, match=r"expected with it: pip install 'jaxhil\[sign\]'"):
             read(file)
     assert check_bundle(folder).reasons == []

@@ -10,7 +10,7 @@ from cases import CASES
 from lanes import spread, validated
 
 from jaxhil.laws.none.simulation import NoCompensator
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS
 
 

@@ -7,7 +7,7 @@ import pytest
 from drawn_mechanisms import BAR, FIGURES, Form, differences, oracle_figures
 from lanes import join, run_rollout, validated
 
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.scenario import build_scenarios
 

@@ -13,14 +13,14 @@ import pytest
 from gain_documents import gain_document
 
 from jaxhil.rig import COMPENSATORS, Controller
-from tuning.bundle.single_file import runtime_source
+from tuning.bundle.single_file import build_runtime_source
 
 
 @pytest.fixture(scope="module", params=sorted(COMPENSATORS))
 def exported(request, tmp_path_factory):
     """Write the runtime for one compensator as one file, beside a gain file of it."""
     folder = tmp_path_factory.mktemp("single")
-    (folder / "jaxhil_runtime.py").write_text(runtime_source(request.param))
+    (folder / "jaxhil_runtime.py").write_text(build_runtime_source(request.param))
     (folder / "gains.json").write_text(json.dumps(gain_document(request.param)))
     return request.param, folder
 
@@ -130,8 +130,8 @@ def test_single_file_holds_what_a_law_imports_and_no_other_law(package):
         second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"
         "class Second:\n    number = SHARED\n",
     )
-    assert "SHARED" not in runtime_source("first", made)
-    text = runtime_source("second", made)
+    assert "SHARED" not in build_runtime_source("first", made)
+    text = build_runtime_source("second", made)
     in_one_file = run_source(text)
     assert in_one_file["COMPENSATORS"]["second"].number == 4
     assert "First" not in text and in_one_file["__all__"] == ["COMPENSATORS", "Controller"]
@@ -146,7 +146,7 @@ def test_single_file_holds_what_a_law_imports_and_no_other_law(package):
         ("from . import registry\n", "a relative import"),
         ("from .registry import register as enter\n", "under another name"),
         ("from .circle import A\n", "import each other"),
-        ("def register():\n    pass\n", "register: found in .*registry and in .*controller, allowed once"),
+        ("def register():\n    pass\n", "register: found in .*registry and in .*controller, expected once"),
         ("import re as register\n", "register: found in .*registry and in import re as register"),
         ("from .same import X\nimport cmath as m\n", "m: found in import math as m and in import cmath as m"),
         ("for register in (): pass\n", "register: found in .*registry and in .*controller"),
@@ -159,9 +159,9 @@ def test_single_file_refuses_what_it_cannot_hold(package, controller, reason):
     (folder / "same.py").write_text("import math as m\nX = m.inf\n")
     (folder / "controller.py").write_text(absolute(controller, made.__name__) + "class Controller: pass\n")
     with pytest.raises(ValueError, match=reason):
-        runtime_source("first", made)
+        build_runtime_source("first", made)
 
 
 def test_single_file_of_unknown_compensator_is_a_key_error():
     with pytest.raises(KeyError):
-        runtime_source("no such law")
+        build_runtime_source("no such law")

@@ -19,7 +19,7 @@ from browser import LAYOUT
 
 import jaxhil
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.mechanism.keys import tables
+from jaxhil.mechanism.keys import describe_tables
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.parser import Command
@@ -52,7 +52,7 @@ def reference():
 )
 def test_site_has_every_key_of_the_mechanism_file(reference, page, kind):
     text = reference[f"reference/{page}.md"]
-    for table in tables(kind):
+    for table in describe_tables(kind):
         part = text[text.index(f"## `[{table.path}]`") :] if table.path else text
         for key in table.keys:
             row = re.search(rf"^\| `{key.name}` \|.*", part, re.M)[0].split(" | ")

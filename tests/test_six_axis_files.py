@@ -11,10 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import any_from_builtins, builtin_path, load, load_any, six_axis_names, to_builtins
+from jaxhil.mechanism.file import (
+    any_from_plain_data,
+    builtin_path,
+    load,
+    load_any,
+    six_axis_names,
+    to_plain_data,
+)
 from jaxhil.mechanism.six_axes import numeric_keys_of
 from jaxhil.mechanism.toml_table import parse_toml
-from jaxhil.mechanism.uncertainty import PHASE, draw
+from jaxhil.mechanism.uncertainty import PHASE_KEY, draw
 
 RAW = {name: parse_toml(builtin_path(name).read_bytes(), name, "") for name in six_axis_names()}
 BODY = {"position": [0, 0, 0], "attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
@@ -34,8 +41,8 @@ def test_six_axis_builtins_are_read_and_state_their_sources(name):
     mechanism = load_any(name).mechanism
     assert mechanism.name == name and mechanism.uncertainty
     assert "assumed" in mechanism.source
-    text = json.dumps(to_builtins(mechanism), allow_nan=False)
-    assert any_from_builtins(json.loads(text), name) == mechanism
+    text = json.dumps(to_plain_data(mechanism), allow_nan=False)
+    assert any_from_plain_data(json.loads(text), name) == mechanism
 
 
 def test_six_values_may_be_given_as_one_or_two():
@@ -55,42 +62,43 @@ def test_six_values_may_be_given_as_one_or_two():
 @pytest.mark.parametrize(
     ("override", "reason"),
     [
-        ("schema=jaxhil/mechanism/3", "schema: found 'jaxhil/mechanism/3', allowed"),
-        ("schema=jaxhil/mechanism/1", "found 'jaxhil/mechanism/1' beside target and chaser, allowed jaxhil"),
-        ("target.inertia=[0, 0, 0]", "nothing but zeros, in kg m^2, allowed positive principal moments"),
-        ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, allowed those of a body"),
-        ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, allowed positive"),
-        ("target.inertia=[1, 1, 1e-7]", "moments from 1e-07 to 1 kg m^2, allowed those of a body: none less"),
+        ("schema=jaxhil/mechanism/3", "schema: found 'jaxhil/mechanism/3', expected"),
+        ("schema=jaxhil/mechanism/1", "found 'jaxhil/mechanism/1' beside target and chaser, expected jaxhil"),
+        ("target.inertia=[0, 0, 0]", "nothing but zeros, in kg m^2, expected positive principal moments"),
+        ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, expected those of a body"),
+        ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, expected positive"),
+        ("target.inertia=[1, 1, 1e-7]", "moments from 1e-07 to 1 kg m^2, expected those of a body: none "
+                                        "less"),
         ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, 1 there transposed"),
         ("target.inertia=[[1, 0, 0], 2, 3]", "three moments, or three rows"),
-        ("chaser.interface=[0, 0, 1.0]", "allowed one beyond C, at positive z"),
+        ("chaser.interface=[0, 0, 1.0]", "expected one beyond C, at positive z"),
         ("target.interface_rotation=[3, 0, 0]", "target.interface: found a centre of mass at z = 1.18"),
-        ("target.interface_rotation=[4, 0, 0]", "a rotation by 4 rad, allowed a rotation vector shorter"),
-        ("approach.attitude=[1, 1, 0]", "a rotation by 1.414 rad, allowed a rotation vector of at most 1"),
-        ("approach.velocity[2]=0.01", "approach.velocity[2]: found 0.01, allowed a number < 0 m/s"),
-        ("contact={}", "contact: found nothing, allowed [contact.NAME]"),
-        ("contact={law='linear', stiffness=1}", "a table without a name: law, stiffness, allowed [contact."),
-        ("contact.tip.target.half_angle=45", "found 45, allowed a number > 0 rad and < 1.5708 rad"),
+        ("target.interface_rotation=[4, 0, 0]", "a rotation by 4 rad, expected a rotation vector shorter"),
+        ("approach.attitude=[1, 1, 0]", "a rotation by 1.414 rad, expected a rotation vector of at most 1"),
+        ("approach.velocity[2]=0.01", "approach.velocity[2]: found 0.01, expected a number < 0 m/s"),
+        ("contact={}", "contact: found nothing, expected [contact.NAME]"),
+        ("contact={law='linear', stiffness=1}", "a table without a name: law, stiffness, expected [contact."),
+        ("contact.tip.target.half_angle=45", "found 45, expected a number > 0 rad and < 1.5708 rad"),
         ("contact.tip.target={shape='plane', point=[0, 0, 0]}",
-         "normal: found nothing, allowed a list of 3 entries, each a finite number (plane needs it)"),
+         "normal: found nothing, expected a list of 3 entries, each a finite number (plane needs it)"),
         ("contact.tip.friction={law='regularised', coefficient=1}",
-         "slip: found nothing, allowed a number > 0 m/s (regularised needs it)"),
-        ("contact.tip.stifness=1", "an unknown key, allowed one of chaser, target"),
+         "slip: found nothing, expected a number > 0 m/s (regularised needs it)"),
+        ("contact.tip.stifness=1", "an unknown key, expected one of chaser, target"),
         ("contact.tip.stifness=1", "did you mean stiffness?"),
-        ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], allowed a number > 0 N/m (law hunt_crossley)"),
-        ("contact.tip.law=hardening", "reference_depth: found nothing, allowed a number > 0"),
-        ("contact.tip.depths=[1]", "depths: found [1.0], allowed nothing (only for law piecewise_linear)"),
-        ("contact.tip.friction.law=bristle", "slip: found 0.0025, allowed nothing (bristle"),
-        ("contact.tip.chaser.radius=0.05", "0.05, allowed a number < 0.04 m, the radius that it is to fit"),
-        ("contact.tip.chaser.radius=0", "allowed a number > 0 m: a drogue with a mouth is a thin shell"),
-        ("contact.tip.chaser.from=[0, 0, 0]", "allowed nothing (sphere does not use it: unset it)"),
-        ("contact.tip.chaser.shape=drogue", "centre: found [0.0, 0.0, 0.0], allowed nothing (drogue"),
-        ("contact.tip.target.mouth_radius=0.02", "allowed a number > 0.0292"),
-        ("contact.tip.target_pattern.phase=1", "allowed nothing, or pattern = { count = N } beside it"),
-        ("rig.simulator.delay=[1, 2]", "a list of 2 entries, allowed a list of 6 entries"),
-        ("rig.simulator.delay=2.0", "rig.simulator.delay[0]: found 2.0, allowed a number from 0 to 1 s"),
+        ("contact.tip.stiffness=[1, 2]", "[1.0, 2.0], expected a number > 0 N/m (law hunt_crossley)"),
+        ("contact.tip.law=hardening", "reference_depth: found nothing, expected a number > 0"),
+        ("contact.tip.depths=[1]", "depths: found [1.0], expected nothing (only for law piecewise_linear)"),
+        ("contact.tip.friction.law=bristle", "slip: found 0.0025, expected nothing (bristle"),
+        ("contact.tip.chaser.radius=0.05", "0.05, expected a number < 0.04 m, the radius that it is to fit"),
+        ("contact.tip.chaser.radius=0", "expected a number > 0 m: a drogue with a mouth is a thin shell"),
+        ("contact.tip.chaser.from=[0, 0, 0]", "expected nothing (sphere does not use it: unset it)"),
+        ("contact.tip.chaser.shape=drogue", "centre: found [0.0, 0.0, 0.0], expected nothing (drogue"),
+        ("contact.tip.target.mouth_radius=0.02", "expected a number > 0.0292"),
+        ("contact.tip.target_pattern.phase=1", "expected nothing, or pattern = { count = N } beside it"),
+        ("rig.simulator.delay=[1, 2]", "a list of 2 entries, expected a list of 6 entries"),
+        ("rig.simulator.delay=2.0", "rig.simulator.delay[0]: found 2.0, expected a number from 0 to 1 s"),
         ("rig.simulator.model=ideal", "damping_ratio: found [0.8, 0.8,"),
-        ("rig.force_sensor.side=fixed", "tool: found a table, allowed nothing (a fixed sensor"),
+        ("rig.force_sensor.side=fixed", "tool: found a table, expected nothing (a fixed sensor"),
         ("rig.force_sensor.tool.inertia=[1, 1, 3]", "tool.inertia: found principal moments 1, 1 and 3"),
         ("rig.force_sensor.crosstalk=[[0,1,0,0,0,0],[1,0,0,0,0,0],[0,0,0,0,0,0],[0,0,0,0,0,0],"
          "[0,0,0,0,0,0],[0,0,0,0,0,0]]", "crosstalk: found channels that are nearly the same"),
@@ -98,7 +106,7 @@ def test_six_values_may_be_given_as_one_or_two():
         ('uncertainty."contact.tip.stifness"={distribution="normal",std=1}', "did you mean contact.tip"),
         ('uncertainty."target.inertia"={distribution="normal",std=1,independent=true}', "are not symmetric"),
         ('uncertainty."approach.velocity"={distribution="uniform",low=-0.1,high=0.1,independent=true}',
-         "a z component as far as 0.1, allowed draws below 0 m/s"),
+         "a z component as far as 0.1, expected draws below 0 m/s"),
     ],
 )  # fmt: skip
 def test_unusable_six_axis_values_are_named(override, reason):
@@ -113,28 +121,30 @@ LEGS = "hydraulic-hexapod"
 @pytest.mark.parametrize(
     ("name", "changes", "reason"),
     [
-        ("ring-capture", {"latch.hooks.depth": None}, "found nothing, allowed a number >= 0 m, or latched"),
-        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, allowed false: an approach"),
-        ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, allowed six numbers"),
-        ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix beside it, allowed"),
+        ("ring-capture", {"latch.hooks.depth": None}, "found nothing, expected a number >= 0 m, or latched"),
+        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false: an approach"),
+        ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, expected six numbers"),
+        ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix beside it, expected"),
         ("ring-capture",
          {"latch.hooks.stiffness": None, "latch.hooks.stiffness_matrix": NO_SPRING,
-          "uncertainty": {}}, "or has an eigenvalue below 0, allowed that of a spring"),
-        ("ring-capture", {"latch.hooks.angel": 0.1}, "an unknown key, allowed one of chaser, pattern"),
-        ("ring-capture", {"latch.hooks.pattern.count": 0}, "count: found 0, allowed an integer from 1"),
-        ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, 'latch."a b": found this name, allowed'),
-        (LEGS, {"rig.simulator.height": None}, 'height: found nothing, allowed what space = "stewart" needs'),
-        (LEGS, {"rig.simulator.base": [[0, 0, 0]]}, "base: found a list of 1 entry, allowed a list of 6"),
-        (LEGS, {"rig.simulator.base[2]": [0, 0]}, "base[2]: found a list of 2 entries, allowed a list of 3"),
-        (LEGS, {"rig.simulator.stroke": [2, 1]}, "stroke: found [2.0, 1.0], allowed a longest leg longer"),
+          "uncertainty": {}}, "or has an eigenvalue below 0, expected that of a spring"),
+        ("ring-capture", {"latch.hooks.angel": 0.1}, "an unknown key, expected one of chaser, pattern"),
+        ("ring-capture", {"latch.hooks.pattern.count": 0}, "count: found 0, expected an integer from 1"),
+        ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, 'latch."a b": found this name, expected'),
+        (LEGS, {"rig.simulator.height": None}, 'height: found nothing, expected what space = "stewart" '
+                                               'needs'),
+        (LEGS, {"rig.simulator.base": [[0, 0, 0]]}, "base: found a list of 1 entry, expected a list of 6"),
+        (LEGS, {"rig.simulator.base[2]": [0, 0]}, "base[2]: found a list of 2 entries, expected a list of 3"),
+        (LEGS, {"rig.simulator.stroke": [2, 1]}, "stroke: found [2.0, 1.0], expected a longest leg longer"),
         (LEGS, {"rig.simulator.delay": {"translation": 1e-3, "rotation": 2e-3}}, "list of six, one each leg"),
         (LEGS, {"rig.simulator.space": "task"}, '(space = "task" does not use it)'),
         (LEGS, {"rig.simulator.space": "two_robots", "rig.simulator.target_robot.share": 0.5},
          'base: found [[1.58, 0.255, 0.0]'),
-        ("claw-two-arms", {"rig.simulator.target_robot": None}, "target_robot: found nothing, allowed what"),
-        ("claw-two-arms", {"rig.simulator.target_robot.share": 1.5}, "share[0]: found 1.5, allowed a number"),
+        ("claw-two-arms", {"rig.simulator.target_robot": None}, "target_robot: found nothing, expected what"),
+        ("claw-two-arms", {"rig.simulator.target_robot.share": 1.5}, "share[0]: found 1.5, expected a "
+                                                                     "number"),
         ("claw-two-arms", {"rig.simulator.target_robot.time_constant": 0.1}, "(model second_order does not"),
-        ("claw-two-arms", {"rig.simulator.space": "tasks"}, "allowed one of stewart, task, two_robots"),
+        ("claw-two-arms", {"rig.simulator.space": "tasks"}, "expected one of stewart, task, two_robots"),
     ],
 )  # fmt: skip
 def test_unusable_latches_and_simulators_are_named(name, changes, reason):
@@ -145,26 +155,26 @@ def test_shapes_that_cannot_touch_are_refused():
     capsule = {"shape": "capsule", "from": [0, 0, 0], "to": [0, 0, 1], "radius": 0.1}
     raw = copy.deepcopy(RAW["probe-drogue"])
     raw["contact"]["tip"]["chaser"] = capsule
-    with pytest.raises(InputError, match="found drogue against the chaser's capsule, allowed a sphere on"):
-        any_from_builtins(raw, "f")
+    with pytest.raises(InputError, match="found drogue against the chaser's capsule, expected a sphere on"):
+        any_from_plain_data(raw, "f")
     raw["contact"]["tip"]["target"] = {**capsule, "to": [0, 0, 0]}
     with pytest.raises(InputError, match=r"contact\.tip\.target\.to: found the point that is from"):
-        any_from_builtins(raw, "f")
+        any_from_plain_data(raw, "f")
     raw["contact"]["tip"]["target"] = capsule
-    assert any_from_builtins(raw, "f")
+    assert any_from_plain_data(raw, "f")
 
 
 def test_start_replaces_the_approach():
     start = {"start.target": BODY, "start.chaser": {**BODY, "position": [0, 0, 3]}}
-    with pytest.raises(InputError, match=r"start: found \[approach\] beside it, allowed one of the two"):
+    with pytest.raises(InputError, match=r"start: found \[approach\] beside it, expected one of the two"):
         load_any("probe-drogue", start)
     mechanism = load_any(
         "probe-drogue", {**start, "approach": None, "contact": {}, "uncertainty": {}}
     ).mechanism
-    assert mechanism.start.duration is None and PHASE not in draw(mechanism, 1, 0)
-    assert "approach: found nothing, allowed [approach], or [start]" in refusal(unset=["approach"])
+    assert mechanism.start.duration is None and PHASE_KEY not in draw(mechanism, 1, 0)
+    assert "approach: found nothing, expected [approach], or [start]" in refusal(unset=["approach"])
     start["start.chaser"]["attitude"] = [1, 0.1, 0, 0]
-    with pytest.raises(InputError, match=r"attitude: found one of norm 1\.0049876, allowed a quaternion"):
+    with pytest.raises(InputError, match=r"attitude: found one of norm 1\.0049876, expected a quaternion"):
         load_any("probe-drogue", {**start, "approach": None})
 
 
@@ -196,13 +206,13 @@ def test_six_axis_values_can_all_be_uncertain_including_lists_and_inertias():
     share = drawn["contact.edge_left.chaser.from"] / np.array([0.527, -0.286, 1.0])
     np.testing.assert_allclose(share[:, 0], share[:, 1])
     assert np.all(drawn["contact.edge_left.chaser.from"][:, 2] == 0)
-    assert np.all((drawn[PHASE] >= 0) & (drawn[PHASE] <= 1)) and drawn[PHASE].shape == (64,)
+    assert np.all((drawn[PHASE_KEY] >= 0) & (drawn[PHASE_KEY] <= 1)) and drawn[PHASE_KEY].shape == (64,)
     assert 0.008 < np.std(drawn["rig.force_sensor.crosstalk"]) < 0.012
 
 
 def test_commands_of_one_axis_refuse_six_axis_files():
     with pytest.raises(
-        InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, allowed jaxhil"
+        InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, expected jaxhil"
     ):
         load("petals")
 
@@ -234,11 +244,11 @@ def test_any_six_axis_table_is_read_or_refused_in_one_line(place, junk, sibling)
         raw = copy.deepcopy(RAW[name])
         at(raw, path[:-1])[path[-1]] = value
         try:
-            mechanism = any_from_builtins(raw, "f")
+            mechanism = any_from_plain_data(raw, "f")
         except InputError as error:
-            assert str(error).isprintable() and ": found " in str(error) and ", allowed " in str(error)
+            assert str(error).isprintable() and ": found " in str(error) and ", expected " in str(error)
         else:
-            assert any_from_builtins(to_builtins(mechanism), "f") == mechanism
+            assert any_from_plain_data(to_plain_data(mechanism), "f") == mechanism
 
 
 def at(node, path):

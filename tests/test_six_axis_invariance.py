@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from six_axes import FULL, lanes, place, plain_body, spheres, springs
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.sixdof.bodies import build_body, build_state, kinetic_energy
 from jaxhil.sixdof.candidates import TargetSpheres
 from jaxhil.sixdof.forces import ContactGroup
@@ -80,7 +80,9 @@ def test_contact_is_invariant_to_frames_and_names_of_the_bodies():
     expected, lost = after(pair, before, spheres(probe, 0.02 * ONE, drogue, "hunt_crossley", LAW, RUBBING))
     assert float(lost[0]) > 0.01
     swapped = Pair(pair.chaser, pair.target)
-    contact = ContactGroup(TargetSpheres(points, 0.02 * ONE, drogue), LAWS["hunt_crossley"], LAW, RUBBING)
+    contact = ContactGroup(
+        TargetSpheres(points, 0.02 * ONE, drogue), CONTACT_LAWS["hunt_crossley"], LAW, RUBBING
+    )
     result, other = after(swapped, States(before.chaser, before.target), contact)
     close(result[::-1], expected, before)
     np.testing.assert_allclose(other, lost, rtol=1e-8)

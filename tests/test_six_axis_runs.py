@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxhil as package
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import any_from_builtins, builtin_names, load_any, six_axis_names, to_builtins
+from jaxhil.mechanism.file import any_from_plain_data, builtin_names, load_any, six_axis_names, to_plain_data
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.building_contacts import candidate_names
@@ -85,7 +85,7 @@ def test_latches_and_robots_are_built_as_specified():
 def central(name):
     """Return one contact of a built-in mechanism of one axis as two bodies that meet on their line."""
     one = load_any(name, {"approach.contacts": 1}).mechanism
-    raw = to_builtins(one)
+    raw = to_plain_data(one)
     body = {"mass": 2 * one.bodies.mass, "inertia": [3.0, 4.0, 5.0]}
     contact = {key: value for key, value in raw["contact"].items() if key != "clearance"}
     contact |= {key: contact[key][0] for key in ("stiffness", "damping") if key in contact}
@@ -118,7 +118,7 @@ def test_central_contact_is_that_of_one_axis(name):
     one, raw = central(name)
     quiet = {"approach.contacts": 1, "rig.force_sensor.noise_std": 0.0, "rig.contact_plane": 0.0}
     expected = package.simulate(package.load(name, quiet), "none").contacts[0]
-    [result] = simulate_six_axes(any_from_builtins(raw, name)).episodes
+    [result] = simulate_six_axes(any_from_plain_data(raw, name)).episodes
     np.testing.assert_allclose(result.restitution, expected.restitution, rtol=1e-9)
     np.testing.assert_allclose(result.reference_restitution, expected.reference_restitution, rtol=1e-6)
     np.testing.assert_allclose(result.effective_mass, one.bodies.mass, rtol=1e-12)
@@ -137,7 +137,7 @@ def test_starts_that_cannot_be_run_are_refused():
         ("ring-capture", {**APART, "contact": {}, "start.chaser.position": [0.04, 0.06, 2.19]},
          "latch.hooks.depth: found 0.0002 m, deep enough at the start already"),
         ("ring-capture", {"approach.angular_velocity": [0, 60, 0]},
-         "approach.angular_velocity: found a rotation by 1.22 rad at the start, allowed at most 1 rad"),
+         "approach.angular_velocity: found a rotation by 1.22 rad at the start, expected at most 1 rad"),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
             simulate_six_axes(load_any(name, changes).mechanism)
@@ -146,11 +146,11 @@ def test_starts_that_cannot_be_run_are_refused():
         ({"approach.offset": [9.0, 0.0]}, "approach.offset: found nothing to touch"),
         (
             {"approach.velocity": [0, 0, -5.0]},
-            "approach.velocity: found shapes of contact.tip that pass at 5 m/s, allowed at most 1.25 m/s",
+            "approach.velocity: found shapes of contact.tip that pass at 5 m/s, expected at most 1.25 m/s",
         ),
         (
             {"rig.simulator.natural_frequency": {"translation": 14.0, "rotation": 2e4}},
-            "rig.simulator: found a pole of 1.26e+05 rad/s at a control period of 0.001 s, allowed at most",
+            "rig.simulator: found a pole of 1.26e+05 rad/s at a control period of 0.001 s, expected at most",
         ),
         ({"approach.duration": 999.0, "rig.control_period": 1e-5}, "approach.duration: found 999.02 s"),
         (
@@ -307,17 +307,20 @@ def test_bodies_at_rest_do_not_diverge():
 
 def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
     for arguments, reason in (
-        (["simulate", "petals", "--setting", "x"], "--setting: found 'x', allowed none: in six axes"),
+        (["simulate", "petals", "--setting", "x"], "--setting: found 'x', expected none: in six axes"),
         (
             ["simulate", "petals", "--animate", "x.avi"],
-            "--animate: found 'x.avi', allowed a name that ends in .gif",
+            "--animate: found 'x.avi', expected a name that ends in .gif",
         ),
         (["simulate", "petals", "--compensator", "response_error"], "phase_lead_per_axis: in six axes"),
-        (["simulate", "petals", "--reference", "--plot", "x.png"], "allowed none beside --reference"),
-        (["simulate", "rig-300kg", "--reference"], "--reference: found one axis, allowed a mechanism of six"),
+        (["simulate", "petals", "--reference", "--plot", "x.png"], "expected none beside --reference"),
+        (
+            ["simulate", "rig-300kg", "--reference"],
+            "--reference: found one axis, expected a mechanism of six",
+        ),
         (
             ["simulate", "rig-300kg", "--animate", "x.gif"],
-            "allowed none: there is an animation of six axes only",
+            "expected none: there is an animation of six axes only",
         ),
     ):
         ran = jaxhil(*arguments)
@@ -328,4 +331,4 @@ def test_init_copies_a_six_axis_builtin_under_a_name(jaxhil, tmp_path):
     path = tmp_path / "mine.toml"
     assert jaxhil("init", "petals", "-o", path).code == 0
     mine, builtin = load_any(path).mechanism, load_any("petals").mechanism
-    assert mine.name == "mine" and to_builtins(mine) | {"name": ""} == to_builtins(builtin) | {"name": ""}
+    assert mine.name == "mine" and to_plain_data(mine) | {"name": ""} == to_plain_data(builtin) | {"name": ""}

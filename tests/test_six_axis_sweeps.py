@@ -10,12 +10,12 @@ import jaxhil as package
 import tuning
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load_any
-from jaxhil.simulation.environment import computing
-from tuning.caches.cluster import Workers
+from jaxhil.simulation.jax_environment import jax_context
+from tuning.caches.cluster import ClusterWorkers
 from tuning.gain_file import build_document, write_gain_file
 from tuning.gains import tune_all
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.replay import recorded
+from tuning.sweeps.replay import record_six_axes
 from tuning.sweeps.store import read_row, read_store
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
@@ -50,8 +50,8 @@ def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
     assert ran.code == 0 and "Episodes" in ran.out and "to the bit" in ran.out
 
     # The draw is that scenario, and no other, until it ends.
-    with computing():
-        ticks = recorded(build_sweep(here.manifest), 7)
+    with jax_context():
+        ticks = record_six_axes(build_sweep(here.manifest), 7)
     touching = ticks.depth.max(axis=1) > 0
     force = np.linalg.norm(ticks.wrench[:, :3], axis=1)
     np.testing.assert_allclose(force.max(), row["peak_force_1"][0], rtol=1e-3)
@@ -62,7 +62,7 @@ def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
 def test_six_axis_cluster_gives_the_same_rows_though_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
-        killed_meanwhile(monkeypatch, Workers, cluster, first, "run")
+        killed_meanwhile(monkeypatch, ClusterWorkers, cluster, first, "run")
         there = tuning.sweep(gains, **ASKED, scheduler=cluster.address)
         assert first.poll() is not None
     assert there.table.equals(here.table)
@@ -71,7 +71,7 @@ def test_six_axis_cluster_gives_the_same_rows_though_a_worker_is_killed(here, ga
 
 
 def test_six_axis_cluster_gives_the_same_gains_though_a_worker_is_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tune_all, "BLOCK", 1)
+    monkeypatch.setattr(tune_all, "MAX_GROUP_SIZE", 1)
     mechanisms = [package.load(NAME, {"target.mass": mass, "name": f"{mass}"}) for mass in (1e3, 2e3, 3e3)]
     few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}
     here = tuning.tune(mechanisms, LAW, **few)

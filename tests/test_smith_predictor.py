@@ -8,7 +8,7 @@ from noise_cases import check_amplification
 
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
-from tuning.gains.pareto_search import amplification as pareto_amplification
+from tuning.gains.pareto_search import compute_noise_amplification as pareto_amplification
 
 # Lag of the motion simulator and delay of the force [s]; the first are model.md's.
 LAGS = np.array([[0.010, 0.008], [0.010, 0.002], [0.004, 0.008], [0.015, 0.0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuning.statistics.sobol_indices import evaluations, saltelli_design, sobol_indices
+from tuning.statistics.sobol_indices import count_evaluations, saltelli_design, sobol_indices
 
 
 def ishigami(uniform):
@@ -74,7 +74,7 @@ def test_sobol_intervals_of_repeats_cover(case, number, capsys):
 def test_sobol_input_may_have_several_columns():
     columns = (1, 3, 1)
     points = saltelli_design(columns, 2048, seed=2)
-    assert points.shape == (evaluations(columns, 2048), 5) == (2048 * 5, 5)
+    assert points.shape == (count_evaluations(columns, 2048), 5) == (2048 * 5, 5)
     weights = np.array([2.0, 1.0, 1.0, 1.0, 0.5])
     variances = np.array([4.0, 3.0, 0.25])
     indices = sobol_indices(points @ weights, columns, 2048)

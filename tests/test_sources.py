@@ -6,9 +6,9 @@ import sys
 import jax
 import numpy
 
-from jaxhil.contact.laws import LAWS
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.simulation.sources import sources_sha256, versions
+from jaxhil.simulation.source_fingerprint import dependency_versions, sources_sha256
 
 LAW = """
 import dataclasses
@@ -36,7 +36,7 @@ def test_fingerprint_covers_every_source(tmp_path, monkeypatch):
 
 
 def test_fingerprint_covers_user_registered_law_and_its_fields(tmp_path, monkeypatch):
-    assert sources_sha256(*COMPENSATORS.values(), *LAWS.values()) == sources_sha256()
+    assert sources_sha256(*COMPENSATORS.values(), *CONTACT_LAWS.values()) == sources_sha256()
     monkeypatch.syspath_prepend(tmp_path)
     digests = [sources_sha256()]
     for number in ("2", "30"):
@@ -44,11 +44,14 @@ def test_fingerprint_covers_user_registered_law_and_its_fields(tmp_path, monkeyp
         sys.modules.pop("law_of_mine", None)
         importlib.invalidate_caches()
         mine = importlib.import_module("law_of_mine").Mine
-        digests += [sources_sha256(mine()), sources_sha256(LAWS["linear"], mine(2.0))]
+        digests += [sources_sha256(mine()), sources_sha256(CONTACT_LAWS["linear"], mine(2.0))]
         assert sources_sha256(mine()) == digests[-2]
     assert len(set(digests)) == 5
 
 
 def test_fingerprint_versions_are_those_that_run():
-    assert versions()["jax"] == jax.__version__ and versions()["numpy"] == numpy.__version__
-    assert versions()["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert (
+        dependency_versions()["jax"] == jax.__version__
+        and dependency_versions()["numpy"] == numpy.__version__
+    )
+    assert dependency_versions()["python"] == ".".join(map(str, sys.version_info[:3]))

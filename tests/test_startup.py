@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from jaxhil import InputError
-from jaxhil.simulation import environment, startup
+from jaxhil.simulation import jax_environment, jax_startup
 from tuning import terminal
 
 pytestmark = pytest.mark.users_options
@@ -83,28 +83,28 @@ def test_debugging_modes_and_displays_change_no_number(jaxhil, tmp_path):
 
 
 def test_flags_are_tried_by_another_process():
-    startup.check_flags("--xla_cpu_ftz=true")
+    jax_startup.check_xla_flags("--xla_cpu_ftz=true")
     for flags, reason in (
         ("--xla_backend_optimization_level=high", "interpret value high"),
         ("--xla_backend_extra_options=-no-such-option", "Unknown command line argument"),
     ):
         with pytest.raises(InputError, match=f"XLA_FLAGS: found '{flags}'.*{reason}"):
-            startup.check_flags(flags)
+            jax_startup.check_xla_flags(flags)
 
 
 def test_flags_of_a_file_are_those_in_it(tmp_path):
     (tmp_path / "flags").write_text("--xla_cpu_ftz=true\n--xla_backend_optimization_level=3\n")
     flags = "--xla_cpu_ftz=true --xla_backend_optimization_level=3"
-    assert environment.flags(str(tmp_path / "flags")) == environment.flags(flags)
+    assert jax_environment.build_xla_flags(str(tmp_path / "flags")) == jax_environment.build_xla_flags(flags)
 
 
 def test_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
-    monkeypatch.setattr(startup, "_processes", set())
-    startup.check_process()
-    startup.check_process()
+    monkeypatch.setattr(jax_startup, "_processes", set())
+    jax_startup.check_not_forked()
+    jax_startup.check_not_forked()
     monkeypatch.setattr(os, "getpid", lambda: -1)
     with pytest.raises(InputError, match="forked after jax had started, expected one begun by spawn"):
-        startup.check_process()
+        jax_startup.check_not_forked()
 
 
 def test_closed_standard_output_is_refused_before_any_work():

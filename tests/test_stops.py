@@ -9,11 +9,11 @@ from jaxhil.rig import digest
 from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
-from tuning.bundle.bundle import build_bundle, limits_section
-from tuning.front_door.export import export
+from tuning.api.export import export
+from tuning.bundle.bundle import build_bundle, build_limits_section
 from tuning.gain_file import build_document
-from tuning.verification.replay import verify
-from tuning.verification.stops import advice, find_stop, passing_limits
+from tuning.verification.runtime_replay import verify
+from tuning.verification.stops import describe_limit_changes, find_passing_limits, find_stop
 
 LAW = "phase_lead"
 AUDIT = {
@@ -43,7 +43,7 @@ def recorded(loaded):
 
 def limited(loaded, **limits):
     """Return the gain document with these limits."""
-    document = {**loaded.document, "limits": limits_section(limits)}
+    document = {**loaded.document, "limits": build_limits_section(limits)}
     return {**document, "sha256": digest(document)}
 
 
@@ -54,7 +54,7 @@ def stop_of(loaded, lane, **limits):
 
 def test_run_without_limits_is_not_stopped(loaded, recorded):
     gain_file, stop = stop_of(loaded, recorded[1])
-    assert stop is None and passing_limits(gain_file, recorded[1]) == {}
+    assert stop is None and find_passing_limits(gain_file, recorded[1]) == {}
 
 
 def reaches(lane):
@@ -95,10 +95,10 @@ def test_guard_that_stops_a_run_is_named_with_value_and_limit(loaded, recorded, 
     assert stop.time == pytest.approx(1e-3 * stop.tick) and 1 <= stop.contact <= 3
     for part in (stop.fault, f"{limit} {stop.allowed:.4g}", f"{stop.found:.4g}", f"contact {stop.contact}"):
         assert part in stop.text, stop.text
-    passing = passing_limits(gain_file, recorded[1])
+    passing = find_passing_limits(gain_file, recorded[1])
     assert list(passing) == [limit] and abs(passing[limit]) >= abs(most)
     assert stop_of(loaded, recorded[1], **start, **passing)[1] is None
-    assert f"--set {limit}=" in advice(passing)
+    assert f"--set {limit}=" in describe_limit_changes(passing)
 
 
 def test_first_command_far_from_the_drives_is_named_with_the_distance(loaded, recorded):
@@ -107,7 +107,7 @@ def test_first_command_far_from_the_drives_is_named_with_the_distance(loaded, re
     assert (stop.fault, stop.limit, stop.tick) == ("velocity_limit", "start_distance", 0)
     first = recorded[1].signals.position_desired[1] - recorded[1].signals.position_measured[0]
     assert stop.found == pytest.approx(abs(first), rel=1e-9)
-    passing = passing_limits(gain_file, recorded[1])
+    passing = find_passing_limits(gain_file, recorded[1])
     assert list(passing) == ["start_distance"]
     assert stop_of(loaded, recorded[1], velocity_limit=speed, **passing)[1] is None
 
@@ -157,7 +157,7 @@ def test_last_contact_of_a_run_is_audited(loaded, recorded):
 def test_contact_that_lasts_too_long_is_named(loaded, recorded):
     gain_file, stop = stop_of(loaded, recorded[1], **AUDIT, longest_contact=0.05)
     assert (stop.fault, stop.by, stop.contact) == ("contact_too_long", "watchdog", 1)
-    assert list(passing_limits(gain_file, recorded[1])) == ["longest_contact"]
+    assert list(find_passing_limits(gain_file, recorded[1])) == ["longest_contact"]
 
 
 def test_verify_names_the_cause_that_stopped_the_closed_loop(loaded):

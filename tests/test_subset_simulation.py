@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from tuning.statistics.intervals import binomial_interval
-from tuning.statistics.subset_simulation import subset_simulation, to_uniform
+from tuning.statistics.subset_simulation import convert_to_uniform, subset_simulation
 
 
 def plane(inputs):
@@ -186,7 +186,7 @@ def test_subset_number_of_levels_is_limited():
 
 
 def test_subset_uniform_numbers_stay_within_their_range():
-    uniform = to_uniform(np.array([-40.0, -1.0, 0.0, 1.0, 40.0]))
+    uniform = convert_to_uniform(np.array([-40.0, -1.0, 0.0, 1.0, 40.0]))
     assert np.all((uniform > 0) & (uniform < 1)) and np.all(np.diff(uniform) > 0)
     np.testing.assert_allclose(uniform[1:4], stats.norm.cdf([-1.0, 0.0, 1.0]), rtol=1e-14)
 

@@ -12,7 +12,7 @@ from bundles import document
 from matplotlib import image
 
 from jaxhil.rig.limits import LIMITS
-from tuning.bundle.bundle import with_limits
+from tuning.bundle.bundle import replace_limits
 from tuning.bundle.summary import summary_html
 from tuning.plots.bundle_summary import COLOURS, summary_png
 
@@ -46,7 +46,7 @@ def full_document():
     }
     # Values that stand for themselves, and some missing limits.
     limits = {name: None if index % 7 == 3 else 1.5 + index for index, name in enumerate(LIMITS)}
-    return with_limits(made, limits, RATES)
+    return replace_limits(made, limits, RATES)
 
 
 class Page(HTMLParser):
@@ -115,8 +115,8 @@ def test_summary_states_purpose_quality_and_confidence(made, page):
             "numpy",
             "350 kg at 5 mm/s",
         ),
-        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073, allowed 0.01)",
-        "missed alarms 2 of 40 runs to be stopped (95 %: 0 to 0.17, allowed 0.02)",
+        "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073, limit 0.01)",
+        "missed alarms 2 of 40 runs to be stopped (95 %: 0 to 0.17, limit 0.02)",
         "Unknown: missed alarms: <0 to 0.17>.",
         "restitution_margin widened from 0.0025 to 0.013, or too many good runs would be stopped",
         "errors from 0.018 on are noticed in 95 % of contacts",
@@ -173,5 +173,5 @@ def test_summary_does_not_invent_unknown_values():
     assert "None: the measured force is passed on." in text
     assert "None in the gain file: those of the code hold." in text
     assert "holds no figures" in text
-    unknown = with_limits(bare, {"force_limit": 1.0})
+    unknown = replace_limits(bare, {"force_limit": 1.0})
     assert "Rates of false and missed alarms are not known." in " ".join(Page(summary_html(unknown)).texts)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from sweep_cases import NOISY, case, manifest
 
-from tuning.sweeps.chunks import build_sweep, run_chunk, run_parts
-from tuning.sweeps.columns import OUTCOMES
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.replay import replay
-from tuning.sweeps.store import open_store, write_part
+from tuning.sweeps.chunk_file import list_different_columns
+from tuning.sweeps.chunks import build_sweep, run_chunk, run_chunks
+from tuning.sweeps.columns import SCENARIO_OUTCOMES
+from tuning.sweeps.replay import replay_scenario
+from tuning.sweeps.store import open_store, write_chunk
 
 pytestmark = pytest.mark.users_options
 
@@ -31,15 +31,15 @@ def sweep(request):
 
 def test_sweep_rows_do_not_depend_on_the_chunks(sweep):
     whole = run_chunk(sweep, 0, 112)
-    assert same_rows(joined([rows for _, rows in run_parts(sweep, range(4))]), whole) == []
+    assert list_different_columns(joined([rows for _, rows in run_chunks(sweep, range(4))]), whole) == []
     uneven = [run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 80), (80, 112))]
-    assert same_rows(joined(uneven), whole) == []
+    assert list_different_columns(joined(uneven), whole) == []
     assert np.ptp(whole["error_1"]) > 1e-3
 
 
 def test_sweep_chunks_come_one_by_one_in_the_requested_order(sweep):
-    assert [part for part, _ in run_parts(sweep, [3, 0])] == [3, 0]
-    assert list(run_parts(sweep, [])) == []
+    assert [part for part, _ in run_chunks(sweep, [3, 0])] == [3, 0]
+    assert list(run_chunks(sweep, [])) == []
 
 
 def test_sweep_program_serves_whatever_can_be_drawn():
@@ -66,9 +66,9 @@ def test_failed_runs_are_rows():
     uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
     sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
     rows = run_chunk(sweep, 0, 32)
-    names = {OUTCOMES[index] for index in rows["outcome"]}
+    names = {SCENARIO_OUTCOMES[index] for index in rows["outcome"]}
     assert {"timeout", "saturated", "good"} <= names
-    assert np.isnan(rows["restitution_1"][rows["outcome"] == OUTCOMES.index("timeout")]).all()
+    assert np.isnan(rows["restitution_1"][rows["outcome"] == SCENARIO_OUTCOMES.index("timeout")]).all()
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
@@ -83,8 +83,8 @@ def test_simulator_slower_than_the_model_is_saturated(tmp_path, precision):
     assert 4 < np.sum(too_slow) < 28
     np.testing.assert_array_equal(rows["position_shortfall_1"] > 0, too_slow)
     assert np.all(rows["position_shortfall_1"] >= 0)
-    np.testing.assert_array_equal(rows["outcome"] == OUTCOMES.index("saturated"), too_slow)
+    np.testing.assert_array_equal(rows["outcome"] == SCENARIO_OUTCOMES.index("saturated"), too_slow)
     store = open_store(tmp_path / "store", label, resume=False)
-    write_part(store, 0, rows)
+    write_chunk(store, 0, rows)
     for index in (np.argmax(too_slow), np.argmin(too_slow)):
-        assert replay(store, int(index)).different == []
+        assert replay_scenario(store, int(index)).different_columns == []

@@ -15,13 +15,13 @@ from sweep_cases import NOISY, case, manifest
 
 import tuning
 from jaxhil.errors import InputError
-from tuning.caches.cluster import Piece, Workers, on_workers
+from tuning.caches.cluster import ClusterWorkers, WorkUnit, run_on_workers
 from tuning.gain_file import write_gain_file
-from tuning.sweeps.cluster import run_part
-from tuning.sweeps.manifest import encode
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.run import run_sweep
-from tuning.sweeps.store import open_store, read_part
+from tuning.sweeps.chunk_file import list_different_columns
+from tuning.sweeps.cluster_computers import run_manifest_chunk
+from tuning.sweeps.manifest import encode_manifest
+from tuning.sweeps.run_sweep import run_sweep
+from tuning.sweeps.store import open_store, read_chunk
 
 pytestmark = pytest.mark.users_options
 
@@ -33,7 +33,7 @@ def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
     store = open_store(folder, label, resume=True)
     more = {} if computer is None else {"computer": computer}
     _, tally = run_sweep(store, lambda *_: None, lambda number, tally: each(tally), **more)
-    parts = [read_part(store, part) for part in range(-(-tally.scenarios // label.chunk))]
+    parts = [read_chunk(store, part) for part in range(-(-tally.scenarios // label.chunk))]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, tally
 
 
@@ -57,7 +57,7 @@ def test_sweep_without_a_scheduler_is_one_line_and_leaves_nothing(tmp_path):
 )
 def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch, says, reason):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("tuning.caches.cluster.WAIT", 0.5)
+    monkeypatch.setattr("tuning.caches.cluster.SCHEDULER_TIMEOUT", 0.5)
     waited = Event()
 
     def answer(listening):
@@ -70,7 +70,7 @@ def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch,
         answered = thread.submit(answer, listening)
         address = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
         with pytest.raises(InputError, match=f"--scheduler: found '{address}', .*{reason}"):
-            list(on_workers(address, awaited, [Piece(0, (0.0,))], None, "never"))
+            list(run_on_workers(address, awaited, [WorkUnit(0, (0.0,))], None, "never"))
         waited.set()
         answered.result()
 
@@ -84,10 +84,10 @@ def test_worker_imports_no_jax_before_its_flags_are_set():
 
 def test_worker_of_other_flags_says_how_to_start_it(monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("tuning.sweeps.manifest.xla_flags", lambda: "--others")
-        asked = encode(manifest(case()))
+        patched.setattr("tuning.sweeps.manifest.active_xla_flags", lambda: "--others")
+        asked = encode_manifest(manifest(case()))
     with pytest.raises(InputError, match=r"start workers by: dask worker ADDRESS --preload"):
-        run_part(asked, 0)
+        run_manifest_chunk(asked, 0)
 
 
 @pytest.mark.slow
@@ -101,7 +101,7 @@ def test_plain_workers_give_the_same_rows_though_one_is_killed(whole, tmp_path):
 
         rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_one)
         assert first.poll() is not None
-    assert same_rows(rows, whole[0]) == [] and tally == whole[1]
+    assert list_different_columns(rows, whole[0]) == [] and tally == whole[1]
 
 
 @pytest.mark.slow
@@ -114,7 +114,7 @@ def test_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_pat
         cluster.kill(wrong)
         cluster.worker("--preload", "tuning.caches.worker", "--preload", str(tmp_path / "early.py"))
         rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address))
-    assert same_rows(rows, whole[0]) == []
+    assert list_different_columns(rows, whole[0]) == []
 
 
 @pytest.mark.slow
@@ -127,17 +127,17 @@ def test_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
         cluster.worker("--preload", str(tmp_path / "deadly.py"))
         rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), few)
     here, again = rows_of(tmp_path / "here", label=few)
-    assert same_rows(rows, here) == [] and tally == again
+    assert list_different_columns(rows, here) == [] and tally == again
 
 
 @pytest.mark.slow
 def test_workers_that_join_later_get_chunks_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.caches.cluster.RECOUNT", 0.5)
+    monkeypatch.setattr("tuning.caches.cluster.WORKER_COUNT_INTERVAL", 0.5)
     with started(tmp_path) as cluster:
         cluster.worker()
         spans = []
-        for _, span in on_workers(
-            cluster.address, awaited, (Piece(i, (1.0,)) for i in range(40)), None, "late"
+        for _, span in run_on_workers(
+            cluster.address, awaited, (WorkUnit(i, (1.0,)) for i in range(40)), None, "late"
         ):
             if not spans:
                 for _ in range(3):
@@ -149,11 +149,11 @@ def test_workers_that_join_later_get_chunks_too(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_sweep_without_workers_is_computed_locally(tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.caches.cluster.PATIENCE", 1.0)
+    monkeypatch.setattr("tuning.caches.cluster.IDLE_TIMEOUT", 1.0)
     few = manifest(case(), scenarios=64, limit=1.5)
     with started(tmp_path) as cluster:
         rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address), few)
-    assert same_rows(rows, rows_of(tmp_path / "here", label=few)[0]) == []
+    assert list_different_columns(rows, rows_of(tmp_path / "here", label=few)[0]) == []
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_scheduler_that_dies_is_one_line_and_finished_chunks_stay(whole, tmp_pat
         with pytest.raises(InputError, match="--resume goes on"):
             rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_scheduler)
     assert len(list((tmp_path / "store").glob("parts/part-*"))) >= 1
-    assert same_rows(rows_of(tmp_path / "store")[0], whole[0]) == []
+    assert list_different_columns(rows_of(tmp_path / "store")[0], whole[0]) == []
 
 
 @pytest.mark.slow
@@ -178,12 +178,12 @@ def test_sweep_on_a_cluster_stops_at_the_same_look(tmp_path):
     with started(tmp_path) as cluster:
         cluster.worker("--nworkers", "2", "--nthreads", "1")
         rows, again = rows_of(tmp_path / "store", on_cluster(cluster.address), label=until)
-    assert 64 < tally.scenarios < 300 and again == tally and same_rows(rows, here) == []
+    assert 64 < tally.scenarios < 300 and again == tally and list_different_columns(rows, here) == []
 
 
 @pytest.mark.slow
 def test_studies_are_the_same_though_a_worker_is_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.sweeps.points.FEWEST", 16)
+    monkeypatch.setattr("tuning.sweeps.point_batches.MIN_POINTS_PER_BATCH", 16)
     gains, folder = tmp_path / "gains.json", tmp_path / "store"
     write_gain_file(gains, case(force_sensor=NOISY))
     asked: dict[str, Any] = {"scenarios": 100, "chunk": 64, "limit": 1.5}
@@ -192,7 +192,7 @@ def test_studies_are_the_same_though_a_worker_is_killed(tmp_path, monkeypatch):
     tuning.sweep(gains, **asked, folder=folder)
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
-        killed_meanwhile(monkeypatch, Workers, cluster, first, "run")
+        killed_meanwhile(monkeypatch, ClusterWorkers, cluster, first, "run")
         there = tuning.sweep(
             gains, **asked, **studies, folder=folder, resume=True, scheduler=cluster.address
         ).document

@@ -9,7 +9,15 @@ from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT, Metrics
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.sweeps.columns import OUTCOMES, STATUSES, error_slots, judge, rows_of, sweep_columns, unit_of
+from tuning.sweeps.columns import (
+    CONTACT_STATUSES,
+    SCENARIO_OUTCOMES,
+    build_rows,
+    classify_outcomes,
+    find_key_unit,
+    list_error_columns,
+    list_sweep_columns,
+)
 
 LIMIT = 0.01
 NAN = np.nan
@@ -55,11 +63,11 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ide
         status == OK,
         status != status,
     )
-    return rows_of(parsed, 7, draws, scenarios, outcome, LIMIT, False)
+    return build_rows(parsed, 7, draws, scenarios, outcome, LIMIT, False)
 
 
 def outcomes(found):
-    return [OUTCOMES[index] for index in found["outcome"]]
+    return [SCENARIO_OUTCOMES[index] for index in found["outcome"]]
 
 
 def test_error_of_largest_magnitude_decides_the_outcome():
@@ -77,7 +85,7 @@ def test_failed_run_is_a_row_with_a_cause():
     assert outcomes(result) == ["non-finite", "diverged", "timeout", "not reached"]
     assert result["failed"].all()
     np.testing.assert_array_equal(result["worst_error"], [NAN, NAN, 0.0, 0.0])
-    assert [STATUSES[index] for index in result["status_2"]] == ["not reached"] * 2 + [
+    assert [CONTACT_STATUSES[index] for index in result["status_2"]] == ["not reached"] * 2 + [
         "timeout",
         "not reached",
     ]
@@ -132,7 +140,9 @@ def test_unlike_contact_ranks_above_an_error_and_below_saturation():
 def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
     result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
     old = {name: values for name, values in result.items() if not name.startswith("reference_")}
-    judged = judge(old, error_slots(("error",), 2), np.array(np.inf), np.array(2e-3), LIMIT)
+    judged = classify_outcomes(
+        old, list_error_columns(("error",), 2), np.array(np.inf), np.array(2e-3), LIMIT
+    )
     assert outcomes(result) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
 
 
@@ -145,7 +155,7 @@ def test_energies_are_kinetic_energies_of_the_numerical_model():
 def test_columns_and_rows_have_the_same_names():
     result = rows([[0.0], [0.0]], [[OK], [OK]])
     parsed = check_document(case(2, uncertainty={})).mechanism
-    assert [column.name for column in sweep_columns(parsed, False)] == list(result)
+    assert [column.name for column in list_sweep_columns(parsed, False)] == list(result)
 
 
 @pytest.mark.parametrize(
@@ -160,10 +170,10 @@ def test_columns_and_rows_have_the_same_names():
     ],
 )
 def test_sweep_columns_have_units(path, unit):
-    assert unit_of(load("varying").mechanism, path) == unit
+    assert find_key_unit(load("varying").mechanism, path) == unit
 
 
 def test_every_contact_has_its_own_columns():
-    names = [column.name for column in sweep_columns(load("varying").mechanism, True)]
+    names = [column.name for column in list_sweep_columns(load("varying").mechanism, True)]
     assert {"contact.stiffness_3", "approach.phase_3", "error_3", "work_in_3", "status_3"} <= set(names)
     assert len(names) == len(set(names)) and "error_4" not in names

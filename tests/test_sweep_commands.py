@@ -14,8 +14,8 @@ from sweep_cases import case
 from jaxhil.rig import digest
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
-from tuning.sweeps.store import read_part, read_store, write_part
-from tuning.sweeps.studies import rare_failure
+from tuning.sweeps.store import read_chunk, read_store, write_chunk
+from tuning.sweeps.studies import estimate_rare_failure
 
 TINY = ["--scenarios", "100", "--chunk", "64"]
 
@@ -147,7 +147,9 @@ KEPT = ("studies/drivers-16.json", "studies/rare-1.6-10x1000.json")
 @pytest.fixture
 def quick(monkeypatch):
     """Options for subset simulation with few samples, and no plots."""
-    monkeypatch.setattr("tuning.sweeps.studies.rare_failure", partial(rare_failure, samples=20))
+    monkeypatch.setattr(
+        "tuning.sweeps.studies.estimate_rare_failure", partial(estimate_rare_failure, samples=20)
+    )
     monkeypatch.setattr("tuning.plots.sweep.write_plots", lambda *_: [])
 
 
@@ -207,7 +209,7 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick
         assert jaxhil(*again, *STUDIES)[:2] == (130, "")
     assert json.loads((folder / "verdict.json").read_text())["verdict"] == "bad"
     with monkeypatch.context() as patched:
-        patched.setattr("tuning.sweeps.studies.rare_failure", interrupted)
+        patched.setattr("tuning.sweeps.studies.estimate_rare_failure", interrupted)
         assert jaxhil(*again, *STUDIES)[:2] == (130, "")
     so_far = json.loads((folder / "verdict.json").read_text())
     assert so_far["verdict"] == "bad" and so_far["drivers"]["evaluations"] == 80 and "rare" not in so_far
@@ -282,13 +284,13 @@ def test_replay_detects_changes(jaxhil, gains, tmp_path):
     folder = tmp_path / "store"
     jaxhil("sweep", gains, *TINY, "-o", folder)
     opened = read_store(folder)
-    rows = dict(read_part(opened, 0))
+    rows = dict(read_chunk(opened, 0))
     rows["duration_1"] = rows["duration_1"] * (1 + 1e-15)
-    write_part(opened, 0, rows)
+    write_chunk(opened, 0, rows)
     code, out, _ = jaxhil("replay", folder, 3)
     assert code == 1 and "Bad: differs" in out and "duration_1" in out
     rows["error_1"] = rows["error_1"] * (1 + 1e-15)
-    write_part(opened, 0, rows)
+    write_chunk(opened, 0, rows)
     refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found damage, or a part of something")
 
 
@@ -313,7 +315,7 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
     refused(jaxhil("sweep", gains, *TINY, "-o", store, "--resume"), "limit: found 1.5, asked for 0.01")
     (tmp_path / "file").touch()
     refused(jaxhil("sweep", gains, *TINY, "-o", tmp_path / "file" / "store"), "cannot be written")
-    refused(jaxhil("replay", store, 100), "found 100, allowed 0 to 99")
+    refused(jaxhil("replay", store, 100), "found 100, expected 0 to 99")
     refused(jaxhil("replay", tmp_path, 0), "manifest.json")
     assert not (tmp_path / "new").exists()
 

@@ -15,9 +15,14 @@ from cases import IDEAL, MASS, STIFFNESS, mechanism, nominal_gains, validated
 from sweep_cases import manifest
 
 from tuning.gain_file import build_document
-from tuning.statistics.intervals import enough
+from tuning.statistics.intervals import is_narrow_enough
 from tuning.sweeps.chunks import build_sweep, run_chunk
-from tuning.sweeps.tally import Probability, add_rows, empty_tally, failure_probability
+from tuning.sweeps.tally import (
+    ProbabilityEstimate,
+    add_to_tally,
+    build_empty_tally,
+    estimate_failure_probability,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +46,7 @@ def repeated(truth, sampling):
         yield run_chunk(sweep._replace(manifest=own), 0, NUMBER)
 
 
-def check(found: list[Probability], truth: float, name: str, capsys) -> None:
+def check(found: list[ProbabilityEstimate], truth: float, name: str, capsys) -> None:
     inside = np.mean([one.low <= truth <= one.high for one in found])
     width = np.mean([one.high - one.low for one in found])
     value = np.mean([one.value for one in found])
@@ -56,7 +61,7 @@ def check(found: list[Probability], truth: float, name: str, capsys) -> None:
 def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
     replicates = 16 if sampling == "sobol" else 1
     result = [
-        failure_probability(add_rows(empty_tally(replicates, NUMBER), rows))
+        estimate_failure_probability(add_to_tally(build_empty_tally(replicates, NUMBER), rows))
         for rows in repeated(truth, sampling)
     ]
     # The pooled sweeps agree with the closed form itself.
@@ -69,11 +74,11 @@ def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
 def test_intervals_of_sweeps_stopped_at_a_width_cover_the_truth(truth, capsys):
     result = []
     for rows in repeated(truth, "random"):
-        tally = empty_tally(1, NUMBER, looked_at=True)
+        tally = build_empty_tally(1, NUMBER, looked_at=True)
         for first in range(0, NUMBER, LOOK):
-            tally = add_rows(tally, {name: column[first : first + LOOK] for name, column in rows.items()})
+            tally = add_to_tally(tally, {name: column[first : first + LOOK] for name, column in rows.items()})
             assert tally.looks is not None
-            if enough(tally.looks, 0.3 if truth > 0.1 else 0.12):
+            if is_narrow_enough(tally.looks, 0.3 if truth > 0.1 else 0.12):
                 break
-        result.append(failure_probability(tally))
+        result.append(estimate_failure_probability(tally))
     check(result, truth, "sequential", capsys)

@@ -11,10 +11,17 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.rig import digest
-from tuning.sweeps.manifest import decode, differences, encode, other_code, rounding_flags, unlike_here
+from tuning.sweeps.manifest import (
+    decode_manifest,
+    encode_manifest,
+    list_code_differences,
+    list_input_differences,
+    list_process_differences,
+    rounding_flags,
+)
 
 GOOD = manifest()
-DOCUMENT = json.loads(encode(GOOD))
+DOCUMENT = json.loads(encode_manifest(GOOD))
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
@@ -24,26 +31,26 @@ JSON = st.recursive(
 
 def refusal(content):
     with pytest.raises(InputError) as caught:
-        decode(content, "store/manifest.json")
+        decode_manifest(content, "store/manifest.json")
     message = str(caught.value)
     assert message.startswith("store/manifest.json: ") and message.isprintable()
     return message
 
 
 def test_manifest_survives_a_round_trip():
-    assert decode(encode(GOOD), "f") == GOOD
+    assert decode_manifest(encode_manifest(GOOD), "f") == GOOD
     endless = manifest(limit=0)
-    assert decode(encode(endless), "f") == endless and endless.largest_error == 0
-    assert GOOD.largest_error == float("inf")
+    assert decode_manifest(encode_manifest(endless), "f") == endless and endless.error_limit == 0
+    assert GOOD.error_limit == float("inf")
 
 
 def test_manifest_has_a_width_if_there_is_one():
     # Without it a manifest is as it was before widths existed.
-    assert b"until_width" not in encode(GOOD) and "until_width" not in DOCUMENT
+    assert b"until_width" not in encode_manifest(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
-    assert decode(encode(wide), "f") == wide and wide.until_width == 0.1
-    assert differences(GOOD, wide) == ["until_width: found nothing, asked for 0.1"]
-    with pytest.raises(InputError, match="until_width: found with sobol, allowed with random"):
+    assert decode_manifest(encode_manifest(wide), "f") == wide and wide.until_width == 0.1
+    assert list_input_differences(GOOD, wide) == ["until_width: found nothing, asked for 0.1"]
+    with pytest.raises(InputError, match="until_width: found with sobol, expected with random"):
         manifest(until_width=0.1, sampling="sobol", scenarios=96, chunk=32)
 
 
@@ -59,7 +66,7 @@ def test_manifest_with_another_value_is_refused_or_taken_as_signed(key, value, s
     if signed:
         changed["sha256"] = digest(changed)
     try:
-        result = decode(json.dumps(changed).encode(), "store/manifest.json")
+        result = decode_manifest(json.dumps(changed).encode(), "store/manifest.json")
     except InputError as error:
         assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
     else:
@@ -72,12 +79,12 @@ def test_manifest_with_missing_or_unknown_keys_names_them():
     assert "seed" in refusal(json.dumps({k: v for k, v in DOCUMENT.items() if k != "seed"}).encode())
     assert "speed" in refusal(json.dumps({**DOCUMENT, "speed": 1}).encode())
     assert "jaxhil/sweep/2" in refusal(b"[]")
-    assert "NaN" in refusal(encode(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
+    assert "NaN" in refusal(encode_manifest(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
 
 
 def test_manifest_parts_cover_all_scenarios():
     assert GOOD.parts == 4
-    assert [GOOD.part_rows(part) for part in range(4)] == [(0, 32), (32, 32), (64, 32), (96, 4)]
+    assert [GOOD.chunk_range(part) for part in range(4)] == [(0, 32), (32, 32), (64, 32), (96, 4)]
 
 
 @pytest.mark.parametrize(
@@ -85,22 +92,24 @@ def test_manifest_parts_cover_all_scenarios():
     [("seed", 1), ("scenarios", 96), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
 )
 def test_manifest_comparison_names_what_differs(key, value):
-    (difference,) = differences(manifest(scenarios=112), manifest(**{"scenarios": 112, key: value}))
+    (difference,) = list_input_differences(
+        manifest(scenarios=112), manifest(**{"scenarios": 112, key: value})
+    )
     assert difference.startswith(f"{key}: found ")
 
 
 def test_manifest_of_an_earlier_schema_says_what_to_do():
     old = json.dumps({**DOCUMENT, "schema": "jaxhil/sweep/1"}).encode()
-    assert "allowed jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
+    assert "expected jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
 
 
 def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
-    content = encode(GOOD)
+    content = encode_manifest(GOOD)
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
         harmed[bit // 8] ^= 1 << int(bit % 8)
         try:
-            result = decode(bytes(harmed), "store/manifest.json")
+            result = decode_manifest(bytes(harmed), "store/manifest.json")
         except InputError as error:
             assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
         else:
@@ -108,14 +117,18 @@ def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
 
 
 def test_manifest_differs_for_other_gains_and_other_code():
-    (difference,) = differences(GOOD, manifest(case(compensator="phase_lead")))
+    (difference,) = list_input_differences(GOOD, manifest(case(compensator="phase_lead")))
     assert difference.startswith("gains_sha256: ")
     newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"}, sources_sha256="0" * 64)
-    sources, version = other_code(GOOD, newer)
+    sources, version = list_code_differences(GOOD, newer)
     assert sources.startswith("sources_sha256: found ") and sources.endswith("here 000000000000...")
     assert version.startswith("versions.jax: ") and "9.9" in version
-    assert unlike_here(newer)[0].startswith("sources_sha256: found 000000000000..., here ")
-    assert not differences(GOOD, manifest()) and not other_code(GOOD, manifest()) and not unlike_here(GOOD)
+    assert list_process_differences(newer)[0].startswith("sources_sha256: found 000000000000..., here ")
+    assert (
+        not list_input_differences(GOOD, manifest())
+        and not list_code_differences(GOOD, manifest())
+        and not list_process_differences(GOOD)
+    )
 
 
 def test_manifest_covers_only_flags_that_may_change_a_result():
@@ -126,5 +139,5 @@ def test_manifest_covers_only_flags_that_may_change_a_result():
 
 def test_every_sobol_replicate_has_a_scenario():
     assert manifest(sampling="sobol", scenarios=16, chunk=5).replicates == 16
-    with pytest.raises(InputError, match="--scenarios: found 15, allowed 16 or more"):
+    with pytest.raises(InputError, match="--scenarios: found 15, expected 16 or more"):
         manifest(sampling="sobol", scenarios=15)

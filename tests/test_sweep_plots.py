@@ -9,18 +9,23 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sweep_cases import case, manifest
 
-from jaxhil.simulation.contact_plot import save
+from jaxhil.simulation.contact_plot import save_figure
 from jaxhil.simulation.gain_file import check_document
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
-from tuning.plots.scenarios import UNENDED, failure_region
-from tuning.plots.sweep import convergence, error_map
+from tuning.plots.scenarios import UNENDED, plot_failure_region
+from tuning.plots.sweep import plot_convergence, plot_error_map
 from tuning.statistics.intervals import binomial_interval, replicate_interval
-from tuning.statistics.quantiles import EDGES
-from tuning.sweeps import regions
+from tuning.statistics.quantiles import BIN_EDGES
+from tuning.sweeps import plot_statistics
 from tuning.sweeps.chunks import build_sweep, run_chunk
-from tuning.sweeps.columns import OUTCOMES, STATUSES
-from tuning.sweeps.regions import add_rows, empty_regions, make_plan, quantile
+from tuning.sweeps.columns import CONTACT_STATUSES, SCENARIO_OUTCOMES
+from tuning.sweeps.plot_statistics import (
+    add_to_statistics,
+    build_empty_statistics,
+    compute_error_quantile,
+    plan_statistics,
+)
 from tuning.sweeps.store import PLOTS
 
 NUMBER = 96
@@ -57,14 +62,14 @@ def swept(request):
 
 @pytest.fixture
 def few_points(monkeypatch):
-    monkeypatch.setattr(regions, "POINTS", 10)
-    monkeypatch.setattr(regions, "FAILED_POINTS", 20)
+    monkeypatch.setattr(plot_statistics, "MAX_POINTS", 10)
+    monkeypatch.setattr(plot_statistics, "MAX_FAILED_POINTS", 20)
 
 
 def accumulated(plan, rows, cuts):
-    result = empty_regions(plan)
+    result = build_empty_statistics(plan)
     for first, until in cuts:
-        result = add_rows(plan, result, {name: values[first:until] for name, values in rows.items()})
+        result = add_to_statistics(plan, result, {name: values[first:until] for name, values in rows.items()})
     return result
 
 
@@ -78,7 +83,7 @@ def flat(found):
 )
 def test_sweep_plots_are_the_same_for_any_division(swept, few_points, cuts):
     made, mechanism, rows = swept
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     whole = accumulated(plan, rows, [(0, NUMBER)])
     for one, other in zip(flat(whole), flat(accumulated(plan, rows, cuts)), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -86,23 +91,23 @@ def test_sweep_plots_are_the_same_for_any_division(swept, few_points, cuts):
 
 def test_stiffness_and_force_delay_are_plotted_first(usual):
     made, mechanism, rows = usual
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     assert [one.label for one in plan.per_contact] == ["contact stiffness [kN/m]", "force delay [ms]"]
     assert all(one.low < np.median(one.values(rows)) < one.high for one in plan.per_contact)
 
 
 def test_inputs_with_strongest_rank_correlation_are_plotted_otherwise(lost):
     made, mechanism, rows = lost
-    assert make_plan(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
+    assert plan_statistics(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
     # The plan gets other sensitivities of the error than the real ones.
     size = rows["approach.phase_2"]
     made_up = {**rows, "worst_error": size, "outcome": np.zeros(NUMBER, int)}
-    assert make_plan(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
+    assert plan_statistics(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
 
 
 def test_cell_counts_are_a_histogram_of_the_whole(usual):
     made, mechanism, rows = usual
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     sizes = accumulated(plan, rows, [(0, NUMBER)]).sizes
     sample, edges = [], [one.edges(plan.cells) for one in plan.per_contact]
     for number in (1, 2):
@@ -110,38 +115,42 @@ def test_cell_counts_are_a_histogram_of_the_whole(usual):
         up = np.clip(1e3 * rows["rig.force_sensor.delay"], edges[1][0], edges[1][-1])
         sample.append(np.stack([across, up, np.abs(rows[f"error_{number}"])], axis=1))
     inner = sizes[..., 1:-1]
-    direct, _ = np.histogramdd(np.concatenate(sample), bins=[*edges, EDGES])
+    direct, _ = np.histogramdd(np.concatenate(sample), bins=[*edges, BIN_EDGES])
     np.testing.assert_array_equal(inner, direct)
     assert inner.sum() == sizes.sum() == 2 * NUMBER and np.count_nonzero(inner) > 50
 
 
 def test_plotted_quantile_is_that_of_the_values():
     values = np.abs(np.random.default_rng(0).standard_normal(3000)) * 10.0 ** np.linspace(-4, 0, 3000)
-    counts = np.bincount(np.searchsorted(EDGES, values, side="right"), minlength=len(EDGES) + 1)
+    counts = np.bincount(np.searchsorted(BIN_EDGES, values, side="right"), minlength=len(BIN_EDGES) + 1)
     for order in (0.5, 0.95, 0.99):
         direct = np.quantile(values, order, method="inverted_cdf")
-        assert quantile(counts, order, 20) == pytest.approx(direct, rel=0.005)
-    assert np.isnan(quantile(counts, 0.5, 3001)) and np.isnan(quantile(0 * counts, 0.5, 0))
+        assert compute_error_quantile(counts, order, 20) == pytest.approx(direct, rel=0.005)
+    assert np.isnan(compute_error_quantile(counts, 0.5, 3001)) and np.isnan(
+        compute_error_quantile(0 * counts, 0.5, 0)
+    )
     counts[-1] = 200
-    assert quantile(counts, 0.95, 20) == np.inf and np.isfinite(quantile(counts, 0.9, 20))
+    assert compute_error_quantile(counts, 0.95, 20) == np.inf and np.isfinite(
+        compute_error_quantile(counts, 0.9, 20)
+    )
 
 
 def test_contact_without_end_counts_as_infinite_and_later_ones_are_left_out(lost):
     made, mechanism, rows = lost
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    ended = [rows[f"status_{number}"] == STATUSES.index("ok") for number in (1, 2)]
+    ended = [rows[f"status_{number}"] == CONTACT_STATUSES.index("ok") for number in (1, 2)]
     first, second = np.sum(~ended[0]), np.sum(ended[0] & ~ended[1])
     assert first > 10
     assert result.sizes[..., -1].sum() == first + second
     assert result.sizes.sum() == NUMBER + ended[0].sum()
-    bad = rows["outcome"] > OUTCOMES.index("saturated")
+    bad = rows["outcome"] > SCENARIO_OUTCOMES.index("saturated")
     np.testing.assert_array_equal(np.isinf(result.points.size), bad)
 
 
 def test_failures_are_counted_up_to_each_look(swept):
     made, mechanism, rows = swept
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
     assert (result.scenarios, result.failed) == (NUMBER, rows["failed"].sum())
     assert plan.looks[-1] == NUMBER // plan.replicates * plan.replicates
@@ -154,7 +163,7 @@ def test_failures_are_counted_up_to_each_look(swept):
 
 def test_plotted_points_are_the_first_and_the_first_failures(usual, few_points):
     made, mechanism, rows = usual
-    result = accumulated(make_plan(made, mechanism, rows), rows, [(0, NUMBER)])
+    result = accumulated(plan_statistics(made, mechanism, rows), rows, [(0, NUMBER)])
     failed = np.flatnonzero(rows["failed"])[:20]
     wanted = np.union1d(np.arange(10), failed)
     assert len(wanted) > 20
@@ -165,9 +174,9 @@ def test_plotted_points_are_the_first_and_the_first_failures(usual, few_points):
 
 def test_convergence_plot_ends_at_the_verdict(swept):
     made, mechanism, rows = swept
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    figure = convergence(plan, result, made, "name")
+    figure = plot_convergence(plan, result, made, "name")
     axes = figure.axes[0]
     drawn = {line.get_label(): line.get_data() for line in axes.lines}
     (number,), (share,) = [
@@ -190,9 +199,9 @@ def test_convergence_plot_ends_at_the_verdict(swept):
 def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     made, mechanism, rows = usual
     rows = {**rows, "failed": np.zeros(NUMBER, bool)}
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    axes = convergence(plan, result, made, "name", acceptable).axes[0]
+    axes = plot_convergence(plan, result, made, "name", acceptable).axes[0]
     last = float(binomial_interval(0, NUMBER).high)
     low, high = axes.get_ylim()
     assert low < 0.9 * last and last < 0.9 * high
@@ -202,14 +211,14 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
 
 def test_sweep_plots_ignore_the_callers_settings(usual, tmp_path):
     made, mechanism, rows = usual
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
 
     def drawn(name):
-        figures = [draw(plan, result, made, "n") for draw in (error_map, failure_region)]
+        figures = [draw(plan, result, made, "n") for draw in (plot_error_map, plot_failure_region)]
         paths = [tmp_path / f"{name}-{index}.png" for index in range(2)]
         for figure, path in zip(figures, paths, strict=True):
-            save(figure, path)
+            save_figure(figure, path)
         return [path.read_bytes() for path in paths]
 
     usually = drawn("usual")
@@ -238,11 +247,11 @@ SELDOM = [("phases", 0.0), ("phases", 1e-9), ("phases", 1e9), ("lost", 0.2), ("l
 def test_every_axis_is_labelled_with_its_unit(request, name, limit):
     made, mechanism, rows = request.getfixturevalue(name)
     made = msgspec.structs.replace(made, limit=limit)
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     assert len(plan.per_contact) == (1 if name == "phases" else 2)
     result = accumulated(plan, rows, [(0, NUMBER)])
-    drawn = [draw(plan, result, made, name) for draw in (error_map, failure_region)]
-    for figure in (*drawn, convergence(plan, result, made, name, 0.1)):
+    drawn = [draw(plan, result, made, name) for draw in (plot_error_map, plot_failure_region)]
+    for figure in (*drawn, plot_convergence(plan, result, made, name, 0.1)):
         FigureCanvasAgg(figure).draw()
         named = [axes for axes in figure.axes if axes.axison]
         assert named
@@ -257,8 +266,8 @@ def test_every_axis_is_labelled_with_its_unit(request, name, limit):
 def test_colour_scale_is_labelled_at_both_ends(usual, limit):
     made, mechanism, rows = usual
     made = msgspec.structs.replace(made, limit=limit)
-    plan = make_plan(made, mechanism, rows)
-    figure = error_map(plan, accumulated(plan, rows, [(0, NUMBER)]), made, "usual")
+    plan = plan_statistics(made, mechanism, rows)
+    figure = plot_error_map(plan, accumulated(plan, rows, [(0, NUMBER)]), made, "usual")
     FigureCanvasAgg(figure).draw()
     (bar,) = (axes for axes in figure.axes if "not exceeded by 95 %" in axes.get_ylabel())
     ticks = bar.get_yticks()
@@ -269,12 +278,12 @@ def test_colour_scale_is_labelled_at_both_ends(usual, limit):
 
 def test_legend_counts_failures_by_kind(lost, few_points):
     made, mechanism, rows = lost
-    plan = make_plan(made, mechanism, rows)
+    plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
     endless = int(np.sum(result.points.failed & np.isinf(result.points.size)))
     failed, of = int(np.sum(result.points.failed)), int(np.sum(rows["failed"]))
     assert 0 < endless < failed < of
-    (legend,) = failure_region(plan, result, made, "lost").legends
+    (legend,) = plot_failure_region(plan, result, made, "lost").legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert f"failed, every contact ended ({failed - endless} of the first {failed} of {of})" in labels
     assert f"{UNENDED} ({endless} of the first {failed} of {of})" in labels

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from sweep_cases import case, manifest
 
-from tuning.caches.pieces import Pieces
-from tuning.sweeps import points
+from tuning.caches.checkpoints import Checkpoints
+from tuning.sweeps import point_batches
+from tuning.sweeps.chunk_file import list_different_columns
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.points import HERE, Running, run_here, run_points
+from tuning.sweeps.point_batches import LOCAL_RUN, PointRunSettings, run_locally, run_points
 
 NUMBER = 100
 
@@ -23,29 +23,31 @@ def asked():
 
 
 def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
-    monkeypatch.setattr(points, "FEWEST", 8)
+    monkeypatch.setattr(point_batches, "MIN_POINTS_PER_BATCH", 8)
     *what, rows = asked
     ran, result = [], []
 
     def interrupted(sweep, pieces):
         # As on a cluster: in any order, and none twice.
-        for number, one in enumerate(run_here(sweep, list(pieces)[::-1])):
+        for number, one in enumerate(run_locally(sweep, list(pieces)[::-1])):
             if number == 3:
                 raise KeyboardInterrupt
             yield one
 
-    running = Running(ran.append, result.append, Pieces(tmp_path / "kept"), interrupted, several=10)
+    running = PointRunSettings(
+        ran.append, result.append, Checkpoints(tmp_path / "kept"), interrupted, several=10
+    )
     with pytest.raises(KeyboardInterrupt):
         run_points(*what, running)
-    again = running._replace(kept=Pieces(tmp_path / "kept", resume=True), computer=run_here)
-    assert same_rows(run_points(*what, again), rows) == []
+    again = running._replace(kept=Checkpoints(tmp_path / "kept", resume=True), computer=run_locally)
+    assert list_different_columns(run_points(*what, again), rows) == []
     assert len(result) == 3 and sum(ran) == NUMBER and sum(result) == sum(ran[:3])
     assert again.kept.other == []
 
 
 def test_study_points_of_other_noise_are_run_anew(asked, tmp_path):
     sweep, inputs, noise, rows = asked
-    running = HERE._replace(kept=Pieces(tmp_path / "kept", resume=True))
+    running = LOCAL_RUN._replace(kept=Checkpoints(tmp_path / "kept", resume=True))
     run_points(sweep, inputs, noise, running)
     other = run_points(sweep, inputs, noise + 1, running)
     assert np.any(other["worst_error"] != rows["worst_error"])
@@ -55,7 +57,7 @@ def test_equal_study_points_are_run_once(asked):
     sweep, inputs, noise, rows = asked
     ran = []
     twice = run_points(
-        sweep, np.tile(inputs[:32], (3, 1)), np.tile(noise[:32], 3), HERE._replace(done=ran.append)
+        sweep, np.tile(inputs[:32], (3, 1)), np.tile(noise[:32], 3), LOCAL_RUN._replace(done=ran.append)
     )
     assert ran == [32]
     np.testing.assert_array_equal(twice["worst_error"], np.tile(rows["worst_error"][:32], 3))

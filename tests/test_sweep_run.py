@@ -15,12 +15,12 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from tuning.gain_file import write_gain_file
-from tuning.statistics.intervals import Running, enough, updated
+from tuning.statistics.intervals import SequentialState, is_narrow_enough, update_sequence
+from tuning.sweeps.chunk_file import list_different_columns
 from tuning.sweeps.chunks import run_chunk
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.replay import motion_of, replay
-from tuning.sweeps.run import compare_precisions, describe_outcomes, run_sweep
-from tuning.sweeps.store import open_store, read_part, read_store, write_part
+from tuning.sweeps.replay import compute_motion, replay_scenario
+from tuning.sweeps.run_sweep import compare_precisions, count_outcomes, run_sweep
+from tuning.sweeps.store import open_store, read_chunk, read_store, write_chunk
 
 pytestmark = pytest.mark.users_options
 
@@ -48,7 +48,7 @@ class Log(list):
 
 
 def all_rows(store):
-    parts = [read_part(store, part) for part in range(store.manifest.parts)]
+    parts = [read_chunk(store, part) for part in range(store.manifest.parts)]
     assert all(part is not None for part in parts)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
@@ -64,7 +64,7 @@ def test_tally_is_that_of_the_rows(whole):
     _, rows, _, tally = whole
     assert tally.scenarios == 300 and tally.failed == np.sum(rows["failed"])
     assert 0 < tally.failed < 300
-    assert describe_outcomes(tally) == {"good": 300 - tally.failed, "error beyond limit": tally.failed}
+    assert count_outcomes(tally) == {"good": 300 - tally.failed, "error beyond limit": tally.failed}
     worst = np.argsort(-np.abs(rows["worst_error"]))[:10]
     np.testing.assert_array_equal([index for _, _, index in tally.worst], worst)
 
@@ -72,15 +72,15 @@ def test_tally_is_that_of_the_rows(whole):
 def test_missing_or_damaged_parts_are_made_again(whole, tmp_path):
     _, rows, _, tally = whole
     store, _, _ = Log().sweep(tmp_path / "store")
-    store.part_path(0).unlink()
-    store.part_path(9).unlink()
-    content = store.part_path(4).read_bytes()
-    store.part_path(4).write_bytes(content[: len(content) // 2])
+    store.chunk_path(0).unlink()
+    store.chunk_path(9).unlink()
+    content = store.chunk_path(4).read_bytes()
+    store.chunk_path(4).write_bytes(content[: len(content) // 2])
     (tmp_path / "store" / "parts" / UNFINISHED).write_bytes(content[:100])
     log = Log()
     store, _, again = log.sweep(tmp_path / "store")
     assert (log.found, log.computed) == (300 - 32 - 32 - 12, 32 + 32 + 12)
-    assert same_rows(all_rows(store), rows) == [] and again == tally
+    assert list_different_columns(all_rows(store), rows) == [] and again == tally
     assert len(list((tmp_path / "store" / "parts").iterdir())) == 10
 
 
@@ -97,7 +97,7 @@ def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
     log = Log()
     store, _, again = log.sweep(tmp_path / "store")
     assert log.found == 96
-    assert same_rows(all_rows(store), rows) == [] and again == tally
+    assert list_different_columns(all_rows(store), rows) == [] and again == tally
 
 
 def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
@@ -118,30 +118,30 @@ def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
     log = Log()
     store, _, _ = log.sweep(folder)
     assert log.found >= 32 and log.computed > 0
-    assert same_rows(all_rows(store), rows) == []
+    assert list_different_columns(all_rows(store), rows) == []
 
 
 def test_any_row_replays_to_the_bit(whole):
     store, rows, _, _ = whole
     for index in np.random.default_rng(0).integers(0, 300, 6):
-        result = replay(read_store(store.folder), int(index))
-        assert result.different == []
+        result = replay_scenario(read_store(store.folder), int(index))
+        assert result.different_columns == []
         np.testing.assert_array_equal(result.again["error_1"], rows["error_1"][index])
 
 
 def test_replay_detects_a_changed_row(whole, tmp_path):
     store = read_store(shutil.copytree(whole[0].folder, tmp_path / "store"))
-    changed = dict(read_part(store, 0))
+    changed = dict(read_chunk(store, 0))
     changed["peak_force_1"] = changed["peak_force_1"].copy()
     changed["peak_force_1"][5] = np.nextafter(changed["peak_force_1"][5], np.inf)
-    write_part(store, 0, changed)
-    assert replay(store, 5).different == ["peak_force_1"]
-    assert replay(store, 6).different == []
+    write_chunk(store, 0, changed)
+    assert replay_scenario(store, 5).different_columns == ["peak_force_1"]
+    assert replay_scenario(store, 6).different_columns == []
 
 
 def test_replayed_motion_is_that_of_the_scenario(whole):
     _, rows, sweep, _ = whole
-    (piece,) = motion_of(sweep, 17)
+    (piece,) = compute_motion(sweep, 17)
     curve = piece.curves["rig"]
     rebound = -np.diff(curve.position)[-1] / 2e-3
     np.testing.assert_allclose(rebound / curve.velocity, rows["restitution_1"][17], rtol=1e-9)
@@ -173,21 +173,24 @@ def parts_of(store):
 def test_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
     _, rows, _, _ = whole
     store, parts, tally = stopped
-    failed, running = rows["failed"], Running()
+    failed, running = rows["failed"], SequentialState()
     for looks in range(1, 11):
         part = failed[32 * (looks - 1) : 32 * looks]
-        running = updated(running, int(np.sum(part)), len(part))
-        if enough(running, WIDE):
+        running = update_sequence(running, int(np.sum(part)), len(part))
+        if is_narrow_enough(running, WIDE):
             break
     assert 2 < looks < 9 and tally.looks == running
     assert tally.scenarios == 32 * looks and len(parts) == looks
     for number in range(looks):
-        made = read_part(store, number)
+        made = read_chunk(store, number)
         assert made is not None
-        assert same_rows(made, {k: v[32 * number : 32 * number + 32] for k, v in rows.items()}) == []
-    assert replay(read_store(store.folder), 32 * looks - 1).different == []
-    with pytest.raises(InputError, match="allowed those before the sweep stopped"):
-        replay(store, 299)
+        assert (
+            list_different_columns(made, {k: v[32 * number : 32 * number + 32] for k, v in rows.items()})
+            == []
+        )
+    assert replay_scenario(read_store(store.folder), 32 * looks - 1).different_columns == []
+    with pytest.raises(InputError, match="expected those before the sweep stopped"):
+        replay_scenario(store, 299)
 
 
 def test_stopped_sweep_is_not_continued(stopped):
@@ -205,13 +208,13 @@ def test_sweep_with_parts_in_any_order_stops_at_the_same_look(stopped, tmp_path)
 
     def shuffled(sweep, missing):
         for part in np.random.default_rng(0).permutation(list(missing)):
-            yield int(part), run_chunk(sweep, *sweep.manifest.part_rows(int(part)))
+            yield int(part), run_chunk(sweep, *sweep.manifest.chunk_range(int(part)))
 
     store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, computer=shuffled)
     assert again == tally and parts_of(store) == parts
     # The order has gaps too.
-    store.part_path(0).unlink()
-    store.part_path(2).unlink()
+    store.chunk_path(0).unlink()
+    store.chunk_path(2).unlink()
     log = Log()
     assert log.sweep(tmp_path / "store", label=UNTIL)[2] == tally and parts_of(store) == parts
     assert (log.found, log.computed) == (tally.scenarios - 64, 64)
@@ -221,7 +224,7 @@ def test_sweep_ends_at_its_largest_number_of_scenarios(whole, tmp_path):
     _, rows, _, _ = whole
     label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
     store, _, tally = Log().sweep(tmp_path / "store", label=label)
-    assert tally.scenarios == 300 and same_rows(all_rows(store), rows) == []
+    assert tally.scenarios == 300 and list_different_columns(all_rows(store), rows) == []
     # Parts beyond the stop of a sweep are removed if an interruption has left them.
     wide = read_store(store.folder)._replace(manifest=msgspec.structs.replace(label, until_width=WIDE))
     _, tally = run_sweep(wide, lambda *_: None, lambda *_: None)

@@ -10,18 +10,18 @@ from sweep_cases import case, manifest
 
 from jaxhil.errors import InputError
 from jaxhil.rig import digest
-from tuning.sweeps.columns import OUTCOMES, STATUSES, error_slots, judge
-from tuning.sweeps.manifest import unlike_here
-from tuning.sweeps.parts import decode_part, encode_part, same_rows
+from tuning.sweeps.chunk_file import decode_chunk, encode_chunk, list_different_columns
+from tuning.sweeps.columns import CONTACT_STATUSES, SCENARIO_OUTCOMES, classify_outcomes, list_error_columns
+from tuning.sweeps.manifest import list_process_differences
 from tuning.sweeps.store import (
-    kept_part,
-    locked,
+    lock_store,
     open_store,
-    read_part,
+    read_chunk,
+    read_intact_chunk,
     read_row,
     read_store,
-    remove_parts,
-    write_part,
+    remove_chunks,
+    write_chunk,
     write_verdict,
 )
 from tuning.sweeps.stored_studies import IndicesRequest, write_study
@@ -31,12 +31,12 @@ MANIFEST = manifest(case(2))
 UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
 
 
-SLOTS = error_slots(("error",), 2)
+SLOTS = list_error_columns(("error",), 2)
 
 
 def made_up(part, label=MANIFEST, seed=0):
     """Return made-up rows of a part, with gaps."""
-    first, number = label.part_rows(part)
+    first, number = label.chunk_range(part)
     generator = np.random.default_rng([seed, part])
     rows = {}
     for column in label.columns:
@@ -47,13 +47,13 @@ def made_up(part, label=MANIFEST, seed=0):
         elif column.kind == "flag":
             rows[column.name] = generator.random(number) < 0.5
         elif column.kind == "text":
-            texts = OUTCOMES if column.name == "outcome" else STATUSES
+            texts = SCENARIO_OUTCOMES if column.name == "outcome" else CONTACT_STATUSES
             rows[column.name] = generator.integers(0, len(texts), number).astype(np.int8)
         else:
             rows[column.name] = values
     return {
         **rows,
-        **judge(rows, SLOTS, np.array(np.inf), np.array(1e-3), label.largest_error),
+        **classify_outcomes(rows, SLOTS, np.array(np.inf), np.array(1e-3), label.error_limit),
     }
 
 
@@ -61,7 +61,7 @@ def made_up(part, label=MANIFEST, seed=0):
 def store(tmp_path):
     made = open_store(tmp_path / "store", MANIFEST, resume=False)
     for part in range(MANIFEST.parts):
-        write_part(made, part, made_up(part))
+        write_chunk(made, part, made_up(part))
     return made
 
 
@@ -71,10 +71,10 @@ def refused(*words):
 
 def test_store_is_read_as_it_was_written(store):
     for part in range(MANIFEST.parts):
-        result = read_part(store, part)
+        result = read_chunk(store, part)
         assert result is not None and list(result) == [column.name for column in MANIFEST.columns]
-        assert same_rows(result, made_up(part)) == []
-    assert same_rows(read_row(store, 99), {k: v[3:4] for k, v in made_up(3).items()}) == []
+        assert list_different_columns(result, made_up(part)) == []
+    assert list_different_columns(read_row(store, 99), {k: v[3:4] for k, v in made_up(3).items()}) == []
 
 
 def test_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
@@ -86,12 +86,12 @@ def test_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
     assert table.schema.field("energy_in_2").metadata[b"unit"] == b"J"
     expected = np.concatenate([made_up(part)["error_1"] for part in range(MANIFEST.parts)])
     assert table.column("error_1").null_count == np.sum(np.isnan(expected)) > 0
-    assert set(table.column("outcome").to_pylist()) <= set(OUTCOMES)
+    assert set(table.column("outcome").to_pylist()) <= set(SCENARIO_OUTCOMES)
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "gone", "other sweep", "other part"])
 def test_store_ignores_a_damaged_or_third_party_part(store, tmp_path, harm):
-    path = store.part_path(1)
+    path = store.chunk_path(1)
     content = bytearray(path.read_bytes())
     if harm == "cut":
         path.write_bytes(content[:-10])
@@ -103,35 +103,35 @@ def test_store_ignores_a_damaged_or_third_party_part(store, tmp_path, harm):
     elif harm == "gone":
         path.unlink()
     elif harm == "other part":
-        path.write_bytes(store.part_path(0).read_bytes())
+        path.write_bytes(store.chunk_path(0).read_bytes())
     else:
         other = open_store(tmp_path / "other", manifest(case(2), seed=1), resume=False)
-        write_part(other, 1, made_up(1))
-        path.write_bytes(other.part_path(1).read_bytes())
-    assert read_part(store, 1) is None
-    assert read_part(store, 0) is not None
+        write_chunk(other, 1, made_up(1))
+        path.write_bytes(other.chunk_path(1).read_bytes())
+    assert read_chunk(store, 1) is None
+    assert read_chunk(store, 0) is not None
     with refused("part-000001.parquet", "--resume"):
         read_row(store, 40)
 
 
 def test_store_detects_any_flipped_bit_of_a_part():
-    content = encode_part(MANIFEST, made_up(0))
-    assert decode_part(MANIFEST, 0, content) is not None
+    content = encode_chunk(MANIFEST, made_up(0))
+    assert decode_chunk(MANIFEST, 0, content) is not None
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
         harmed[bit // 8] ^= 1 << int(bit % 8)
-        assert decode_part(MANIFEST, 0, bytes(harmed)) is None
+        assert decode_chunk(MANIFEST, 0, bytes(harmed)) is None
 
 
 def test_store_ignores_a_part_rewritten_by_another_program(store):
     from pyarrow import parquet
 
-    path = store.part_path(0)
+    path = store.chunk_path(0)
     table = parquet.read_table(path)
     parquet.write_table(table, path)
     assert table.schema.metadata.keys() == parquet.read_table(path).schema.metadata.keys()
     with refused("part-000000.parquet: found damage, or a part of something else", "--resume"):
-        kept_part(store, 0)
+        read_intact_chunk(store, 0)
 
 
 @pytest.mark.parametrize("column", ["outcome", "failed", "worst_error", "error_2", "status_1"])
@@ -143,19 +143,23 @@ def test_store_outcomes_follow_from_errors(store, column):
         rows[f"{name}_1"][5] = rows[f"{name}_2"][5] = value
     rows = {
         **rows,
-        **judge(rows, SLOTS, np.array(np.inf), np.array(1e-3), MANIFEST.largest_error),
+        **classify_outcomes(rows, SLOTS, np.array(np.inf), np.array(1e-3), MANIFEST.error_limit),
     }
-    assert OUTCOMES[rows["outcome"][5]] == "good" and not rows["failed"][5] and rows["worst_error"][5] == 0.25
-    write_part(store, 0, rows)
-    assert read_part(store, 0) is not None
+    assert (
+        SCENARIO_OUTCOMES[rows["outcome"][5]] == "good"
+        and not rows["failed"][5]
+        and rows["worst_error"][5] == 0.25
+    )
+    write_chunk(store, 0, rows)
+    assert read_chunk(store, 0) is not None
     other = {"outcome": 3, "failed": True, "worst_error": 0.5, "error_2": 7.0, "status_1": 2}
     rows[column][5] = other[column]
-    write_part(store, 0, rows)
-    assert read_part(store, 0) is None
+    write_chunk(store, 0, rows)
+    assert read_chunk(store, 0) is None
 
 
 def test_store_refuses_an_index_beyond_the_end(store):
-    with refused("index: found 100, allowed 0 to 99"):
+    with refused("index: found 100, expected 0 to 99"):
         read_row(store, 100)
 
 
@@ -184,7 +188,9 @@ def test_store_refuses_a_missing_column_by_name(tmp_path):
     with refused("other code", difference):
         open_store(folder, MANIFEST, resume=True)
     # It can still be read, with a warning.
-    assert unlike_here(read_store(folder).manifest) == [difference] and not unlike_here(MANIFEST)
+    assert list_process_differences(read_store(folder).manifest) == [
+        difference
+    ] and not list_process_differences(MANIFEST)
 
 
 def test_store_removes_unfinished_files_on_resuming(store):
@@ -201,7 +207,7 @@ def test_store_removes_unfinished_files_on_resuming(store):
 def test_new_store_takes_over_no_study_and_no_verdict(store):
     (store.folder / "manifest.json").unlink()
     for part in range(MANIFEST.parts):
-        store.part_path(part).unlink()
+        store.chunk_path(part).unlink()
     (store.folder / "studies").mkdir()
     for resume in (False, True):
         with refused("store: found 'studies' and no sweep"):
@@ -217,15 +223,15 @@ def test_new_store_takes_over_no_study_and_no_verdict(store):
 
 
 def test_store_on_a_full_disk_is_one_line_and_keeps_its_parts(store):
-    before = store.part_path(0).read_bytes()
+    before = store.chunk_path(0).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
     try:
         with refused("part-000000.parquet: cannot be written: "):
-            write_part(store, 0, made_up(0, seed=1))
+            write_chunk(store, 0, made_up(0, seed=1))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert store.part_path(0).read_bytes() == before
+    assert store.chunk_path(0).read_bytes() == before
     assert len(os.listdir(store.folder / "parts")) == MANIFEST.parts
 
 
@@ -239,14 +245,14 @@ def test_store_folder_that_cannot_be_made_is_one_line(tmp_path):
 def test_store_in_a_read_only_folder_is_one_line(store):
     (store.folder / "parts").chmod(0o500)
     with refused("part-000000.parquet: cannot be written: Permission denied"):
-        write_part(store, 0, made_up(0))
+        write_chunk(store, 0, made_up(0))
 
 
 def test_store_is_continued_by_the_code_that_made_it(tmp_path):
     old = msgspec.structs.replace(MANIFEST, sources_sha256="0" * 64)
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
-    what_to_do = "allowed a new folder, or --resume with the version that made this one"
+    what_to_do = "expected a new folder, or --resume with the version that made this one"
     with refused("store: was made by other code: sources_sha256: found 000000000000...", what_to_do):
         open_store(folder, MANIFEST, resume=True)
 
@@ -258,8 +264,8 @@ def test_store_touches_no_file_of_the_user(tmp_path):
         (thesis / name).write_text("years")
     before = {path: (path.read_text(), path.stat().st_mtime_ns) for path in thesis.iterdir()}
     for resume in (False, True):
-        with refused("thesis: found '.thesis.docx.1.tmp' and no sweep, allowed an empty folder"):
-            with locked(thesis):
+        with refused("thesis: found '.thesis.docx.1.tmp' and no sweep, expected an empty folder"):
+            with lock_store(thesis):
                 open_store(thesis, MANIFEST, resume)
     assert {path: (path.read_text(), path.stat().st_mtime_ns) for path in thesis.iterdir()} == before
 
@@ -279,7 +285,7 @@ def test_store_follows_no_link_and_waits_for_no_pipe(store, tmp_path, name, kind
     else:
         folder.symlink_to(tmp_path / ("precious" if kind == "link" else "elsewhere"))
     before = os.lstat(folder).st_ino
-    with refused(name, "found a (link|pipe), allowed a (plain file|folder)"), locked(store.folder):
+    with refused(name, "found a (link|pipe), expected a (plain file|folder)"), lock_store(store.folder):
         opened = open_store(store.folder, MANIFEST, resume=True)
         write_verdict(opened, {"verdict": "good"})
         write_study(opened, IndicesRequest(2), ErrorIndices((), 1.0, 4, 0))
@@ -290,21 +296,21 @@ def test_store_follows_no_link_and_waits_for_no_pipe(store, tmp_path, name, kind
 
 @pytest.mark.parametrize("kind", ["link", "pipe"])
 def test_store_part_is_a_plain_file(store, tmp_path, kind):
-    path = store.part_path(2)
+    path = store.chunk_path(2)
     path.rename(tmp_path / "part")
     if kind == "pipe":
         os.mkfifo(path)
     else:
         path.symlink_to(tmp_path / "part")
-    assert read_part(store, 2) is None
+    assert read_chunk(store, 2) is None
     with refused("part-000002.parquet: cannot be written: found a"):
-        write_part(store, 2, made_up(2))
-    remove_parts(store, 1)
+        write_chunk(store, 2, made_up(2))
+    remove_chunks(store, 1)
     assert sorted(os.listdir(path.parent)) == ["part-000000.parquet", path.name]
 
 
 def test_store_is_written_by_one_sweep_at_a_time(tmp_path):
-    with locked(tmp_path), refused("another sweep"), locked(tmp_path):
+    with lock_store(tmp_path), refused("another sweep"), lock_store(tmp_path):
         pass
-    with locked(tmp_path):
+    with lock_store(tmp_path):
         pass

@@ -15,17 +15,17 @@ from jaxhil.errors import InputError
 from jaxhil.rig import digest
 from tuning.statistics.subset_simulation import SubsetSimulation
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.store import Store, open_store, write_verdict
+from tuning.sweeps.store import SweepStore, open_store, write_verdict
 from tuning.sweeps.stored_studies import (
     IndicesRequest,
-    RareRequest,
-    decode,
-    encode,
+    RareFailureRequest,
+    decode_study,
+    encode_study,
     read_study,
     study_path,
     write_study,
 )
-from tuning.sweeps.studies import ErrorIndices, InputIndices, error_indices, rare_failure
+from tuning.sweeps.studies import ErrorIndices, InputIndices, compute_error_indices, estimate_rare_failure
 
 MANIFEST = manifest(limit=1.5)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -72,7 +72,7 @@ SOME_RARE = SubsetSimulation(
     1e-5, 0.0, 2e-5, math.inf, 0.25, np.array([0.0, 2e-5]), np.array([math.inf, 0.25]),
     np.array([[0.5, 0.25], [math.nan, 1.5]]), 4000, np.ones((2, 3)), np.array([math.inf, 2.0]),
 )  # fmt: skip
-REQUESTS = IndicesRequest(128), RareRequest(1.5, replicates=2)
+REQUESTS = IndicesRequest(128), RareFailureRequest(1.5, replicates=2)
 STUDIES = tuple(zip(REQUESTS, (SOME_DRIVERS, SOME_RARE), strict=True))
 
 
@@ -93,27 +93,27 @@ def unwritten(*words):
 @given(drivers())
 def test_sobol_study_is_read_as_it_was_written(found):
     request = IndicesRequest(128)
-    assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
+    assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(RARE)
 def test_rare_event_study_is_read_as_it_was_written(found):
-    request = RareRequest(1.5, replicates=REPLICATES)
-    assert same(decode(MANIFEST, request, encode(MANIFEST, request, found)), found)
+    request = RareFailureRequest(1.5, replicates=REPLICATES)
+    assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(st.sampled_from(REQUESTS), st.binary(max_size=300))
 def test_study_of_arbitrary_bytes_is_ignored(request, content):
-    assert decode(MANIFEST, request, content) is None
+    assert decode_study(MANIFEST, request, content) is None
 
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=400)
 def test_study_with_any_flipped_bit_is_ignored(study, data):
     request, result = study
-    content = bytearray(encode(MANIFEST, request, result))
+    content = bytearray(encode_study(MANIFEST, request, result))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    read = decode(MANIFEST, request, bytes(content))
+    read = decode_study(MANIFEST, request, bytes(content))
     assert read is None or same(read, result)
 
 
@@ -129,13 +129,13 @@ JSON = st.recursive(
 def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
     """Include other types or shapes, which are no result and must not crash."""
     request, result = study
-    document = json.loads(encode(MANIFEST, request, result))
+    document = json.loads(encode_study(MANIFEST, request, result))
     place = data.draw(st.sampled_from([document, document["result"]]))
     place[data.draw(st.sampled_from([*place, "more"]))] = data.draw(JSON)
     document["sha256"] = digest(document)
-    read = decode(MANIFEST, request, json.dumps(document).encode())
+    read = decode_study(MANIFEST, request, json.dumps(document).encode())
     if read is not None:
-        again = json.loads(encode(MANIFEST, request, read))
+        again = json.loads(encode_study(MANIFEST, request, read))
         # Another digest, if 1 was written for 1.0.
         assert {**again, "sha256": document["sha256"]} == document
 
@@ -145,33 +145,33 @@ def test_study_that_json_cannot_express_is_not_written(store):
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):
-        write_study(store, RareRequest(1.5), SOME_RARE._replace(coefficient_of_variation=math.nan))
+        write_study(store, RareFailureRequest(1.5), SOME_RARE._replace(coefficient_of_variation=math.nan))
     assert not (store.folder / "studies").exists()
 
 
 def test_stored_study_is_what_a_new_run_gives(store, sweep):
-    first, again = (error_indices(sweep, 8) for _ in range(2))
+    first, again = (compute_error_indices(sweep, 8) for _ in range(2))
     write_study(store, IndicesRequest(8), first)
     assert same(read_study(store, IndicesRequest(8)), again)
     content = study_path(store, IndicesRequest(8)).read_bytes()
     write_study(store, IndicesRequest(8), again)
     assert study_path(store, IndicesRequest(8)).read_bytes() == content
 
-    first, again = (rare_failure(sweep, 2.0, samples=20, replicates=2) for _ in range(2))
-    write_study(store, RareRequest(2.0, 20, 2), first)
-    assert same(read_study(store, RareRequest(2.0, 20, 2)), again)
-    content = study_path(store, RareRequest(2.0, 20, 2)).read_bytes()
-    write_study(store, RareRequest(2.0, 20, 2), again)
-    assert study_path(store, RareRequest(2.0, 20, 2)).read_bytes() == content
+    first, again = (estimate_rare_failure(sweep, 2.0, samples=20, replicates=2) for _ in range(2))
+    write_study(store, RareFailureRequest(2.0, 20, 2), first)
+    assert same(read_study(store, RareFailureRequest(2.0, 20, 2)), again)
+    content = study_path(store, RareFailureRequest(2.0, 20, 2)).read_bytes()
+    write_study(store, RareFailureRequest(2.0, 20, 2), again)
+    assert study_path(store, RareFailureRequest(2.0, 20, 2)).read_bytes() == content
 
 
 def test_study_without_variance_and_failures_is_stored(tmp_path):
     still = build_sweep(manifest(case(uncertainty={}), limit=1.5))
     store = open_store(tmp_path / "store", still.manifest, resume=False)
-    nothing = rare_failure(still, 1e9, samples=20, replicates=2)
+    nothing = estimate_rare_failure(still, 1e9, samples=20, replicates=2)
     assert nothing.probability == 0 and nothing.coefficient_of_variation == math.inf
-    write_study(store, RareRequest(1e9, 20, 2), nothing)
-    assert same(read_study(store, RareRequest(1e9, 20, 2)), nothing)
+    write_study(store, RareFailureRequest(1e9, 20, 2), nothing)
+    assert same(read_study(store, RareFailureRequest(1e9, 20, 2)), nothing)
     constant = ErrorIndices((InputIndices("approach.phase", *[math.nan, 0.0, 1.0] * 2),), 15.0, 6, 0)
     write_study(store, IndicesRequest(2), constant)
     assert same(read_study(store, IndicesRequest(2)), constant)
@@ -179,39 +179,42 @@ def test_study_without_variance_and_failures_is_stored(tmp_path):
 
 def test_study_is_read_only_for_the_same_arguments_and_sweep(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
-    write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
+    write_study(store, RareFailureRequest(1.5, replicates=2), SOME_RARE)
     assert (
         read_study(store, IndicesRequest(128)) is not None
-        and read_study(store, RareRequest(1.5, replicates=2)) is not None
+        and read_study(store, RareFailureRequest(1.5, replicates=2)) is not None
     )
     assert read_study(store, IndicesRequest(64)) is None
-    assert read_study(store, RareRequest(1.6, replicates=2)) is None
+    assert read_study(store, RareFailureRequest(1.6, replicates=2)) is None
     assert (
-        read_study(store, RareRequest(1.5, samples=500, replicates=2)) is None
-        and read_study(store, RareRequest(1.5)) is None
+        read_study(store, RareFailureRequest(1.5, samples=500, replicates=2)) is None
+        and read_study(store, RareFailureRequest(1.5)) is None
     )
     # The same holds for a study renamed to another file's name.
     os.replace(study_path(store, IndicesRequest(128)), study_path(store, IndicesRequest(64)))
-    os.replace(study_path(store, RareRequest(1.5, 1000, 2)), study_path(store, RareRequest(1.6, 1000, 2)))
+    os.replace(
+        study_path(store, RareFailureRequest(1.5, 1000, 2)),
+        study_path(store, RareFailureRequest(1.6, 1000, 2)),
+    )
     assert (
         read_study(store, IndicesRequest(64)) is None
-        and read_study(store, RareRequest(1.6, replicates=2)) is None
+        and read_study(store, RareFailureRequest(1.6, replicates=2)) is None
     )
 
 
 @pytest.mark.parametrize("other", [manifest(limit=1.5, seed=1), manifest(limit=1.6)])
 def test_study_of_another_sweep_is_ignored(store, other):
-    write_study(Store(store.folder, other), IndicesRequest(128), SOME_DRIVERS)
-    write_study(Store(store.folder, other), RareRequest(1.5, replicates=2), SOME_RARE)
+    write_study(SweepStore(store.folder, other), IndicesRequest(128), SOME_DRIVERS)
+    write_study(SweepStore(store.folder, other), RareFailureRequest(1.5, replicates=2), SOME_RARE)
     assert (
         read_study(store, IndicesRequest(128)) is None
-        and read_study(store, RareRequest(1.5, replicates=2)) is None
+        and read_study(store, RareFailureRequest(1.5, replicates=2)) is None
     )
 
 
 def test_study_states_its_subject(store):
-    write_study(store, RareRequest(1.5, replicates=2), SOME_RARE)
-    result = json.loads(study_path(store, RareRequest(1.5, 1000, 2)).read_bytes())
+    write_study(store, RareFailureRequest(1.5, replicates=2), SOME_RARE)
+    result = json.loads(study_path(store, RareFailureRequest(1.5, 1000, 2)).read_bytes())
     del result["result"]
     assert result.pop("sha256") != MANIFEST.sha256
     assert result == {
@@ -235,7 +238,7 @@ def test_damaged_study_is_ignored(store, harm):
         write_study(store, IndicesRequest(128), SOME_DRIVERS)
         assert path.read_bytes() == content
     else:
-        with unwritten("drivers-128.json: ", "found a folder, allowed a plain file"):
+        with unwritten("drivers-128.json: ", "found a folder, expected a plain file"):
             write_study(store, IndicesRequest(128), SOME_DRIVERS)
 
 

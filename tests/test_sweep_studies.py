@@ -4,18 +4,23 @@ import numpy as np
 import pytest
 from sweep_cases import NOISY, UNCERTAIN, case, manifest
 
-from jaxhil.mechanism.uncertainty import dimensions
-from tuning.statistics.sobol_indices import evaluations
+from jaxhil.mechanism.uncertainty import count_dimensions
+from tuning.statistics.sobol_indices import count_evaluations
 from tuning.sweeps.chunks import build_sweep, run_chunk
-from tuning.sweeps.points import Running, run_points
+from tuning.sweeps.point_batches import PointRunSettings, run_points
 from tuning.sweeps.studies import (
-    NOISE,
-    error_indices,
-    independent_inputs,
-    rare_failure,
-    spread_beyond_formula,
+    NOISE_INPUT,
+    compute_error_indices,
+    estimate_rare_failure,
+    group_independent_inputs,
+    is_spread_beyond_formula,
 )
-from tuning.sweeps.tally import add_rows, empty_tally, error_sizes, failure_probability
+from tuning.sweeps.tally import (
+    add_to_tally,
+    build_empty_tally,
+    compute_error_sizes,
+    estimate_failure_probability,
+)
 
 pytestmark = pytest.mark.users_options
 
@@ -38,9 +43,9 @@ def whole():
 def test_input_without_effect_has_no_sensitivity(whole):
     sweep, _ = whole
     ran = []
-    result = error_indices(sweep, 128, Running(ran.append))
-    assert result.evaluations == sum(ran) == evaluations(4, 128) == 768
-    assert {one.input for one in result.inputs} == set(dimensions(sweep.mechanism))
+    result = compute_error_indices(sweep, 128, PointRunSettings(ran.append))
+    assert result.evaluations == sum(ran) == count_evaluations(4, 128) == 768
+    assert {one.input for one in result.inputs} == set(count_dimensions(sweep.mechanism))
     totals = [one.total for one in result.inputs]
     assert totals == sorted(totals, reverse=True)
     idle = next(one for one in result.inputs if one.input == "approach.velocity")
@@ -53,10 +58,10 @@ def test_input_without_effect_has_no_sensitivity(whole):
 def test_variance_of_a_single_input_is_all_its_own():
     # One input beside the phase: the law of total variance by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
-    result = {one.input: one for one in error_indices(sweep, 256).inputs}
+    result = {one.input: one for one in compute_error_indices(sweep, 256).inputs}
     cells = (np.arange(64) + 0.5) / 64
     grid = np.stack([axis.ravel() for axis in np.meshgrid(cells, cells, indexing="ij")], axis=1)
-    sizes = error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
+    sizes = compute_error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
     assert np.max(sizes) < 10  # which is the cap
     share = np.var(np.mean(sizes, axis=1)) / np.var(sizes)
     stiffness, phase = result["contact.stiffness"], result["approach.phase"]
@@ -68,33 +73,35 @@ def test_correlated_inputs_count_as_one():
     table = {"keys": ["rig.force_sensor.delay", "approach.velocity"], "matrix": [[1.0], [0.9, 1.0]]}
     apart = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     together = sweep_of(case(uncertainty=UNCERTAIN | IDLE, correlation=table))
-    inputs = independent_inputs(together.mechanism)
+    inputs = group_independent_inputs(together.mechanism)
     assert {name: columns.tolist() for name, columns in inputs.items()} == {
         "rig.force_sensor.delay + approach.velocity": [2, 0],
         "contact.stiffness": [1],
         "approach.phase": [3],
     }
     # The velocity has no effect in linear contact: the correlated pair has the delay's share.
-    joint, *others = sorted(error_indices(together, 128).inputs, key=lambda one: "delay" not in one.input)
+    joint, *others = sorted(
+        compute_error_indices(together, 128).inputs, key=lambda one: "delay" not in one.input
+    )
     assert joint.input == "rig.force_sensor.delay + approach.velocity" and len(others) == 2
-    alone = next(one for one in error_indices(apart, 128).inputs if "delay" in one.input)
+    alone = next(one for one in compute_error_indices(apart, 128).inputs if "delay" in one.input)
     assert alone.total_low < joint.total < alone.total_high
 
 
 def test_noise_is_an_input_of_the_study():
     document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
-    result = error_indices(sweep_of(document), 64)
+    result = compute_error_indices(sweep_of(document), 64)
     shares = {one.input: one for one in result.inputs}
     assert result.evaluations == 64 * 5 and shares.keys() == {
         "bodies.equivalent_mass",
         "approach.phase",
-        NOISE,
+        NOISE_INPUT,
     }
-    assert shares[NOISE].total_low > 0.1 and result.inputs[0].input != "bodies.equivalent_mass"
+    assert shares[NOISE_INPUT].total_low > 0.1 and result.inputs[0].input != "bodies.equivalent_mass"
     assert shares["bodies.equivalent_mass"].total_high < 1e-3
     # Without noise its index is zero.
-    quiet = error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
-    assert NOISE not in {one.input for one in quiet.inputs}
+    quiet = compute_error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
+    assert NOISE_INPUT not in {one.input for one in quiet.inputs}
 
 
 TIGHT = {"distribution": "uniform", "factor": [0.99999, 1.00001]}
@@ -104,7 +111,7 @@ def test_errors_beyond_the_cap_count_as_the_cap(whole):
     _, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
-    result = error_indices(limited, 128)
+    result = compute_error_indices(limited, 128)
     assert result.cap == 10 * limit
     assert 0.4 < result.capped / result.evaluations < 0.6
 
@@ -114,27 +121,27 @@ def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
     sweep, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 1 - share))
     rows = {**rows, "outcome": (np.abs(rows["worst_error"]) > limit).astype(np.int8)}
-    counted = add_rows(empty_tally(1), {**rows, "failed": rows["outcome"] > 0})
-    brute = failure_probability(counted)
-    result = rare_failure(sweep, limit, samples=200, replicates=6)
+    counted = add_to_tally(build_empty_tally(1), {**rows, "failed": rows["outcome"] > 0})
+    brute = estimate_failure_probability(counted)
+    result = estimate_rare_failure(sweep, limit, samples=200, replicates=6)
     assert brute.value == pytest.approx(share, abs=1e-3)
     assert result.low < brute.high and brute.low < result.high
     assert result.low < result.probability < result.high
-    assert not spread_beyond_formula(result)
-    assert spread_beyond_formula(result._replace(coefficient_of_variation=0.9))
+    assert not is_spread_beyond_formula(result)
+    assert is_spread_beyond_formula(result._replace(coefficient_of_variation=0.9))
 
 
 def test_rare_failures_are_reproducible(whole):
     sweep, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.97))
-    first, again = (rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
+    first, again = (estimate_rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
     np.testing.assert_array_equal(first.estimates, again.estimates)
 
 
 def test_other_failures_fail_at_any_limit():
     # A force sensor that reads only a little of the force.
     sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
-    assert rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
+    assert estimate_rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 
 
 def test_study_points_run_alike_in_any_chunk(whole):

@@ -4,24 +4,31 @@ import numpy as np
 import pytest
 from exact_quantile import quantile
 
-from tuning.statistics.intervals import Running, confidence_sequence, replicate_interval, updated
-from tuning.sweeps.columns import GOOD, OUTCOMES, SATURATED
+from tuning.statistics.intervals import (
+    SequentialState,
+    confidence_sequence,
+    replicate_interval,
+    update_sequence,
+)
+from tuning.sweeps.columns import GOOD, SATURATED, SCENARIO_OUTCOMES
 from tuning.sweeps.tally import (
-    ORDERS,
-    WORST,
-    add_rows,
-    empty_tally,
-    error_quantiles,
-    error_sizes,
-    failure_probability,
+    MAX_WORST_SCENARIOS,
+    QUANTILE_ORDERS,
+    add_to_tally,
+    build_empty_tally,
+    compute_error_sizes,
+    estimate_error_quantiles,
+    estimate_failure_probability,
 )
 
 
 def made_up(number, seed=0, share=0.3):
     generator = np.random.default_rng(seed)
-    outcome = np.where(generator.random(number) < share, generator.integers(1, len(OUTCOMES), number), 0)
+    outcome = np.where(
+        generator.random(number) < share, generator.integers(1, len(SCENARIO_OUTCOMES), number), 0
+    )
     error = generator.normal(size=number)
-    error[outcome > OUTCOMES.index("not reached")] = np.nan
+    error[outcome > SCENARIO_OUTCOMES.index("not reached")] = np.nan
     return {
         "index": np.arange(number),
         "outcome": outcome.astype(np.int8),
@@ -37,11 +44,11 @@ def piece(rows, part):
 def test_tally_is_the_same_for_parts_in_any_order():
     rows = made_up(1000)
     cuts = np.split(np.arange(1000), [10, 500, 501])
-    whole = add_rows(empty_tally(16), rows)
+    whole = add_to_tally(build_empty_tally(16), rows)
     for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
-        tally = empty_tally(16)
+        tally = build_empty_tally(16)
         for number in order:
-            tally = add_rows(tally, piece(rows, cuts[number]))
+            tally = add_to_tally(tally, piece(rows, cuts[number]))
         assert tally == whole
     assert whole.scenarios == 1000 and whole.failed == np.sum(rows["failed"])
     assert sum(k for _, k in whole.replicates) == whole.failed
@@ -49,26 +56,26 @@ def test_tally_is_the_same_for_parts_in_any_order():
 
 def test_tally_lists_the_worst_first():
     rows = made_up(1000)
-    tally = add_rows(empty_tally(1), rows)
-    assert len(tally.worst) == WORST
-    outcomes = [OUTCOMES[rows["outcome"][index]] for _, _, index in tally.worst]
+    tally = add_to_tally(build_empty_tally(1), rows)
+    assert len(tally.worst) == MAX_WORST_SCENARIOS
+    outcomes = [SCENARIO_OUTCOMES[rows["outcome"][index]] for _, _, index in tally.worst]
     assert set(outcomes) == {"non-finite"}
     mild = piece(rows, rows["outcome"] <= 1)
-    tally = add_rows(empty_tally(1), mild)
-    largest = np.sort(np.abs(mild["worst_error"]))[::-1][:WORST]
+    tally = add_to_tally(build_empty_tally(1), mild)
+    largest = np.sort(np.abs(mild["worst_error"]))[::-1][:MAX_WORST_SCENARIOS]
     np.testing.assert_array_equal([error for _, error, _ in tally.worst], largest)
 
 
 def test_tally_interval_without_failures_is_the_closed_form():
     rows = made_up(500, share=0.0)
-    result = failure_probability(add_rows(empty_tally(1), rows))
-    assert OUTCOMES[0] == GOOD and result.value == 0 and result.low == 0
+    result = estimate_failure_probability(add_to_tally(build_empty_tally(1), rows))
+    assert SCENARIO_OUTCOMES[0] == GOOD and result.value == 0 and result.low == 0
     assert result.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
 def test_tally_interval_of_replicates_is_students():
     rows = made_up(16 * 64)
-    result = failure_probability(add_rows(empty_tally(16), rows))
+    result = estimate_failure_probability(add_to_tally(build_empty_tally(16), rows))
     means = rows["failed"].reshape(64, 16).mean(axis=0)
     half = 2.131449545559323 * np.std(means, ddof=1) / 4
     assert result.value == pytest.approx(np.mean(means))
@@ -77,50 +84,55 @@ def test_tally_interval_of_replicates_is_students():
 
 def test_tally_remainder_is_in_no_replicate():
     rows = made_up(16 * 64 + 5)
-    tally = add_rows(empty_tally(16, 16 * 64 + 5), rows)
+    tally = add_to_tally(build_empty_tally(16, 16 * 64 + 5), rows)
     assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
     whole = piece(rows, slice(16 * 64))
     expected = replicate_interval(whole["failed"].reshape(64, 16).sum(axis=0), 64)
-    result = failure_probability(tally)
+    result = estimate_failure_probability(tally)
     assert (result.value, result.low, result.high) == pytest.approx(tuple(map(float, expected)))
-    assert result == failure_probability(add_rows(empty_tally(16, 16 * 64), whole))
-    assert error_quantiles(tally) == error_quantiles(add_rows(empty_tally(16, 16 * 64), whole))
+    assert result == estimate_failure_probability(add_to_tally(build_empty_tally(16, 16 * 64), whole))
+    assert estimate_error_quantiles(tally) == estimate_error_quantiles(
+        add_to_tally(build_empty_tally(16, 16 * 64), whole)
+    )
 
 
 def test_tally_has_no_interval_for_replicates_of_unequal_size():
-    tally = add_rows(empty_tally(16, 1600), made_up(100))
-    result = failure_probability(tally)
+    tally = add_to_tally(build_empty_tally(16, 1600), made_up(100))
+    result = estimate_failure_probability(tally)
     assert (result.low, result.high) == (0, 1) and 0 < result.value < 1 and "yet" in result.method
-    assert all((one.low, one.high) == (0, np.inf) for one in error_quantiles(tally))
-    assert failure_probability(add_rows(empty_tally(16, 10), made_up(10))).high == 1
+    assert all((one.low, one.high) == (0, np.inf) for one in estimate_error_quantiles(tally))
+    assert estimate_failure_probability(add_to_tally(build_empty_tally(16, 10), made_up(10))).high == 1
 
 
 def test_tally_looks_are_the_confidence_sequences():
     rows = made_up(1000)
-    tally, running = empty_tally(1, 10**6, looked_at=True), Running()
+    tally, running = build_empty_tally(1, 10**6, looked_at=True), SequentialState()
     for part in np.split(np.arange(1000), 10):
-        tally = add_rows(tally, piece(rows, part))
-        running = updated(running, int(np.sum(rows["failed"][part])), 100)
+        tally = add_to_tally(tally, piece(rows, part))
+        running = update_sequence(running, int(np.sum(rows["failed"][part])), 100)
     assert tally.looks == running
-    result, (_, low, high) = failure_probability(tally), confidence_sequence(tally.failed, 1000)
+    result, (_, low, high) = estimate_failure_probability(tally), confidence_sequence(tally.failed, 1000)
     assert low <= result.low < result.value < result.high <= high
     assert "repeated looks" in result.method
-    fixed = add_rows(empty_tally(1), rows)
-    assert result.high - result.low > failure_probability(fixed).high - failure_probability(fixed).low
-    for one, other in zip(error_quantiles(tally), error_quantiles(fixed), strict=True):
+    fixed = add_to_tally(build_empty_tally(1), rows)
+    assert (
+        result.high - result.low
+        > estimate_failure_probability(fixed).high - estimate_failure_probability(fixed).low
+    )
+    for one, other in zip(estimate_error_quantiles(tally), estimate_error_quantiles(fixed), strict=True):
         assert one.low <= other.low and other.high <= one.high
-    assert error_quantiles(tally)[0] != error_quantiles(fixed)[0]
+    assert estimate_error_quantiles(tally)[0] != estimate_error_quantiles(fixed)[0]
 
 
 @pytest.mark.parametrize("replicates", [1, 16])
 def test_tally_quantiles_are_those_of_the_errors(replicates):
     rows = made_up(1600, share=0.01)
-    sizes = error_sizes(rows)
-    assert np.array_equal(np.isinf(sizes), rows["outcome"] > OUTCOMES.index(SATURATED)) and np.any(
+    sizes = compute_error_sizes(rows)
+    assert np.array_equal(np.isinf(sizes), rows["outcome"] > SCENARIO_OUTCOMES.index(SATURATED)) and np.any(
         np.isinf(sizes)
     )
-    result = error_quantiles(add_rows(empty_tally(replicates, 1600), rows))
-    assert [one.order for one in result] == list(ORDERS)
+    result = estimate_error_quantiles(add_to_tally(build_empty_tally(replicates, 1600), rows))
+    assert [one.order for one in result] == list(QUANTILE_ORDERS)
     for one in result[:3]:
         exact = quantile(sizes, one.order)
         assert one.value == pytest.approx(float(exact.value), rel=0.01)

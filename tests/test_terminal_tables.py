@@ -13,10 +13,10 @@ FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 
 @pytest.mark.parametrize("width", [30, 60, 80, 110, 300])
 def test_table_loses_no_digit(monkeypatch, capsys, width):
-    monkeypatch.setattr(terminal, "WIDTH", width)
+    monkeypatch.setattr(terminal, "DEFAULT_WIDTH", width)
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
     terminal.emit(
-        terminal.table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]])
+        terminal.build_table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]])
     )
     title, *_, line, _ = capsys.readouterr().out.splitlines()
     assert title == "suite-damped: each law, and a title that is long"
@@ -24,9 +24,11 @@ def test_table_loses_no_digit(monkeypatch, capsys, width):
 
 
 def test_table_folds_long_texts_between_words(monkeypatch, capsys):
-    monkeypatch.setattr(terminal, "WIDTH", 60)
+    monkeypatch.setattr(terminal, "DEFAULT_WIDTH", 60)
     text = "force delay, noise of the force sensor and dead zone, equivalent mass, roughly the surface"
-    terminal.emit(terminal.table("costs", ["law", "known beforehand", "us"], [[LAW, text, 1.25]], (0, 1)))
+    terminal.emit(
+        terminal.build_table("costs", ["law", "known beforehand", "us"], [[LAW, text, 1.25]], (0, 1))
+    )
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 60
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
@@ -39,4 +41,9 @@ def test_json_writes_numpy_numbers_as_numbers_and_nonfinite_as_null():
         "half": np.float32(0.5),
         "each": np.array([1.0, np.nan]),
     }
-    assert json.loads(terminal.as_json(said)) == {"yes": True, "three": 3, "half": 0.5, "each": [1.0, None]}
+    assert json.loads(terminal.format_json(said)) == {
+        "yes": True,
+        "three": 3,
+        "half": 0.5,
+        "each": [1.0, None],
+    }

@@ -7,21 +7,21 @@ from tuning.cli import timings
 
 
 def test_timings_count_overlapping_times_once():
-    assert timings.covered([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
+    assert timings.union_duration([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
     spans = {
         "importing": [(0.0, 1.0)],
         "reading kept programs": [(2.0, 2.25)],
         "compiling": [(2.0, 3.0)],
         "tracing": [(0.5, 2.0), (1.0, 1.5)],
     }
-    assert timings.said(0.0, 10.0, spans) == (
+    assert timings.format_timings(0.0, 10.0, spans) == (
         "10.00 s in all: all else 7.00 s, importing 1.00 s, tracing 1.00 s, compiling 0.75 s, "
         "reading kept programs 0.25 s"
     )
 
 
 def test_timings_record_events_of_jax(capsys):
-    with timings.measured(True):
+    with timings.report_timings(True):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 9.5)
         jax.monitoring.record_event_duration_secs("/jax/compilation_cache/cache_retrieval_time_sec", 4.24)
     output = capsys.readouterr().err

@@ -164,9 +164,9 @@ def run(copied, folder, script):
 
 def test_toy_contact_law_is_read_and_rehearsed_without_jax(copied, tmp_path):
     needs, unknown, other, key, rehearsed = run(copied, tmp_path, WITHOUT_JAX).splitlines()
-    assert "contact.doubling_depth: found nothing, allowed a number > 0 m (law toy needs it)" in needs
-    assert "contact.law: found 'hertz', allowed one of linear, " in unknown and unknown.endswith(", toy")
-    assert "contact.doubling_depth: found 0.0003, allowed nothing (only for law toy)" in other
+    assert "contact.doubling_depth: found nothing, expected a number > 0 m (law toy needs it)" in needs
+    assert "contact.law: found 'hertz', expected one of linear, " in unknown and unknown.endswith(", toy")
+    assert "contact.doubling_depth: found 0.0003, expected nothing (only for law toy)" in other
     assert key == "where toy is twice as stiff; m; a number > 0 m; ('toy',)"
     assert rehearsed == "True False"
 

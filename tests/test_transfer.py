@@ -11,11 +11,17 @@ from jaxhil.mechanism.file import builtin_names, load
 from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import tune_all
 from tuning.gains.multistart import choose_starts
-from tuning.gains.objective import RMS, objective_value
-from tuning.gains.rounds import solve_tasks
+from tuning.gains.multistart_solver import solve_tasks
+from tuning.gains.objective import RMS_OBJECTIVE, evaluate_objective
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
-from tuning.gains.transfer import Tuned, carry_over, distance, nearest, traits
+from tuning.gains.transfer import (
+    EarlierGains,
+    compute_mechanism_distance,
+    compute_traits,
+    find_nearest,
+    transfer_gains,
+)
 from tuning.gains.validation import build_validation
 
 MASS, STIFFNESS = 350.0, 124355.0
@@ -49,10 +55,10 @@ def anywhere(mechanism, compensator, seed=0):
 def test_distance_is_zero_to_itself_and_symmetric():
     mechanisms = [load(name).mechanism for name in builtin_names()]
     for a in mechanisms:
-        assert distance(a, a) == 0
+        assert compute_mechanism_distance(a, a) == 0
         for b in mechanisms:
-            assert distance(a, b) == distance(b, a) >= 0
-            assert (distance(a, b) == 0) == (a is b)
+            assert compute_mechanism_distance(a, b) == compute_mechanism_distance(b, a) >= 0
+            assert (compute_mechanism_distance(a, b) == 0) == (a is b)
 
 
 @pytest.mark.parametrize(
@@ -77,33 +83,37 @@ def test_distance_is_zero_to_itself_and_symmetric():
     ],
 )
 def test_distance_weighs_each_trait_by_its_effect_on_the_restitution(override, expected):
-    assert distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
+    assert compute_mechanism_distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
 
 
 def test_traits_do_not_depend_on_the_form_of_the_simulator():
-    second = traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
+    second = compute_traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
     omega = 2 * math.pi * 10
     written = behind(
         f"'transfer_function', numerator=[{omega**2}], denominator=[1.0, {1.4 * omega}, {omega**2}]"
     )
-    assert traits(written).simulator_delay == pytest.approx(second.simulator_delay, rel=1e-12)
+    assert compute_traits(written).simulator_delay == pytest.approx(second.simulator_delay, rel=1e-12)
     leading = behind("'transfer_function', numerator=[0.01, 1.0], denominator=[0.0001, 0.03, 1.0]")
-    assert traits(leading).simulator_delay == pytest.approx(0.004 + 0.02, rel=1e-12)
-    assert traits(behind("'ideal'")).simulator_delay == 0.004
+    assert compute_traits(leading).simulator_delay == pytest.approx(0.004 + 0.02, rel=1e-12)
+    assert compute_traits(behind("'ideal'")).simulator_delay == 0.004
 
 
 def test_damping_of_every_law_is_that_of_its_restitution():
     """Use Hunt and Crossley's e = 1 - chi v."""
-    hertz = traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
+    hertz = compute_traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
     assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
-    assert traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
+    assert compute_traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
 
 
 def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
     stiff, soft = claw("contact.stiffness=[3e5]"), claw("contact.stiffness=[6e4]")
-    sources = [Tuned(stiff, {}, "stiff"), Tuned(soft, {}, "soft"), Tuned(soft, {}, "again")]
-    assert nearest(claw("contact.stiffness=[2e5]"), sources).source == "stiff"
-    assert nearest(claw("contact.stiffness=[8e4]"), sources).source == "soft"
+    sources = [
+        EarlierGains(stiff, {}, "stiff"),
+        EarlierGains(soft, {}, "soft"),
+        EarlierGains(soft, {}, "again"),
+    ]
+    assert find_nearest(claw("contact.stiffness=[2e5]"), sources).source == "stiff"
+    assert find_nearest(claw("contact.stiffness=[8e4]"), sources).source == "soft"
 
 
 # Transfer
@@ -114,13 +124,13 @@ def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
 def test_transferred_gains_on_the_same_mechanism_are_unchanged(compensator, name):
     mechanism = load(name).mechanism
     gains = anywhere(mechanism, compensator)
-    assert carry_over(compensator, gains, mechanism, load(name).mechanism) == gains
+    assert transfer_gains(compensator, gains, mechanism, load(name).mechanism) == gains
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
 def test_transferred_literature_gains_are_the_literatures(compensator):
     source, target = claw(), load("varying", ["rig.control_period=0.002"]).mechanism
-    transferred = carry_over(compensator, literature_gains(source, compensator), source, target)
+    transferred = transfer_gains(compensator, literature_gains(source, compensator), source, target)
     for name, value in literature_gains(target, compensator).items():
         assert transferred[name] == pytest.approx(value, rel=1e-12)
 
@@ -129,7 +139,7 @@ def test_transferred_gains_move_with_the_literature_and_the_range():
     source = claw()
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
-    transferred = carry_over("response_error", {**gains, "phase_lead": 0.0054}, source, target)
+    transferred = transfer_gains("response_error", {**gains, "phase_lead": 0.0054}, source, target)
     # A range of 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
     assert transferred["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
     assert transferred["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
@@ -141,7 +151,9 @@ def test_transferred_gains_are_within_the_bounds():
     names = builtin_names()
     for seed, name in enumerate(names):
         source, target = load(name).mechanism, load(names[seed - 1], ["rig.control_period=0.003"]).mechanism
-        transferred = carry_over("response_error", anywhere(source, "response_error", seed), source, target)
+        transferred = transfer_gains(
+            "response_error", anywhere(source, "response_error", seed), source, target
+        )
         for gain in COMPENSATORS["response_error"].gains:
             assert gain.lower(target) <= transferred[gain.name] <= gain.upper(target)
 
@@ -174,7 +186,7 @@ def test_prior_starts_replace_the_last_starts(task, validation):
     # It begins at exactly these gains: its first value is theirs.
     (starts,) = solve_tasks([task], [points], 6)
     errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, gains, task.scenarios).error[0], 0)
-    assert starts[2].history[0] == pytest.approx(objective_value(RMS, errors), rel=1e-9)
+    assert starts[2].history[0] == pytest.approx(evaluate_objective(RMS_OBJECTIVE, errors), rel=1e-9)
 
 
 @pytest.mark.parametrize("starts", [1, 2])
@@ -200,7 +212,7 @@ def test_prior_start_never_ends_worse_than_it_was(task, validation, solved):
 @pytest.fixture
 def in_blocks(monkeypatch):
     """Return the origin of starts when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
-    monkeypatch.setattr(tune_all, "BLOCK", 2)
+    monkeypatch.setattr(tune_all, "MAX_GROUP_SIZE", 2)
 
     def block(tasks, settings, work, near):
         return [
@@ -208,7 +220,7 @@ def in_blocks(monkeypatch):
             for t, own in zip(tasks, near, strict=True)
         ]
 
-    monkeypatch.setattr(tune_all, "tune_block", block)
+    monkeypatch.setattr(tune_all, "tune_group", block)
 
     def call(starts, tuned=()):
         mechanisms = [claw(f"contact.stiffness=[{k}]", f"name='{k}'") for k in ("1e5", "3e5", "2.9e5")]
@@ -225,7 +237,7 @@ def test_later_blocks_start_at_the_results_of_earlier_ones(in_blocks):
 
 
 def test_prior_starts_come_before_transferred_ones_and_literature_stays(in_blocks):
-    file = Tuned(claw("contact.stiffness=[1.1e5]"), {}, "file")
+    file = EarlierGains(claw("contact.stiffness=[1.1e5]"), {}, "file")
     assert in_blocks(3, [file]) == [["file"], ["file"], ["file", "3e5"]]
     assert in_blocks(2, [file]) == in_blocks(1, [file]) == [["file"]] * 3
     assert in_blocks(1) == [[]] * 3

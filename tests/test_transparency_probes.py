@@ -11,25 +11,25 @@ from scipy.integrate import solve_ivp
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import pareto_search
-from tuning.gains.objective import Objective, contact_terms, objective_value
-from tuning.gains.pareto import fronts
-from tuning.gains.pareto_search import PEAK, TRANSPARENCY, default_axis
-from tuning.gains.rounds import solve_tasks
+from tuning.gains.multistart_solver import solve_tasks
+from tuning.gains.objective import Objective, compute_contact_terms, evaluate_objective
+from tuning.gains.pareto import compute_fronts
+from tuning.gains.pareto_search import PEAK_CRITERION, TRANSPARENCY_CRITERION, choose_default_criterion
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import build_task
 from tuning.gains.tune_all import tune
 from tuning.gains.validation import build_validation
 from tuning.transparency.probes import (
     LANES_PER_SCENARIO,
-    are_probes,
-    default_weights,
-    probe_figures,
-    probed_scenarios,
+    build_probed_scenarios,
+    choose_default_weights,
+    compute_probe_metrics,
+    mask_probes,
 )
-from tuning.transparency.pushes import SIZE, WIDTH
+from tuning.transparency.pushes import PUSH_DURATION, PUSH_SIZE
 
 DAMPED = load("varying", ["contact.stiffness=[1e5]", "approach.contacts=1"]).mechanism
 WEIGHED = Objective(command_weight=0.02, transparency_weight=0.7)
@@ -43,7 +43,7 @@ def kind(scenarios, number):
 
 def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
     """Compare with SciPy, event by event, under the very push that the scenario's hardware gets."""
-    probed = probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
+    probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, known in ((1, probed.early), (2, probed.late)):
         own = kind(probed.scenarios, number)
         assert (own.contacts == 1).all()
@@ -51,11 +51,11 @@ def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
             stiffness, damping = own.contact.stiffness[0, lane], own.contact.damping[0, lane]
             mass, velocity = own.equivalent_mass[lane], own.velocity[lane]
             size, centre = own.probe.push.size[0, lane], own.probe.push.centre[0, lane]
-            assert size == pytest.approx(SIZE * own.reference.peak_force[0, lane])
+            assert size == pytest.approx(PUSH_SIZE * own.reference.peak_force[0, lane])
 
-            def motion(t, y, k=stiffness, b=damping, m=mass, size=size, begin=centre - WIDTH / 2):
-                inside = 0 < t - begin < WIDTH
-                push = size * np.sin(np.pi * (t - begin) / WIDTH) if inside else 0.0
+            def motion(t, y, k=stiffness, b=damping, m=mass, size=size, begin=centre - PUSH_DURATION / 2):
+                inside = 0 < t - begin < PUSH_DURATION
+                push = size * np.sin(np.pi * (t - begin) / PUSH_DURATION) if inside else 0.0
                 return [y[1], -(max(0.0, k * y[0] + b * y[1]) * (y[0] > 0) + push) / m]
 
             tight = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-13, "max_step": 1e-3}
@@ -69,18 +69,18 @@ def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
 def test_probed_copies_have_no_error_on_an_ideal_rig():
     spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
     made = validated({**mechanism({}, IDEAL, 0.0, period=5e-5), "uncertainty": spread})
-    probed = probed_scenarios(made, draw(made, 16, 0))
+    probed = build_probed_scenarios(made, draw(made, 16, 0))
     outcome = evaluate(build_loop(made, "none", probed.scenarios), {}, probed.scenarios)
     assert outcome.good[0].all() and np.max(np.abs(outcome.error[0])) < 1e-3
     copies = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, LANES_PER_SCENARIO), outcome)
-    figures = probe_figures(probed, copies)
+    figures = compute_probe_metrics(probed, copies)
     assert list(figures) == ["early", "late", "slope", "peak"]
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
 def test_first_lanes_hold_some_copies_of_each_kind():
-    assert list(are_probes(8)) == [False, True, True, True] * 2
-    probed = probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
+    assert list(mask_probes(8)) == [False, True, True, True] * 2
+    probed = build_probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]
     assert (damping[3::LANES_PER_SCENARIO] >= damping[::LANES_PER_SCENARIO]).all() and (
         damping[3:] > damping[:-3]
@@ -91,9 +91,13 @@ def test_first_lanes_hold_some_copies_of_each_kind():
 
 
 def test_only_anticipating_laws_are_probed_unless_requested():
-    weighed = [name for name in COMPENSATORS if default_weights(name)]
-    assert weighed == ["impulse_ledger"] == [n for n in COMPENSATORS if default_axis(n) == PEAK]
-    assert Objective(**default_weights(weighed[0])).transparency_weight > 0
+    weighed = [name for name in COMPENSATORS if choose_default_weights(name)]
+    assert (
+        weighed
+        == ["impulse_ledger"]
+        == [n for n in COMPENSATORS if choose_default_criterion(n) == PEAK_CRITERION]
+    )
+    assert Objective(**choose_default_weights(weighed[0])).transparency_weight > 0
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +109,8 @@ def of_training(task, gains):
     """Return restitution errors of scenarios and copies, and all peak excesses, in training."""
     outcome = evaluate(task.loop, gains, task.scenarios)
     assert outcome.good[outcome.wanted].all()
-    error, excess, _ = (np.asarray(term)[0] for term in contact_terms(outcome))
-    copies = are_probes(len(error))
+    error, excess, _ = (np.asarray(term)[0] for term in compute_contact_terms(outcome))
+    copies = mask_probes(len(error))
     return error[~copies], error[copies], excess
 
 
@@ -122,12 +126,12 @@ def test_solver_and_search_minimise_the_stated_objective(task):
         error, of_probes, excess = of_training(task, validation.gains(0, point))
         stated = np.sqrt(np.mean(error**2) + 0.7**2 * np.mean(of_probes**2) + 0.02**2 * np.mean(excess**2))
         assert loss == pytest.approx(stated, rel=1e-9)
-        assert objective_value(WEIGHED, error, excess, probe_errors=of_probes) == pytest.approx(
+        assert evaluate_objective(WEIGHED, error, excess, probe_errors=of_probes) == pytest.approx(
             stated, rel=1e-12
         )
         assert start.history[0] <= stated * (1 + 1e-9)
         ended = of_training(task, start.gains)
-        value = objective_value(WEIGHED, ended[0], ended[2], probe_errors=ended[1])
+        value = evaluate_objective(WEIGHED, ended[0], ended[2], probe_errors=ended[1])
         assert start.rms >= value * (1 - 1e-9)
 
 
@@ -154,26 +158,26 @@ def test_transparency_is_evaluated_for_literature_and_tuned_gains(result):
 
 def test_scenarios_without_transparency_weight_are_not_probed():
     plain = dataclasses.replace(SMALL, objective=Objective())
-    assert not plain.probed and dataclasses.replace(plain, judge_transparency=True).probed
+    assert not plain.probed and dataclasses.replace(plain, evaluate_transparency=True).probed
     assert len(build_task(DAMPED, "phase_lead", 4, 0).scenarios.velocity) == 4
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", [PEAK, TRANSPARENCY])
+@pytest.mark.parametrize("axis", [PEAK_CRITERION, TRANSPARENCY_CRITERION])
 def test_error_is_traded_against_peak_or_transparency(result, axis):
-    ((_, front),) = fronts([result], 2, axis=axis)
+    ((_, front),) = compute_fronts([result], 2, axis=axis)
     assert front.axis == axis and front.points[0].weight == 0 < front.points[1].weight
     for point in (*front.points, front.tuned):
         assert point.transparency is not None
-        if axis == PEAK:
+        if axis == PEAK_CRITERION:
             assert point.cost == pytest.approx(point.transparency["peak"].value, rel=1e-12)
     assert front.tuned.transparency == result.transparency["tuned"]
     # On the training scenarios the heavier weight is no worse in what it weighs.
     task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, probed=True)
     validation = build_validation([task], 3, 0)
-    starts = [pareto_search.Start("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
-    light, heavy = pareto_search._reached(validation, 0, axis, WEIGHED, 0.0, starts)
+    starts = [pareto_search.StartResult("made up", 1, 1.0, [1.0], point.gains) for point in front.points]
+    light, heavy = pareto_search._collect_candidates(validation, 0, axis, WEIGHED, 0.0, starts)
     assert heavy.excess <= light.excess * (1 + 1e-6) and light.error <= heavy.error * (1 + 1e-6)
     _, of_probes, excess = of_training(task, front.points[1].gains)
-    traded = excess if axis == PEAK else of_probes
+    traded = excess if axis == PEAK_CRITERION else of_probes
     assert heavy.excess == pytest.approx(np.sqrt(np.mean(traded**2)), rel=1e-6)

@@ -8,24 +8,24 @@ import pytest
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.gains.multistart import BATCHES, choose_starts
-from tuning.gains.rounds import solve_tasks
+from tuning.gains.multistart import MAX_START_BATCHES, choose_starts
+from tuning.gains.multistart_solver import solve_tasks
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import (
-    NOISY_SCENARIOS,
-    SCENARIOS,
+    DEFAULT_NOISY_SCENARIOS,
+    DEFAULT_SCENARIOS,
+    build_gain_bounds,
     build_task,
-    gain_bounds,
+    list_tuned_gains,
     spread_points,
-    tuned_names,
 )
-from tuning.gains.tune import figures, uncompensated
+from tuning.gains.tune import compute_error_metrics, remove_compensation
 from tuning.gains.tune_all import tune
 from tuning.gains.validation import build_validation
-from tuning.optimisation.solution import STATUSES
+from tuning.optimisation.solution import SOLVER_STATUSES
 from tuning.optimisation.unit_box import to_coordinates, to_gains
 
 SMALL = TuneSettings(scenarios=16, starts=2, steps=12, validation=63, scanned=64)
@@ -44,9 +44,11 @@ def test_tuned_gains_beat_the_literature_on_fresh_scenarios(result):
 
 
 def test_every_start_has_a_status_and_a_falling_history(result):
-    assert 0 < len(result.starts) <= BATCHES * SMALL.starts and len(result.starts) % SMALL.starts == 0
+    assert (
+        0 < len(result.starts) <= MAX_START_BATCHES * SMALL.starts and len(result.starts) % SMALL.starts == 0
+    )
     for start in result.starts:
-        assert start.status in STATUSES
+        assert start.status in SOLVER_STATUSES
         assert len(start.history) == start.steps
         assert (np.diff(start.history) <= 0).all()
         assert start.history[-1] == start.rms
@@ -62,7 +64,7 @@ def test_gains_tuned_with_noise_are_better_with_noise(result):
     tuned = min(starts, key=lambda start: start.rms).gains
     fresh = build_scenarios(noisy, draw(noisy, 255, 99), 99)
     loop = build_loop(noisy, "phase_lead", fresh)
-    noiseless, ours = (figures(evaluate(loop, gains, fresh)) for gains in (result.gains, tuned))
+    noiseless, ours = (compute_error_metrics(evaluate(loop, gains, fresh)) for gains in (result.gains, tuned))
     assert noiseless.failed == ours.failed == 0
     assert ours.rms < 0.9 * noiseless.rms
     assert tuned["lead_filter"] > 2 * result.gains["lead_filter"]
@@ -71,9 +73,12 @@ def test_gains_tuned_with_noise_are_better_with_noise(result):
 @pytest.mark.parametrize(
     "override, number",
     [
-        ("approach.velocity=0.01", SCENARIOS),
-        ("rig.position_sensor.noise_std=1e-6", NOISY_SCENARIOS),
-        ("uncertainty.'rig.force_sensor.noise_std'={distribution='uniform', low=0, high=3}", NOISY_SCENARIOS),
+        ("approach.velocity=0.01", DEFAULT_SCENARIOS),
+        ("rig.position_sensor.noise_std=1e-6", DEFAULT_NOISY_SCENARIOS),
+        (
+            "uncertainty.'rig.force_sensor.noise_std'={distribution='uniform', low=0, high=3}",
+            DEFAULT_NOISY_SCENARIOS,
+        ),
     ],
 )
 def test_noisy_mechanisms_get_more_scenarios(override, number):
@@ -114,8 +119,8 @@ def test_before_is_no_compensation_for_any_law(monkeypatch):
     monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", {"mild": {}})
     mechanism, quiet = load().mechanism, dataclasses.replace(SMALL, setting="mild")
     without = tune(mechanism, "none", SMALL).outcomes["tuned"]
-    assert uncompensated("impulse_ledger", {}) == ("none", {})
-    assert uncompensated("phase_lead", {"phase_lead": 1.0}) == ("phase_lead", {"phase_lead": 0.0})
+    assert remove_compensation("impulse_ledger", {}) == ("none", {})
+    assert remove_compensation("phase_lead", {"phase_lead": 1.0}) == ("phase_lead", {"phase_lead": 0.0})
     before = tune(mechanism, "impulse_ledger", quiet).outcomes["before"]
     np.testing.assert_allclose(before.error, without.error, rtol=1e-12)
     assert np.sqrt(np.nanmean(before.error**2)) > 0.1
@@ -123,8 +128,8 @@ def test_before_is_no_compensation_for_any_law(monkeypatch):
 
 def test_starts_begin_with_the_literature_and_stay_inside():
     task = build_task(load().mechanism, "response_error", 8, 0)
-    names = tuned_names([task])
-    bounds = gain_bounds(task, names)
+    names = list_tuned_gains([task])
+    bounds = build_gain_bounds(task, names)
     first = np.array([task.literature[name] for name in names])
     points = spread_points(to_coordinates(first, bounds), 9, seed=0)
     np.testing.assert_allclose(to_gains(points[0], bounds), first, rtol=1e-12)

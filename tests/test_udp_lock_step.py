@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from rig_lock_step import ANY, FINITE, a_reading, closed_loop, controller, packets, prepared, same
 
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import load, to_builtins
+from jaxhil.mechanism.file import load, to_plain_data
 from jaxhil.rig import faults
 from tuning.rig import udp_protocol
 from tuning.rig.udp_protocol import (
+    MAX_INTERPOLATED_TICKS,
     MISSED_TICK,
-    MOST_MADE_UP,
     PREPARE,
     READY,
     RESET,
     TICK,
     ControllerTask,
-    Reading,
+    ReadingPacket,
     decode_answer,
     encode_answer,
 )
@@ -112,7 +112,7 @@ def test_long_gap_is_left_to_the_controller(varying):
     mechanism, _ = varying
     task = prepared(mechanism, missed_in_a_row=20.0)
     first = task.answer(a_reading(0, force=7.0))
-    gap = MOST_MADE_UP + 1
+    gap = MAX_INTERPOLATED_TICKS + 1
     answer = task.answer(a_reading(1 + gap, force=7.0))
     assert task.made_up == 0 and not answer.words and answer.faults & MISSED_TICK
     # Model time is rig time: the model continued under the last force.
@@ -139,7 +139,7 @@ SMALL = st.integers(0, 40)
 @given(
     st.lists(
         st.builds(
-            Reading,
+            ReadingPacket,
             st.sampled_from([PREPARE, TICK, RESET]),
             SMALL,
             st.integers(0, 3),
@@ -154,7 +154,7 @@ SMALL = st.integers(0, 40)
 def test_any_packets_of_a_rig_are_answered_with_finite_commands(varying, readings, compensator):
     mechanism, gains = varying
     law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
-    task = ControllerTask(law, to_builtins(mechanism))
+    task = ControllerTask(law, to_plain_data(mechanism))
     for number, reading in enumerate(readings):
         answer = task.answer(reading._replace(sequence=reading.sequence + 2 * number))
         if answer is not None:

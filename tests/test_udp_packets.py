@@ -9,30 +9,32 @@ from rig_lock_step import ANY, FINITE, same
 
 from tuning.rig.udp_protocol import (
     FLAGS,
+    MAX_SEQUENCE_STEP,
     PREPARE,
     READY,
     RESET,
     STOP,
     TICK,
-    WINDOW,
-    Answer,
+    AnswerPacket,
     PacketError,
-    Reading,
-    Sequence,
-    Sessions,
-    ask_for_session,
+    ReadingPacket,
+    SequenceFilter,
+    SessionNumbers,
     decode_answer,
     decode_reading,
     decode_session,
     encode_answer,
     encode_reading,
+    encode_session_request,
 )
 
 WORD = st.integers(0, 2**32 - 1)
 
 
 @given(
-    st.builds(Reading, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4)
+    st.builds(
+        ReadingPacket, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4
+    )
 )
 def test_readings_survive_encoding(reading):
     assert same(decode_reading(encode_reading(reading, 7), 7), reading)
@@ -42,15 +44,17 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
 
 
 @given(
-    st.builds(Answer, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable)
+    st.builds(
+        AnswerPacket, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable
+    )
 )
 def test_answers_survive_encoding(answer):
     assert same(decode_answer(encode_answer(answer, 7), 7), answer)
 
 
 SESSION = 2**64 - 2
-READING = encode_reading(Reading(TICK, 1, 2, 3, 4.0, 5.0, 6.0, 7.0, 8.0), SESSION)
-ANSWER = encode_answer(Answer(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
+READING = encode_reading(ReadingPacket(TICK, 1, 2, 3, 4.0, 5.0, 6.0, 7.0, 8.0), SESSION)
+ANSWER = encode_answer(AnswerPacket(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
 
 
 def mutated(packet):
@@ -101,51 +105,54 @@ def test_packets_of_another_session_are_refused():
 
 
 def test_session_number_goes_to_the_asker_and_is_unique_to_every_address():
-    sessions, rig, number = Sessions(), ("127.0.0.1", 4000), 2**63 + 5
-    answer = sessions.answer(ask_for_session(number), rig)
-    assert answer is not None and len(answer) == len(ask_for_session(number))
+    sessions, rig, number = SessionNumbers(), ("127.0.0.1", 4000), 2**63 + 5
+    answer = sessions.answer(encode_session_request(number), rig)
+    assert answer is not None and len(answer) == len(encode_session_request(number))
     assert decode_session(answer, number) == sessions.number(rig)
     with pytest.raises(PacketError):
         decode_session(answer, number + 1)
     others = [("127.0.0.1", 4001), ("127.0.0.2", 4000), ("127.0.0.1", 400)]
     assert len({sessions.number(one) for one in (rig, *others)}) == 4
-    assert Sessions().number(rig) != sessions.number(rig)
+    assert SessionNumbers().number(rig) != sessions.number(rig)
 
 
-@given(st.one_of(st.binary(max_size=40), mutated(ask_for_session(3)), mutated(READING)))
+@given(st.one_of(st.binary(max_size=40), mutated(encode_session_request(3)), mutated(READING)))
 def test_session_is_opened_by_a_question_alone(packet):
-    answer = Sessions().answer(packet, ("127.0.0.1", 4000))
-    assert (answer is not None) == (len(packet) == 24 and packet[:5] == ask_for_session(3)[:5])
+    answer = SessionNumbers().answer(packet, ("127.0.0.1", 4000))
+    assert (answer is not None) == (len(packet) == 24 and packet[:5] == encode_session_request(3)[:5])
 
 
-def newer(sequence: Sequence, *numbers: int) -> list[bool]:
+def newer(sequence: SequenceFilter, *numbers: int) -> list[bool]:
     return [sequence.is_newer(number & 0xFFFFFFFF) for number in numbers]
 
 
 @pytest.mark.parametrize("start", [0, 2**31 - 5, 2**32 - 5, 12345])
 def test_packet_numbers_order_packets_across_their_wrap_around(start):
-    sequence = Sequence(start - 1)
+    sequence = SequenceFilter(start - 1)
     assert newer(sequence, start, start + 1, start + 4) == [True] * 3
     assert newer(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
-    assert newer(sequence, start + 5, start + 5 + WINDOW, start + 10 + WINDOW) == [True] * 3
+    assert (
+        newer(sequence, start + 5, start + 5 + MAX_SEQUENCE_STEP, start + 10 + MAX_SEQUENCE_STEP)
+        == [True] * 3
+    )
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
 def test_single_packet_of_any_number_makes_at_most_a_window_of_others_old(newest, wild):
-    sequence = Sequence(newest)
+    sequence = SequenceFilter(newest)
     sequence.is_newer(wild)
-    following = newer(sequence, *range(newest + 1, newest + WINDOW + 3))
+    following = newer(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
     first = following.index(True)
     # Right after the packet, or from its place if that was ahead within the window.
-    assert first <= WINDOW and all(following[first:])
+    assert first <= MAX_SEQUENCE_STEP and all(following[first:])
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 
 
 def test_first_packet_after_many_lost_ones_is_lost_too():
-    for gap in (WINDOW + 1, 10**6, 2**31 - 10):
-        sequence = Sequence(5)
+    for gap in (MAX_SEQUENCE_STEP + 1, 10**6, 2**31 - 10):
+        sequence = SequenceFilter(5)
         assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
     # Two wild numbers, neither of which follows the other.
-    assert newer(Sequence(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
+    assert newer(SequenceFilter(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
     # Never from behind: that may be a record of what was sent before.
-    assert not any(newer(Sequence(2**31), *range(1000)))
+    assert not any(newer(SequenceFilter(2**31), *range(1000)))

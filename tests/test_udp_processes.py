@@ -134,10 +134,10 @@ def test_interrupted_rig_reports_what_it_measured(tmp_path):
     "options, words",
     [
         (("nowhere.json",), "nowhere.json"),
-        (("GAINS", "--drops", "1"), "--drops: found 1, allowed a probability"),
+        (("GAINS", "--drops", "1"), "--drops: found 1, expected a probability"),
         (("GAINS", "--jitter", "-1"), "--jitter: found -1"),
         (("GAINS", "--delay", "nan"), "--delay: found nan"),
-        (("GAINS", "--duration", "0"), "--duration: found 0, allowed 0.001 to 2000 s"),
+        (("GAINS", "--duration", "0"), "--duration: found 0, expected 0.001 to 2000 s"),
         (("BROKEN",), "sha256"),
     ],
 )
@@ -167,7 +167,7 @@ def test_rig_help_has_an_example(jaxhil):
 
 def test_rig_loop_runs_without_jax():
     program = (
-        "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.report\n"
+        "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.session_report\n"
         "assert 'jax' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

@@ -9,17 +9,17 @@ import pytest
 from gain_documents import gain_document
 from rig_lock_step import a_reading
 
-from tuning.rig.session import SOURCE, listening_port, start_controller
+from tuning.rig.session import SOURCE_FOLDER, read_listening_port, start_controller
 from tuning.rig.udp_protocol import (
     PREPARE,
     READY,
     STOP,
     VERSION,
     PacketError,
-    ask_for_session,
     decode_answer,
     decode_session,
     encode_reading,
+    encode_session_request,
 )
 
 SILENCE = 0.5  # s
@@ -38,7 +38,7 @@ class Rig:
         self.socket.sendto(packet, self.address)
 
     def open(self):
-        self.send(ask_for_session(self.number))
+        self.send(encode_session_request(self.number))
         self.session = decode_session(self.socket.recv(1000), self.number)
 
     def tell(self, reading):
@@ -67,8 +67,8 @@ class Process:
         gains, self._record = folder / "gains.json", folder / "ticks.json"
         gains.write_text(json.dumps(gain_document("none")))
         arguments = ["--gains", str(gains), "--record", str(self._record), "--ticks", "100"]
-        self._process, self._stack = start_controller(SOURCE, [*arguments, *options]), stack
-        self._address = ("127.0.0.1", listening_port(self._process))
+        self._process, self._stack = start_controller(SOURCE_FOLDER, [*arguments, *options]), stack
+        self._address = ("127.0.0.1", read_listening_port(self._process))
 
     def rig(self):
         return Rig(self._stack, self._address)
@@ -121,7 +121,7 @@ def test_controller_process_answers_its_rig_and_nobody_else(process):
     guesser.session = rig.session
     guesser.tell(a_reading(0, 2**32 - 1))
     guesser.tell(a_reading(0, 99, event=STOP))
-    guesser.send(ask_for_session(5))
+    guesser.send(encode_session_request(5))
     for tick in range(5):
         answer = rig.ask(a_reading(tick))
         assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
@@ -188,7 +188,7 @@ def test_packets_of_strangers_do_not_keep_a_session_alive(process):
     rig, stranger = served.rig(), served.rig()
     rig.prepare()
     begun = time.monotonic()
-    garbage = ((stranger, b"garbage"), (stranger, ask_for_session(3)), (rig, b"garbage"))
+    garbage = ((stranger, b"garbage"), (stranger, encode_session_request(3)), (rig, b"garbage"))
     with flood(*garbage, (stranger, encode_reading(a_reading(1), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:
             once()
@@ -202,7 +202,7 @@ def test_controller_process_without_session_ends_whoever_asks_for_one(process, o
     rig = served.rig()
     begun = time.monotonic()
     while time.monotonic() < begun + 0.6:
-        rig.send(ask_for_session(3) if opened else b"garbage")
+        rig.send(encode_session_request(3) if opened else b"garbage")
         time.sleep(0.02)
     code, result = served.ended()
     assert code == 1 and result["ended"] == "silent"
@@ -224,7 +224,7 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
     assert rig.ask(a_reading(0)).tick == 0
     again = served.rig()
     for one in (again, rig):  # from another port, and from the same
-        one.send(ask_for_session(77))
+        one.send(encode_session_request(77))
         assert one.hears_nothing()
     code, result = served.ended()
     assert code == 1 and result["ended"] == "silent" and result["ignored"] == 2
@@ -233,8 +233,8 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
 def test_lost_question_or_answer_is_asked_for_again(process):
     served = process()
     rig = served.rig()
-    rig.send(ask_for_session(1)[:-1])
-    rig.send(ask_for_session(1))  # whose answer the rig does not wait for
+    rig.send(encode_session_request(1)[:-1])
+    rig.send(encode_session_request(1))  # whose answer the rig does not wait for
     first = rig.socket.recv(1000)
     rig.prepare()
     assert decode_session(first, 1) == rig.session
@@ -248,7 +248,7 @@ def test_lost_question_or_answer_is_asked_for_again(process):
 def test_rig_of_another_version_is_ignored(process):
     served = process()
     rig = served.rig()
-    packet = bytearray(ask_for_session(1))
+    packet = bytearray(encode_session_request(1))
     packet[4] = VERSION - 1
     rig.send(bytes(packet))
     assert rig.hears_nothing()

@@ -9,12 +9,19 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import builtin_names, from_builtins, load, to_builtins
-from jaxhil.mechanism.structs import MAGNITUDES, numeric_keys
-from jaxhil.mechanism.uncertainty import PHASE, at_points, dimensions, draw, extremes, quasi_random
+from jaxhil.mechanism.file import builtin_names, from_plain_data, load, to_plain_data
+from jaxhil.mechanism.structs import MAGNITUDE_LIMITS, numeric_keys
+from jaxhil.mechanism.uncertainty import (
+    PHASE_KEY,
+    count_dimensions,
+    draw,
+    draw_at_points,
+    draw_extremes,
+    draw_quasi_random,
+)
 
 CERTAIN = ["uncertainty={}", "contact.damping=[1.0, 2.0]"]
-BASE = to_builtins(load("varying", CERTAIN).mechanism)
+BASE = to_plain_data(load("varying", CERTAIN).mechanism)
 NOMINAL = [124355.0, 373065.0, 62177.5]
 
 
@@ -28,7 +35,7 @@ def mechanism_with(path, entry, **values):
             node = node[table]
         node[key] = value
     raw["uncertainty"] = {path: entry}
-    return from_builtins(raw, "some file")
+    return from_plain_data(raw, "some file")
 
 
 def refusal(path, entry, **values):
@@ -48,12 +55,12 @@ DISTRIBUTIONS = [
     (FREQUENCY, {"distribution": "loguniform", "low": 1, "high": 9}, stats.loguniform(1, 9)),
     (DELAY, {"distribution": "normal", "std": 0.0005}, stats.norm(0.004, 0.0005)),
     (DELAY, {"distribution": "normal", "std": 2.0}, stats.truncnorm(-0.002, 0.498, 0.004, 2.0)),
-    (PHASE, {"distribution": "uniform", "low": 0.2, "high": 0.4}, stats.uniform(0.2, 0.2)),
-    (PHASE, {"distribution": "normal", "std": 1}, stats.truncnorm(-1 / 3, 2 / 3, 1 / 3, 1)),
+    (PHASE_KEY, {"distribution": "uniform", "low": 0.2, "high": 0.4}, stats.uniform(0.2, 0.2)),
+    (PHASE_KEY, {"distribution": "normal", "std": 1}, stats.truncnorm(-1 / 3, 2 / 3, 1 / 3, 1)),
 ]
 
 
-@pytest.mark.parametrize("draws", [draw, quasi_random])
+@pytest.mark.parametrize("draws", [draw, draw_quasi_random])
 @pytest.mark.parametrize(("path", "entry", "expected"), DISTRIBUTIONS)
 def test_draws_have_the_stated_distribution(draws, path, entry, expected):
     values = draws(mechanism_with(path, entry), 4096, 3)[path]
@@ -65,15 +72,15 @@ def test_draws_have_the_stated_distribution(draws, path, entry, expected):
 
 
 def test_phases_are_uniform_and_every_contact_has_its_own():
-    phases = draw(from_builtins(BASE, "f"), 4096, 0)
-    assert list(phases) == [PHASE]
-    assert phases[PHASE].shape == (4096, 3)
-    for column in phases[PHASE].T:
+    phases = draw(from_plain_data(BASE, "f"), 4096, 0)
+    assert list(phases) == [PHASE_KEY]
+    assert phases[PHASE_KEY].shape == (4096, 3)
+    for column in phases[PHASE_KEY].T:
         assert stats.kstest(column, stats.uniform.cdf).pvalue > 0.01
-    assert np.max(np.abs(np.corrcoef(phases[PHASE].T) - np.eye(3))) < 4 / np.sqrt(4096)
+    assert np.max(np.abs(np.corrcoef(phases[PHASE_KEY].T) - np.eye(3))) < 4 / np.sqrt(4096)
 
 
-@pytest.mark.parametrize("draws", [draw, quasi_random])
+@pytest.mark.parametrize("draws", [draw, draw_quasi_random])
 def test_lists_scale_as_one_or_entry_by_entry(draws):
     entry = {"distribution": "loguniform", "factor": [0.3, 3.0]}
     joint = draws(mechanism_with("contact.stiffness", entry), 4096, 1)["contact.stiffness"]
@@ -146,14 +153,14 @@ def test_key_is_drawn_alike_whatever_else_is_uncertain():
     more = ["uncertainty.'rig.simulator.delay'={distribution='uniform', factor=[0.5, 1]}"]
     other = draw(load("varying", [*more, "approach.contacts=5"]).mechanism, 10, 0)
     for path, values in draw(mechanism, 10, 0).items():
-        np.testing.assert_array_equal(values, other[path][:, :3] if path == PHASE else other[path])
+        np.testing.assert_array_equal(values, other[path][:, :3] if path == PHASE_KEY else other[path])
 
 
 def test_recorded_draws_are_reproduced():
     """Keep recorded sweeps reproducible: these numbers may not change between versions."""
     values = draw(load().mechanism, 1, seed=1, first=1024)
     np.testing.assert_allclose(
-        [values["approach.velocity"][0], values[DELAY][0], values[PHASE][0, 2]],
+        [values["approach.velocity"][0], values[DELAY][0], values[PHASE_KEY][0, 2]],
         [0.004737103501163611, 0.004076758988365051, 0.636892879481792],
         rtol=1e-13,
     )
@@ -161,13 +168,13 @@ def test_recorded_draws_are_reproduced():
 
 def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
     mechanism = load().mechanism
-    points = quasi_random(mechanism, 100, 5)
-    for path, values in quasi_random(mechanism, 70, 5).items():
+    points = draw_quasi_random(mechanism, 100, 5)
+    for path, values in draw_quasi_random(mechanism, 70, 5).items():
         assert values.shape[0] == 70
-        np.testing.assert_array_equal(values, quasi_random(mechanism, 70, 5)[path])
-        assert not np.array_equal(values, quasi_random(mechanism, 70, 6)[path])
+        np.testing.assert_array_equal(values, draw_quasi_random(mechanism, 70, 5)[path])
+        assert not np.array_equal(values, draw_quasi_random(mechanism, 70, 6)[path])
         assert points[path].shape[1:] == values.shape[1:]
-    phase = quasi_random(mechanism, 64, 5)[PHASE]
+    phase = draw_quasi_random(mechanism, 64, 5)[PHASE_KEY]
     for column in phase.T:
         # One point in each of 64 equal intervals.
         assert sorted(np.floor(64 * column)) == list(range(64))
@@ -175,24 +182,24 @@ def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
 
 def test_draw_accepts_no_scenarios_and_refuses_negative_arguments():
     mechanism = load().mechanism
-    for values in (draw(mechanism, 0, 0), quasi_random(mechanism, 0, 0)):
+    for values in (draw(mechanism, 0, 0), draw_quasi_random(mechanism, 0, 0)):
         assert {path: entry.shape for path, entry in values.items()} == {
             "contact.stiffness": (0, 3),
             FREQUENCY: (0,),
             DELAY: (0,),
             "approach.velocity": (0,),
-            PHASE: (0, 3),
+            PHASE_KEY: (0, 3),
         }
     for arguments in ((-1, 0), (1, -1), (1, 0, -1)):
         with pytest.raises(ValueError, match="found"):
             draw(mechanism, *arguments)
         with pytest.raises(ValueError, match="found"):
-            quasi_random(mechanism, *[-1, 0] if arguments[0] < 0 else [1, -1])
+            draw_quasi_random(mechanism, *[-1, 0] if arguments[0] < 0 else [1, -1])
 
 
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) - POLYNOMIALS))
 @settings(deadline=None, max_examples=30)
-@given(nominal=st.just(0.0) | st.floats(1e-9, 1e4), std=st.floats(*MAGNITUDES))
+@given(nominal=st.just(0.0) | st.floats(1e-9, 1e4), std=st.floats(*MAGNITUDE_LIMITS))
 def test_normal_draws_are_allowed_values(path, nominal, std):
     allowed = numeric_keys()[path]
     lowest = BASE["approach"]["velocity"] if path.endswith("velocity_limit") else allowed.low + 1e-9
@@ -220,7 +227,7 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
     if path == "contact.clearance":
         node[key] = nominal + 1.0
     raw["uncertainty"] = {path: {"distribution": "normal", "std": std}}
-    values = draw(from_builtins(raw, "f"), 50, 0)[path]
+    values = draw(from_plain_data(raw, "f"), 50, 0)[path]
     assert all(np.isfinite(value) and allowed.allows(float(value)) for value in values.ravel())
 
 
@@ -240,12 +247,12 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
         (FREQUENCY, {"distribution": "cauchy", "std": 1.0}, ".distribution: found 'cauchy'"),
         (FREQUENCY, {"std": 1.0}, ".distribution: found nothing"),
         (FREQUENCY, {"distribution": "normal", "sd": 1.0}, ".sd: found an unknown key"),
-        (FREQUENCY, {"distribution": "normal"}, "found no range, allowed std"),
+        (FREQUENCY, {"distribution": "normal"}, "found no range, expected std"),
         (FREQUENCY, {"distribution": "normal", "std": 0.0}, ".std: found 0.0"),
         (FREQUENCY, {"distribution": "normal", "std": 1.0, "low": 1.0}, "found low and std"),
-        (FREQUENCY, {"distribution": "normal", "factor": [1, 2]}, "found factor, allowed std"),
-        (FREQUENCY, {"distribution": "uniform", "low": 1.0}, "found low, allowed either factor"),
-        (FREQUENCY, {"distribution": "uniform", "std": 1.0}, "found std, allowed either factor"),
+        (FREQUENCY, {"distribution": "normal", "factor": [1, 2]}, "found factor, expected std"),
+        (FREQUENCY, {"distribution": "uniform", "low": 1.0}, "found low, expected either factor"),
+        (FREQUENCY, {"distribution": "uniform", "std": 1.0}, "found std, expected either factor"),
         (FREQUENCY, {"distribution": "uniform", "low": 2, "high": 1}, ".low: found [2.0, 1.0]"),
         (FREQUENCY, {"distribution": "uniform", "low": 2, "high": 2}, ".low: found [2.0, 2.0]"),
         (FREQUENCY, {"distribution": "uniform", "factor": [2, 1]}, ".factor: found [2.0, 1.0]"),
@@ -257,7 +264,7 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
             {"distribution": "uniform", "factor": [1, 1e99]},
             "found values as far as 3e+100",
         ),
-        (PHASE, {"distribution": "uniform", "low": 0, "high": 1.5}, "found values as far as 1.5"),
+        (PHASE_KEY, {"distribution": "uniform", "low": 0, "high": 1.5}, "found values as far as 1.5"),
         (DELAY, {"distribution": "uniform", "low": -0.1, "high": 1}, "found values as far as -0.1"),
         (DELAY, {"distribution": "loguniform", "low": 0, "high": 1}, ".low: found 0.0"),
         ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
@@ -310,7 +317,7 @@ def test_negative_nominal_value_keeps_its_sign():
 
 
 def test_extreme_ranges_are_drawn_without_overflow():
-    wide = {"distribution": "loguniform", "low": MAGNITUDES[0], "high": MAGNITUDES[1]}
+    wide = {"distribution": "loguniform", "low": MAGNITUDE_LIMITS[0], "high": MAGNITUDE_LIMITS[1]}
     values = np.log10(draw(mechanism_with(FREQUENCY, wide), 4096, 0)[FREQUENCY])
     assert stats.kstest(values, stats.uniform(-100, 200).cdf).pvalue > 0.01
 
@@ -319,22 +326,22 @@ def test_extreme_ranges_are_drawn_without_overflow():
 def test_draws_of_builtins_are_valid_mechanisms(name):
     mechanism = load(name).mechanism
     draws = draw(mechanism, 20, 0)
-    assert set(draws) == {*mechanism.uncertainty, PHASE}
+    assert set(draws) == {*mechanism.uncertainty, PHASE_KEY}
     for i in range(20):
-        raw = to_builtins(mechanism)
+        raw = to_plain_data(mechanism)
         for path, values in draws.items():
             *tables, key = path.split(".")
             node = raw
             for table in tables:
                 node = node[table]
-            node[key] = (values[i, 0] if path == PHASE else values[i]).tolist()
-        assert from_builtins(raw, "f").contact.stiffness == draws["contact.stiffness"][i].tolist()
+            node[key] = (values[i, 0] if path == PHASE_KEY else values[i]).tolist()
+        assert from_plain_data(raw, "f").contact.stiffness == draws["contact.stiffness"][i].tolist()
 
 
 @pytest.mark.parametrize("name", builtin_names())
 def test_every_draw_lies_between_the_extremes(name):
     parsed = load(name).mechanism
-    ends = extremes(parsed)
+    ends = draw_extremes(parsed)
     for path, values in draw(parsed, 2000, 5).items():
         assert np.all(np.minimum(*ends[path]) <= values) and np.all(values <= np.maximum(*ends[path]))
         # These ends can be reached; they are not just any bounds.
@@ -342,6 +349,6 @@ def test_every_draw_lies_between_the_extremes(name):
 
 
 def test_quasi_random_draws_are_points_of_the_box():
-    parsed = from_builtins(BASE, "f")
-    points = np.full((2, sum(dimensions(parsed).values())), 0.25)
-    np.testing.assert_array_equal(at_points(parsed, points)[PHASE], np.full((2, 3), 0.25))
+    parsed = from_plain_data(BASE, "f")
+    points = np.full((2, sum(count_dimensions(parsed).values())), 0.25)
+    np.testing.assert_array_equal(draw_at_points(parsed, points)[PHASE_KEY], np.full((2, 3), 0.25))

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
+from tuning.optimisation.unit_box import GainBounds, to_coordinates, to_gains
 
-BOUNDS = Bounds(np.array([0.0, 1e-3, 0.4]), np.array([2.0, 10.0, 0.4]), np.array([0.0, 1.0, 0.0]))
+BOUNDS = GainBounds(np.array([0.0, 1e-3, 0.4]), np.array([2.0, 10.0, 0.4]), np.array([0.0, 1.0, 0.0]))
 
 
 @given(st.floats(0, 1), st.floats(0, 1))

@@ -16,8 +16,15 @@ from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
 from tuning.bundle import selftest
-from tuning.bundle.bundle import with_limits
-from tuning.bundle.vectors import BEGINS, NEXT_CONTACT, Row, as_csv, make_vectors, one_rig
+from tuning.bundle.bundle import replace_limits
+from tuning.bundle.vectors import (
+    NEXT_CONTACT,
+    RUN_START,
+    VectorRow,
+    format_csv,
+    make_vectors,
+    remove_fixed_uncertainty,
+)
 
 pytestmark = pytest.mark.users_options
 
@@ -27,7 +34,7 @@ LIMITS = {"held_readings": 3.0, "missed_in_a_row": 3.0, "limited_in_a_row": 3.0,
 @pytest.fixture(scope="module")
 def loaded():
     made = document("varying", "response_error")
-    return check_document(with_limits(made, {**LIMITS, "velocity_limit": 0.1, "deceleration": 1.0}))
+    return check_document(replace_limits(made, {**LIMITS, "velocity_limit": 0.1, "deceleration": 1.0}))
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +50,12 @@ def runs_of(vectors):
 
 
 def test_vector_columns_are_those_that_the_self_test_reads():
-    assert ",".join(Row._fields) == selftest.COLUMNS
+    assert ",".join(VectorRow._fields) == selftest.VECTOR_COLUMNS
 
 
 def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
     assert vectors.reasons == [] and vectors.ended == [None] * 3
-    _, lanes = record_lanes(loaded, nominal_and_draws(one_rig(loaded.mechanism), 3, 3))
+    _, lanes = record_lanes(loaded, nominal_and_draws(remove_fixed_uncertainty(loaded.mechanism), 3, 3))
     runs = runs_of(vectors)
     for number, lane in enumerate(lanes):
         rows = runs[number]
@@ -58,7 +65,7 @@ def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
         assert np.max(np.abs(result - expected)) <= 1e-13 * np.ptp(expected)
         assert np.array([row.force_simulated for row in rows]) == pytest.approx(expected, rel=0, abs=0)
         begins = np.flatnonzero(lane.signals.age == 0)
-        assert rows[0].event == BEGINS and [row.event for row in rows].count(BEGINS) == 1
+        assert rows[0].event == RUN_START and [row.event for row in rows].count(RUN_START) == 1
         assert [i for i, row in enumerate(rows) if row.event == NEXT_CONTACT] == begins[1:].tolist()
         assert len(begins) == loaded.mechanism.approach.contacts == 3
 
@@ -78,9 +85,9 @@ def test_vector_draws_differ_and_depend_on_the_seed(loaded, vectors):
     first = [rows[60].force_measured for rows in list(runs.values())[:3]]
     assert len({*first}) == 3
     again = make_vectors(loaded, seed=3, draws=2)
-    assert as_csv(again.rows) == as_csv(vectors.rows)
+    assert format_csv(again.rows) == format_csv(vectors.rows)
     other = make_vectors(loaded, seed=4, draws=2)
-    assert as_csv(other.rows) != as_csv(vectors.rows)
+    assert format_csv(other.rows) != format_csv(vectors.rows)
 
 
 def test_hostile_vectors_hold_every_kind_of_damage(vectors):
@@ -103,7 +110,7 @@ def test_every_vector_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, v
     gain_file = check_gain_document(loaded.document)
     controller = None
     for row in vectors.rows:
-        if row.event == BEGINS:
+        if row.event == RUN_START:
             controller = Controller(gain_file)
         elif row.event == NEXT_CONTACT:
             controller.next_contact()
@@ -113,7 +120,7 @@ def test_every_vector_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, v
 
 
 def test_vector_text_gives_back_the_same_bits(vectors):
-    rows = list(csv.reader(io.StringIO(as_csv(vectors.rows))))[1:]
+    rows = list(csv.reader(io.StringIO(format_csv(vectors.rows))))[1:]
     for row, fields in zip(vectors.rows, rows, strict=True):
         for value, field in zip(row, fields, strict=True):
             if value is None:
@@ -125,7 +132,7 @@ def test_vector_text_gives_back_the_same_bits(vectors):
 
 
 def test_vectors_are_not_compared_where_a_guard_acts(loaded):
-    tight = check_document(with_limits(loaded.document, {"force_limit": 20.0}))
+    tight = check_document(replace_limits(loaded.document, {"force_limit": 20.0}))
     result = make_vectors(tight, seed=3, draws=2)
     assert result.reasons == []
     end = next(i for i, row in enumerate(result.rows) if row.faults)
@@ -138,7 +145,7 @@ def test_vectors_are_not_compared_where_a_guard_acts(loaded):
 def test_trip_between_two_contacts_ends_the_comparison(loaded):
     """Let the audit, which waits for the force to die out, come with the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
-    result = make_vectors(check_document(with_limits(loaded.document, limits)), seed=3, draws=1)
+    result = make_vectors(check_document(replace_limits(loaded.document, limits)), seed=3, draws=1)
     assert result.reasons == []
     for run, ended in enumerate(result.ended):
         rows = [row for row in result.rows if row.run == run]
@@ -155,7 +162,7 @@ def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
     monkeypatch.setitem(ON_THE_RIG, loaded.compensator, Wrong)
     result = make_vectors(loaded, seed=3, draws=2)
     assert len(result.reasons) == 3 and result.reasons[0].startswith("the nominal run, tick ")
-    assert "allowed 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
+    assert "expected 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
 
 
 def test_vectors_of_a_noisy_biased_rig_agree():
@@ -169,6 +176,6 @@ def test_vectors_of_a_noisy_biased_rig_agree():
 
 
 def test_vector_draws_change_nothing_that_the_gain_file_states(loaded):
-    uncertain = one_rig(loaded.mechanism).uncertainty
+    uncertain = remove_fixed_uncertainty(loaded.mechanism).uncertainty
     assert "rig.control_period" not in uncertain and "contact.clearance" not in uncertain
     assert uncertain.keys() <= loaded.mechanism.uncertainty.keys()

@@ -13,9 +13,14 @@ from jaxhil.rig import Controller
 from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.metrics import OK
-from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
+from jaxhil.simulation.recording import LaneRecord, nominal_and_draws, record_lanes
 from tuning.gain_file import build_document
-from tuning.verification.replay import near_threshold, replay, replayed, verify
+from tuning.verification.runtime_replay import (
+    compute_runtime_commands,
+    find_threshold_ticks,
+    replay_lane,
+    verify,
+)
 
 pytestmark = pytest.mark.users_options
 
@@ -127,7 +132,7 @@ def test_verification_reports_a_wrong_runtime(varying, monkeypatch, runtime, sta
     assert report.reasons[0].startswith(start), report.reasons
     assert all(reason.isprintable() for reason in report.reasons)
     if runtime is Loose:
-        assert "of the command's range" in report.reasons[0] and report.reasons[0].endswith("allowed 1e-11")
+        assert "of the command's range" in report.reasons[0] and report.reasons[0].endswith("limit 1e-11")
         worst = report.replay[0]
         assert 1e-9 < worst.difference < 1e-7 and worst.found != worst.expected
     if runtime is Failing:
@@ -137,7 +142,7 @@ def test_verification_reports_a_wrong_runtime(varying, monkeypatch, runtime, sta
     if runtime is Leading:
         assert all(lane.difference <= 1e-13 for lane in report.replay)
         in_the_loop = [one for one in report.reasons if one.startswith("closed loop, contact 1: restitution")]
-        assert len(in_the_loop) == 1 and in_the_loop[0].endswith("allowed 1e-09")
+        assert len(in_the_loop) == 1 and in_the_loop[0].endswith("expected 1e-09")
 
 
 def test_verification_refuses_single_precision(varying):
@@ -155,8 +160,8 @@ def lane_of(measured, force, gain_file):
         np.array(measured, float),
         np.arange(ticks, dtype=np.int32),
     )
-    lane = Lane(signals, np.zeros(ticks), None, False)
-    command, _, stiffness, damping = replayed(Controller(gain_file), lane)
+    lane = LaneRecord(signals, np.zeros(ticks), None, False)
+    command, _, stiffness, damping = compute_runtime_commands(Controller(gain_file), lane)
     return lane._replace(command=command, identified=(stiffness, damping))
 
 
@@ -174,13 +179,13 @@ def test_verification_counts_ticks_near_a_threshold(gain_file):
     force[30] = 10.0 * (1 + 1e-12)
     force[3] = 10.0  # not in contact: this force decides nothing
     lane = lane_of(measured, force, gain_file)
-    assert np.nonzero(near_threshold(lane.signals, gain_file))[0].tolist() == [22, 30]
-    seen = replay(lane, gain_file)
+    assert np.nonzero(find_threshold_ticks(lane.signals, gain_file))[0].tolist() == [22, 30]
+    seen = replay_lane(lane, gain_file)
     assert (seen.ticks, seen.compared, seen.near, seen.parted) == (40, 40, 2, None)
     assert seen.difference == seen.near_difference == 0.0
     # Second surface at -9e-5 m: the force of tick 3 decides, and so does the position at tick 4.
     two_sided = gain_file._replace(clearance=9e-5)
-    assert np.nonzero(near_threshold(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
+    assert np.nonzero(find_threshold_ticks(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
 
 
 def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
@@ -191,7 +196,7 @@ def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
     # The other side took the second of these ticks as free: no response, nothing identified.
     measured[21] = -3e-18
     other = lane_of(measured, force, gain_file)
-    parted = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
+    parted = replay_lane(lane._replace(command=other.command, identified=other.identified), gain_file)
     assert (parted.parted, parted.compared, parted.ticks, parted.near) == (23, 23, 40, 3)
     assert parted.difference <= 1e-13
 
@@ -204,7 +209,7 @@ def test_verification_ignores_a_tick_beside_the_surface(gain_file):
     lane = lane_of(measured, force, gain_file)
     measured[20] = -3e-18
     other = lane_of(measured, force, gain_file)
-    seen = replay(lane._replace(command=other.command, identified=other.identified), gain_file)
+    seen = replay_lane(lane._replace(command=other.command, identified=other.identified), gain_file)
     assert (seen.parted, seen.compared, seen.near) == (None, 40, 1)
     assert seen.difference <= 1e-11 and seen.near_difference <= 1e-11
 
@@ -215,7 +220,7 @@ def test_verification_does_not_excuse_a_difference_away_from_thresholds(gain_fil
     lane = lane_of(measured, np.where(np.arange(40) > 17, 50.0, 0.0), gain_file)
     command = lane.command.copy()
     command[19:] += 1e-9 * np.ptp(command)
-    seen = replay(lane._replace(command=command), gain_file)
+    seen = replay_lane(lane._replace(command=command), gain_file)
     assert seen.parted is None and seen.compared == 40
     assert seen.difference == pytest.approx(1e-9, rel=1e-3) and seen.worst_tick >= 19
 
@@ -224,6 +229,6 @@ def test_verification_of_a_command_that_is_always_zero_requires_equality():
     ticks = np.zeros(5)
     signals = Signals(ticks, ticks, ticks, ticks, np.arange(5, dtype=np.int32))
     gain_file = GainFile("none", {}, 0.001, np.inf)
-    assert replay(Lane(signals, ticks, None, False), gain_file).difference == 0.0
+    assert replay_lane(LaneRecord(signals, ticks, None, False), gain_file).difference == 0.0
     signals = signals._replace(force_measured=ticks + 1e-300)
-    assert replay(Lane(signals, ticks, None, False), gain_file).difference == np.inf
+    assert replay_lane(LaneRecord(signals, ticks, None, False), gain_file).difference == np.inf

@@ -12,12 +12,12 @@ from fresh_runs import counted, export, gains
 from sweep_cases import NOISY, UNCERTAIN
 
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import DEFAULT, load
-from jaxhil.rig.faults import RESTITUTION, names
+from jaxhil.mechanism.file import DEFAULT_MECHANISM, load
+from jaxhil.rig.faults import RESTITUTION, fault_names
 from jaxhil.rig.limits import LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
 from tuning.statistics.intervals import binomial_interval
-from tuning.watchdog.calibration import LIMIT, WITHOUT_STORE
+from tuning.watchdog.calibration import DEFAULT_DRAWS, DEFAULT_ERROR_LIMIT
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc) on this machine")
 CHOSEN = {
@@ -83,19 +83,27 @@ def test_run_that_is_not_stopped_in_time_is_counted(tmp_path):
     seeing_nothing, seeing_all = counted(loaded, both, 128, lanes=128, in_python=0)
     assert len(seeing_nothing.missed) == seeing_nothing.bad > 10 and not seeing_nothing.false
     assert len(seeing_all.false) == seeing_all.good > 5 and not seeing_all.missed
-    assert {text for _, _, text in seeing_all.false} == {"restitution"} == set(names(RESTITUTION))
+    assert {text for _, _, text in seeing_all.false} == {"restitution"} == set(fault_names(RESTITUTION))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("chosen", "exports"),
     [
-        ("tuned", [(LIMIT, WITHOUT_STORE), (LIMIT, 8192), (2 * LIMIT, WITHOUT_STORE), (2 * LIMIT, 8192)]),
-        ("literature", [(0.02, 8192), (0.03, WITHOUT_STORE), (0.03, 8192)]),
+        (
+            "tuned",
+            [
+                (DEFAULT_ERROR_LIMIT, DEFAULT_DRAWS),
+                (DEFAULT_ERROR_LIMIT, 8192),
+                (2 * DEFAULT_ERROR_LIMIT, DEFAULT_DRAWS),
+                (2 * DEFAULT_ERROR_LIMIT, 8192),
+            ],
+        ),
+        ("literature", [(0.02, 8192), (0.03, DEFAULT_DRAWS), (0.03, 8192)]),
     ],
 )
 def test_watchdog_misses_none_of_a_hundred_thousand_fresh_runs(chosen, exports, tmp_path):
-    parsed = load(DEFAULT).mechanism
+    parsed = load(DEFAULT_MECHANISM).mechanism
     loaded = gains(parsed, literature_gains(parsed, "response_error") | CHOSEN[chosen])
     exported = [export(loaded, limit, tmp_path, scenarios)[0] for limit, scenarios in exports]
     counts = counted(loaded, exported, 100_000, lanes=1024, in_python=32)

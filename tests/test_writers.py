@@ -17,7 +17,7 @@ from scipy.io import loadmat
 from jaxhil.errors import InputError
 from jaxhil.rig import COMPENSATORS
 from jaxhil.rig.limits import LIMITS
-from tuning.bundle.writers import csv_table, gain_entries, limit_entries, matlab, ros2_yaml
+from tuning.bundle.writers import csv_files, gain_entries, limit_entries, matlab_files, ros2_files
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 AWKWARD = [5e-324, -0.0, 1e16, 1e22, 1e-5, 123456789012345680.0, 1.7976931348623157e308, 0.1 + 0.2]
@@ -50,7 +50,7 @@ writer_test = settings(max_examples=25)
 @writer_test
 @given(documents)
 def test_ros2_parameters_are_read_back(made):
-    text = ros2_yaml(made)["ros2.yaml"].decode("ascii")
+    text = ros2_files(made)["ros2.yaml"].decode("ascii")
     tree = YAML(typ="safe", pure=True).load(text)
     assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
     result = tree["/jaxhil_controller"]["ros__parameters"]
@@ -68,7 +68,7 @@ def test_ros2_parameters_are_read_back(made):
 def test_ros2_numbers_are_doubles_and_texts_are_texts(made):
     """Follow ROS 2's parser by the letter: a decimal point or .inf makes a double, quotes make a string."""
     sections = []
-    for line in ros2_yaml(made)["ros2.yaml"].decode().splitlines()[3:]:
+    for line in ros2_files(made)["ros2.yaml"].decode().splitlines()[3:]:
         indent, name, value = re.fullmatch(r"( +)([A-Za-z_][A-Za-z0-9_]*):(?: (\S.*))?", line).groups()
         sections[len(indent) // 2 - 2 :] = [name]
         if value is None:
@@ -82,7 +82,7 @@ def test_texts_that_look_like_numbers_stay_texts():
     made = gain_document("none")
     made["mechanism"]["name"] = "1e3"
     made["sha256"] = "1234e5"
-    result = YAML(typ="safe", pure=True).load(ros2_yaml(made)["ros2.yaml"])["/jaxhil_controller"][
+    result = YAML(typ="safe", pure=True).load(ros2_files(made)["ros2.yaml"])["/jaxhil_controller"][
         "ros__parameters"
     ]
     assert (result["mechanism"], result["sha256"]) == ("1e3", "1234e5")
@@ -93,8 +93,8 @@ def test_texts_that_look_like_numbers_stay_texts():
 @writer_test
 @given(documents)
 def test_matlab_struct_is_read_back(made):
-    files = matlab(made)
-    assert files == matlab(made)
+    files = matlab_files(made)
+    assert files == matlab_files(made)
     result = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
     for name, one in gain_entries(made).items():
         entry = result["gains"][name]
@@ -139,7 +139,7 @@ def mat_value(content):
 
 def test_matlab_struct_follows_the_description_of_the_format():
     made = document([*AWKWARD, 1.0, 2.0, 3.0, 4.0], [None, 2.5])
-    content = matlab(made)["gains.mat"]
+    content = matlab_files(made)["gains.mat"]
     assert content[124:128] == b"\x00\x01IM"
     ((kind, matrix),) = mat_elements(content[128:])
     result = mat_value(matrix)
@@ -154,7 +154,7 @@ def test_matlab_struct_follows_the_description_of_the_format():
 @writer_test
 @given(documents)
 def test_csv_table_is_read_back(made):
-    rows = list(csv.DictReader(io.StringIO(csv_table(made)["gains.csv"].decode("ascii"))))
+    rows = list(csv.DictReader(io.StringIO(csv_files(made)["gains.csv"].decode("ascii"))))
     result = {row["name"]: row for row in rows}
     assert len(result) == len(rows)
     for name, one in gain_entries(made).items():
@@ -171,11 +171,11 @@ def test_csv_table_is_read_back(made):
 @pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
 def test_every_compensator_is_written(compensator):
     made = gain_document(compensator)
-    text = ros2_yaml(made)["ros2.yaml"]
+    text = ros2_files(made)["ros2.yaml"]
     result = YAML(typ="safe", pure=True).load(text)["/jaxhil_controller"]["ros__parameters"]
     values = {name: one["value"] for name, one in made["gains"].items()}
     assert result.get("gains", {}) == values
-    mat = loadmat(io.BytesIO(matlab(made)["gains.mat"]), simplify_cells=True)["jaxhil"]
+    mat = loadmat(io.BytesIO(matlab_files(made)["gains.mat"]), simplify_cells=True)["jaxhil"]
     assert {name: mat["gains"][name]["value"] for name in values} == values
 
 
@@ -189,5 +189,5 @@ def test_missing_limit_is_written_as_the_runtimes_default():
 def test_name_too_long_for_matlab_is_refused():
     made = json.loads(json.dumps(gain_document("phase_lead")))
     made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
-    with pytest.raises(InputError, match="found 64 characters, allowed 63"):
-        matlab(made)
+    with pytest.raises(InputError, match="found 64 characters, expected 63"):
+        matlab_files(made)

@@ -10,13 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tuning.front_door.compare import compare
-    from tuning.front_door.export import export
-    from tuning.front_door.map import map
-    from tuning.front_door.report import report
-    from tuning.front_door.sweep import sweep
-    from tuning.front_door.tune import tune
-    from tuning.front_door.verify import verify
+    from tuning.api.compare import compare
+    from tuning.api.export import export
+    from tuning.api.map import map
+    from tuning.api.report import report
+    from tuning.api.sweep import sweep
+    from tuning.api.tune import tune
+    from tuning.api.verify import verify
 
 __all__ = ["compare", "export", "map", "report", "sweep", "tune", "verify"]
 
@@ -25,7 +25,7 @@ def __getattr__(name: str) -> Any:
     """Import a public function on its first use, and store it in the module."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    function = getattr(import_module(f"{__name__}.front_door.{name}"), name)
+    function = getattr(import_module(f"{__name__}.api.{name}"), name)
     globals()[name] = function
     return function
 

@@ -10,10 +10,10 @@ import os
 import sys
 from collections.abc import Sequence
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, to_one_line
 
-GOOD, BAD, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
-TRACEBACK = (
+EXIT_GOOD, EXIT_BAD, EXIT_UNUSABLE_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+TRACEBACK_VARIABLE = (
     "JAXHIL_TRACEBACK"  # environment variable; if it is set, internal errors are shown with a traceback
 )
 
@@ -39,30 +39,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except InputError as error:
         # An error in an argument of a function is reported as an error in the option of that name.
-        return _complain(getattr(error, "option", str(error)), UNUSABLE)
+        return _print_error(getattr(error, "option", str(error)), EXIT_UNUSABLE_INPUT)
     except KeyboardInterrupt:
-        return _complain("interrupted", INTERRUPTED)
+        return _print_error("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # Only output without a verdict, such as a list or the help, ends here.
-        _silence()
-        return GOOD
+        _discard_output()
+        return EXIT_GOOD
     except OSError as error:
-        where = f"{one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
-        return _complain(f"{where}{one_line(error.strerror or str(error), 200)}", UNUSABLE)
+        where = f"{to_one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
+        return _print_error(f"{where}{to_one_line(error.strerror or str(error), 200)}", EXIT_UNUSABLE_INPUT)
     except Exception as error:
-        if os.environ.get(TRACEBACK):
+        if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        from jaxhil.simulation import startup
+        from jaxhil.simulation import jax_startup
 
-        if (problem := startup.problem()) is not None:
-            return _complain(str(problem), UNUSABLE)
-        reason = one_line(f"{type(error).__name__}: {error}", 200)
-        return _complain(f"internal error: {reason} (set {TRACEBACK}=1 to see where)", UNUSABLE)
+        if (problem := jax_startup.find_startup_error()) is not None:
+            return _print_error(str(problem), EXIT_UNUSABLE_INPUT)
+        reason = to_one_line(f"{type(error).__name__}: {error}", 200)
+        return _print_error(
+            f"internal error: {reason} (set {TRACEBACK_VARIABLE}=1 to see where)", EXIT_UNUSABLE_INPUT
+        )
 
 
 def command() -> None:
     """Run `main` as a process of its own, which ends with its exit code."""
-    _open_streams()
+    _open_closed_streams()
     os.environ["MPLBACKEND"] = "agg"  # plots are files, so a window system must not be used
     code = main()
     # Without freezing, the last garbage collection takes a fifth of a short command's time.
@@ -70,7 +72,7 @@ def command() -> None:
     sys.exit(code)
 
 
-def _open_streams() -> None:
+def _open_closed_streams() -> None:
     """Open the null device for a closed standard input or error, so that no file gets its descriptor."""
     for number, name, mode in ((0, "stdin", "r"), (2, "stderr", "w")):
         if getattr(sys, name) is None:
@@ -81,16 +83,16 @@ def _open_streams() -> None:
             setattr(sys, name, open(number, mode, encoding="utf-8"))
 
 
-def _complain(text: str, code: int) -> int:
+def _print_error(text: str, code: int) -> int:
     """Print a message on standard error, if it is open, and return the exit code."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:
-        _silence()
+        _discard_output()
     return code
 
 
-def _silence() -> None:
+def _discard_output() -> None:
     """Redirect the output streams to the null device, so that the interpreter's last flush does not fail."""
     try:
         null = os.open(os.devnull, os.O_WRONLY)

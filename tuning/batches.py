@@ -7,12 +7,12 @@ import jax
 import numpy as np
 
 
-def join(batches: Sequence[Any]) -> Any:
+def join_batches(batches: Sequence[Any]) -> Any:
     """Join several batches, trees of equal structure, to one."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches)
 
 
-def cut(batch: Any, lanes: int) -> list[Any]:
+def split_batch(batch: Any, lanes: int) -> list[Any]:
     """Split a batch into batches of `lanes` elements; the last one may have fewer."""
     number = jax.tree.leaves(batch)[0].shape[-1]
     return [

@@ -16,20 +16,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxhil.contact.laws import contact_law
-from jaxhil.errors import InputError, shown
-from jaxhil.files import write_whole, writing
+from jaxhil.contact.laws import find_contact_law
+from jaxhil.errors import InputError, format_value
+from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.laws.simulation_base import Gain
-from jaxhil.mechanism.file import AnyMechanism, to_builtins
+from jaxhil.mechanism.file import AnyMechanism, to_plain_data
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import digest
 from jaxhil.rig.gain_file import SCHEMA
-from jaxhil.simulation.gain_file import bounds_of, check_names, look_up
+from jaxhil.simulation.gain_file import check_gain_names, find_compensator, resolve_gain_bounds
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.sources import versions
+from jaxhil.simulation.source_fingerprint import dependency_versions
 
-VERSIONED = ("jaxhil", "jax", "numpy", "optimistix")
+VERSIONED_PACKAGES = ("jaxhil", "jax", "numpy", "optimistix")
 
 
 def build_document(
@@ -49,22 +49,22 @@ def build_document(
     not finite or not within its bounds.
     """
     source = "gains"
-    law = look_up(compensator, source).gains
-    check_names(gains, law, source)
+    law = find_compensator(compensator, source).gains
+    check_gain_names(gains, law, source)
     document = {
         "schema": SCHEMA,
         "compensator": compensator,
         "gains": {gain.name: _gain_entry(gain, gains[gain.name], mechanism) for gain in law},
         **({"axes": 6} if isinstance(mechanism, SixAxisMechanism) else {}),
         "control_period": mechanism.rig.control_period,
-        "mechanism": to_builtins(mechanism),
+        "mechanism": to_plain_data(mechanism),
         "mechanism_sha256": mechanism_sha256,
-        "envelope": plain(envelope),
-        "figures": plain(figures),
+        "envelope": to_json_data(envelope),
+        "figures": to_json_data(figures),
         "seed": int(seed),
-        "versions": versions(VERSIONED),
+        "versions": dependency_versions(VERSIONED_PACKAGES),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "timings": plain(timings),
+        "timings": to_json_data(timings),
     }
     return {**document, "sha256": digest(document)}
 
@@ -77,8 +77,8 @@ def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -
     target = Path(path)
     signed = {**document, "sha256": digest(document)}
     text = json.dumps(signed, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    with writing(target):
-        write_whole(target, text.encode("ascii"))
+    with report_write_errors(target):
+        write_atomically(target, text.encode("ascii"))
 
 
 def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, dict[str, Any]]:
@@ -97,14 +97,14 @@ def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, di
     frequency = peak / (velocity * mass) / (2 * math.pi)
     delay = np.asarray(scenarios.force_sensor.delay) + np.asarray(scenarios.simulator.delay)
     return {
-        "contact_frequency": _span(frequency[made], "Hz"),
-        "delay": _span(delay, "s"),
-        "approach_velocity": _span(velocity, "m/s"),
-        "force": _span(peak[made], "N"),
+        "contact_frequency": _range_with_unit(frequency[made], "Hz"),
+        "delay": _range_with_unit(delay, "s"),
+        "approach_velocity": _range_with_unit(velocity, "m/s"),
+        "force": _range_with_unit(peak[made], "N"),
     }
 
 
-def envelope_in_space(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]:
+def six_axis_validity_envelope(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]:
     """Return the range {"low", "high", "unit"} of four quantities over a batch of six-axis scenarios.
 
     The quantities are the contact frequency 1/(2 duration) [Hz] and approach velocity [m/s] at the first
@@ -118,45 +118,49 @@ def envelope_in_space(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]
         "force": (outcome.reference_peak_force, "N"),
     }
     delay = np.asarray(scenarios.sensor.delay) + np.asarray(scenarios.simulator.delay)
-    spans = {name: _span(values[ended], unit) for name, (values, unit) in quantities.items() if np.any(ended)}
-    return {**spans, "delay": _span(delay, "s")}
+    spans = {
+        name: _range_with_unit(values[ended], unit)
+        for name, (values, unit) in quantities.items()
+        if np.any(ended)
+    }
+    return {**spans, "delay": _range_with_unit(delay, "s")}
 
 
-def plain(value: Any) -> Any:
+def to_json_data(value: Any) -> Any:
     """Convert `value` to JSON data: mappings, lists and numbers, with null for non-finite numbers.
 
     Accept NumPy and JAX arrays and scalars, and named tuples; raise TypeError for any other type.
     """
     if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
+        return {str(key): to_json_data(entry) for key, entry in value.items()}
     if isinstance(value, tuple) and (fields := getattr(value, "_fields", None)):
-        return {name: plain(entry) for name, entry in zip(fields, value, strict=True)}
+        return {name: to_json_data(entry) for name, entry in zip(fields, value, strict=True)}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [to_json_data(entry) for entry in value]
     if value is None or isinstance(value, (str, bool, int)):
         return value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if not hasattr(value, "__array__"):
         raise TypeError(f"a {type(value).__name__} has no place in a gain file")
-    return plain(np.asarray(value).tolist())
+    return to_json_data(np.asarray(value).tolist())
 
 
 def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
     """Return the peak force [N] of every contact, (slots, lanes), entered undamped at the approach speed."""
     contact = jax.tree.map(np.asarray, scenarios.contact)
     motion = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
-    return contact_law(mechanism.contact.law).undamped_peak_force(contact, *motion)
+    return find_contact_law(mechanism.contact.law).undamped_peak_force(contact, *motion)
 
 
-def _span(values: np.ndarray, unit: str) -> dict[str, Any]:
+def _range_with_unit(values: np.ndarray, unit: str) -> dict[str, Any]:
     return {"low": float(np.min(values)), "high": float(np.max(values)), "unit": unit}
 
 
 def _gain_entry(gain: Gain, value: float, mechanism: AnyMechanism) -> dict[str, Any]:
-    lower, upper, margin = bounds_of(gain, mechanism)
+    lower, upper, margin = resolve_gain_bounds(gain, mechanism)
     number = float(value)
     if not lower - margin <= number <= upper + margin:
         allowed = f"{lower:.12g} to {upper:.12g} {gain.unit}"
-        raise InputError(f"gains: {gain.name}: found {shown(number)}, allowed {allowed}")
+        raise InputError(f"gains: {gain.name}: found {format_value(number)}, expected {allowed}")
     return {"value": min(max(number, lower), upper), "unit": gain.unit, "lower": lower, "upper": upper}

@@ -17,21 +17,21 @@ from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColu
 from rich.table import Column, Table
 from rich.text import Text
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, to_one_line
 
-WIDTH = 110  # width of lines without a terminal
-SECONDS_BETWEEN_LINES = 10.0  # time between lines of progress without a terminal
-SECONDS_OF_SILENCE = 20.0  # time after which the last line is repeated, with the current time left
-KNOWN_FROM = 0.05  # share of the work after which a rate is shown
+DEFAULT_WIDTH = 110  # width of lines without a terminal
+PROGRESS_INTERVAL = 10.0  # time between lines of progress without a terminal
+MAX_SILENCE = 20.0  # time after which the last line is repeated, with the current time left
+MIN_SHARE_FOR_RATE = 0.05  # share of the work after which a rate is shown
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
     """Print on standard output and wrap long texts. A closed pipe is no error."""
-    with _writing_output():
+    with _convert_output_errors():
         for thing in things:
-            console = _console(sys.stdout)
+            console = _make_console(sys.stdout)
             if isinstance(thing, Table):
-                console.width = _fitted(thing, console)
+                console.width = _table_width(thing, console)
             console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
 
@@ -42,14 +42,14 @@ def emit_line(text: str) -> None:
 
 
 def emit_json(document: Mapping[str, Any]) -> None:
-    """Print one JSON document in the form of `as_json`."""
-    with _writing_output():
-        print(as_json(document), end="", flush=True)
+    """Print one JSON document in the form of `format_json`."""
+    with _convert_output_errors():
+        print(format_json(document), end="", flush=True)
 
 
-def as_json(document: Mapping[str, Any]) -> str:
+def format_json(document: Mapping[str, Any]) -> str:
     """Return a document as lines of JSON in ASCII, with null for numbers that are not finite."""
-    return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
+    return json.dumps(to_json_data(document), indent=2, allow_nan=False) + "\n"
 
 
 def warn(texts: Iterable[str]) -> None:
@@ -61,12 +61,12 @@ def warn(texts: Iterable[str]) -> None:
 def note(text: str) -> None:
     """Print a text on standard error; the work continues if this fails."""
     try:
-        _console(sys.stderr).print(text, soft_wrap=True)
+        _make_console(sys.stderr).print(text, soft_wrap=True)
     except OSError:
-        _detach(sys.stderr)
+        _redirect_to_null(sys.stderr)
 
 
-def table(
+def build_table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
     """Return a table; columns whose number is in `texts` contain text, the others numbers."""
@@ -79,39 +79,39 @@ def table(
             heading, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text
         )
     for row in rows:
-        result.add_row(*(value if isinstance(value, str) else figure(value) for value in row))
+        result.add_row(*(value if isinstance(value, str) else format_number(value) for value in row))
     return result
 
 
-def figure(value: Any, digits: int = 4) -> str:
+def format_number(value: Any, digits: int = 4) -> str:
     """Return a number as text with `digits` significant digits, or a dash for none."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
-def signed(value: float | None) -> str:
+def format_error(value: float | None) -> str:
     """Return a restitution error as text with its sign, or a dash for none."""
     return "-" if value is None or value != value else f"{value:+.4f}"
 
 
-def ratio(value: float, ideal: float) -> str:
+def format_ratio(value: float, ideal: float) -> str:
     """Return a value relative to that of the ideal contact as text with three decimals, or a dash."""
     quotient = value / ideal if ideal else math.nan
     return f"{quotient:.3f}" if math.isfinite(quotient) and math.isfinite(ideal) else "-"
 
 
-def finite(value: Any) -> Any:
+def to_json_data(value: Any) -> Any:
     """Convert a value to plain data for JSON, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {str(key): finite(entry) for key, entry in value.items()}
+        return {str(key): to_json_data(entry) for key, entry in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return finite(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
+        return to_json_data(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(value, (list, tuple)):
-        return [finite(entry) for entry in value]
+        return [to_json_data(entry) for entry in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    return finite(value.tolist()) if hasattr(value, "tolist") else value
+    return to_json_data(value.tolist()) if hasattr(value, "tolist") else value
 
 
 class Progress:
@@ -150,13 +150,13 @@ class Progress:
         with self._lock:
             self._done = max(self._done, done)
             self._text = self._text if text is None else text
-            self._show(due=SECONDS_BETWEEN_LINES)
+            self._show(due=PROGRESS_INTERVAL)
 
     def say(self, text: str) -> None:
         """Show the current activity."""
         with self._lock:
             is_new, self._text = text != self._text, text
-            self._show(due=0.0 if is_new else SECONDS_BETWEEN_LINES)
+            self._show(due=0.0 if is_new else PROGRESS_INTERVAL)
 
     def tell(self, text: str, done: float, skipped: float = 0.0) -> None:
         """Show the current activity, and set the total units done and the units done before."""
@@ -179,7 +179,7 @@ class Progress:
     def remind(self) -> None:
         """Repeat the last line, with the current progress, if nothing was shown for long."""
         with self._lock:
-            self._show(due=SECONDS_OF_SILENCE)
+            self._show(due=MAX_SILENCE)
 
     def _end_unit(self) -> None:
         """Count the previous unit, if any, as done."""
@@ -204,27 +204,27 @@ class Progress:
 
     def _pace(self) -> str:
         """Return the rate and the time left as text, or the time so far."""
-        if (rate := self.rate) is None or self._done < KNOWN_FROM * self._total:
-            return f"{_span(time.monotonic() - self._begun)} so far"
+        if (rate := self.rate) is None or self._done < MIN_SHARE_FOR_RATE * self._total:
+            return f"{_format_duration(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
         # For a single unit the rate is shown in percent.
         scale, unit = (100.0, " %") if self._total == 1 else (1.0, f" {self._unit}")
         hourly = 3600 * scale * rate
         divisor, per = next((pair for pair in ((3600, "s"), (60, "min")) if hourly >= pair[0]), (1, "h"))
-        return f"{figure(hourly / divisor, 3)}{unit}/{per}, {_span(left)} left"
+        return f"{format_number(hourly / divisor, 3)}{unit}/{per}, {_format_duration(left)} left"
 
 
 @contextmanager
-def progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
+def show_progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
     """Display progress by a bar on a terminal, else by lines at intervals; not at all unless `shown`."""
-    with _bar(
+    with _show_bar(
         shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _ActivityColumn()
     ) as bar:
         display = Progress(total, unit, bar, quiet=not shown)
         stop = threading.Event()
 
         def remind() -> None:
-            while not stop.wait(SECONDS_BETWEEN_LINES):
+            while not stop.wait(PROGRESS_INTERVAL):
                 display.remind()
 
         thread = threading.Thread(target=remind, daemon=True)
@@ -238,9 +238,9 @@ def progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
                 thread.join()
 
 
-def stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
+def show_stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
     """Display progress through `total` stages."""
-    return progress(total, "stages", shown)
+    return show_progress(total, "stages", shown)
 
 
 class _ActivityColumn(TextColumn):
@@ -257,9 +257,9 @@ class _ActivityColumn(TextColumn):
 
 
 @contextmanager
-def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
+def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
     """Display a bar if it is `shown` and there is a terminal; else yield None."""
-    console = _console(sys.stderr)
+    console = _make_console(sys.stderr)
     if not shown or not console.is_terminal:
         yield None
         return
@@ -267,7 +267,7 @@ def _bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.p
         yield bar
 
 
-def _fitted(table: Table, console: Console) -> int:
+def _table_width(table: Table, console: Console) -> int:
     """Return the width, at least the terminal's, at which a table truncates no digit and breaks no word.
 
     If the terminal is too narrow, each heading has one word per line; the terminal wraps what is still wider.
@@ -288,7 +288,7 @@ def _fitted(table: Table, console: Console) -> int:
     return max(console.width, full_width() - max(broken, 0))
 
 
-def _span(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     """Return a duration as text, h:mm:ss."""
     rounded = round(seconds)
     return f"{rounded // 3600}:{rounded // 60 % 60:02d}:{rounded % 60:02d}"
@@ -298,32 +298,32 @@ class _Console(Console):
     """Console on which a closed pipe is no error."""
 
     def on_broken_pipe(self) -> None:
-        _detach(self.file)
+        _redirect_to_null(self.file)
 
 
-def _console(stream) -> Console:
+def _make_console(stream) -> Console:
     """Return a console for a stream."""
     # Names come from files, so that they must not be interpreted as markup.
     console = _Console(file=stream, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
-        console.width = WIDTH
+        console.width = DEFAULT_WIDTH
     return console
 
 
 @contextmanager
-def _writing_output() -> Iterator[None]:
+def _convert_output_errors() -> Iterator[None]:
     """Raise `InputError` if standard output cannot be written; a closed pipe is no error."""
     try:
         yield
     except BrokenPipeError:
-        _detach(sys.stdout)
+        _redirect_to_null(sys.stdout)
     except OSError as error:
-        _detach(sys.stdout)
-        reason = one_line(error.strerror or str(error), 100)
+        _redirect_to_null(sys.stdout)
+        reason = to_one_line(error.strerror or str(error), 100)
         raise InputError(f"standard output: cannot be written: {reason}") from None
 
 
-def _detach(stream: Any) -> None:
+def _redirect_to_null(stream: Any) -> None:
     """Redirect further output of a stream to the null device, so that the exit code does not change."""
     try:
         null = os.open(os.devnull, os.O_WRONLY)

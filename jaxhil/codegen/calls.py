@@ -6,12 +6,24 @@ import types
 from collections.abc import Callable
 from typing import Any
 
-from .expressions import LARGEST_FACTOR, common
-from .lists import Lists
-from .subset import ATOM, BOOL, CHOICE, FLOAT, INT, SUM, UNARY, Keys, Type, Value, implies
+from .expressions import MAX_SQUARABLE_INT, common
+from .lists import ListLowering
+from .subset import (
+    ATOM,
+    BOOL,
+    CONDITIONAL,
+    FLOAT,
+    INT,
+    SUM,
+    UNARY,
+    CExpression,
+    Locations,
+    ValueType,
+    implies_sign,
+)
 
 # Functions of math, with the condition on operands `{0}`, `{1}` and result `{r}` under which Python raises.
-MATH = {
+MATH_DOMAIN_ERRORS = {
     "sqrt": "{0} < 0.0",
     "log": "{0} <= 0.0",
     "exp": "isinf({r}) && isfinite({0})",
@@ -23,18 +35,18 @@ MATH = {
     "fmod": "isinf({0}) || {1} == 0.0",
     **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign"), ""),
 }
-WHOLE = {"int": "{}", "floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
-TESTS = ("isfinite", "isnan", "isinf")
-LARGEST = "9223372036854774784.0"  # the largest double that an int64_t holds
+INT_CONVERSIONS = {"int": "{}", "floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
+FLOAT_TESTS = ("isfinite", "isnan", "isinf")
+MAX_INT64_DOUBLE = "9223372036854774784.0"  # the largest double that an int64_t holds
 
 
-class Calls(Lists):
+class CallLowering(ListLowering):
     """Lowering of calls and attributes."""
 
-    share: Callable[[ast.AST, Keys, Value], None]
-    changed: Callable[[Value, bool], None]
+    share: Callable[[ast.AST, Locations, CExpression], None]
+    changed: Callable[[CExpression, bool], None]
 
-    def lower_attribute(self, node: ast.Attribute) -> Value:
+    def lower_attribute(self, node: ast.Attribute) -> CExpression:
         name = getattr(node.value, "id", "")
         module = None if name in self.names else self.function.namespace.get(name)
         if isinstance(module, types.ModuleType) and hasattr(module, node.attr):
@@ -47,7 +59,7 @@ class Calls(Lists):
             return self.invoke(static.fget, value, ast.copy_location(ast.Call(node, [], []), node))
         return self.program.field(self, value, node.attr, node)
 
-    def lower_call(self, node: ast.Call) -> Value:
+    def lower_call(self, node: ast.Call) -> CExpression:
         called, target = node.func, None
         if isinstance(called, ast.Name) and called.id not in self.names:
             target = self.function.namespace.get(called.id, getattr(self, f"builtin_{called.id}", called.id))
@@ -76,81 +88,91 @@ class Calls(Lists):
             else self._no_call(node, name)
         )
 
-    def _no_call(self, node: ast.Call, name: str) -> Value:
+    def _no_call(self, node: ast.Call, name: str) -> CExpression:
         is_sum = name in ("sum", "fsum", "hypot", "pow")
         wanted = "a loop or a product: its rounding is Python's own" if is_sum else "a function with a source"
-        raise self.refuse(node, f"{name}(...)", f"{wanted}, or one of math: {', '.join([*MATH, *TESTS])}")
+        raise self.refuse(
+            node,
+            f"{name}(...)",
+            f"{wanted}, or one of math: {', '.join([*MATH_DOMAIN_ERRORS, *FLOAT_TESTS])}",
+        )
 
-    def builtin_abs(self, node: ast.Call) -> Value:
+    def builtin_abs(self, node: ast.Call) -> CExpression:
         (value,) = self.operands(node.args, self.number)
         if value.type.kind == "int":
             text = self.simple(value, "value").text
-            return Value(f"{text} < 0 ? -{text} : {text}", INT, CHOICE, value.reads, sign=">= 0")
-        sign = "> 0" if value.sign and implies(value.sign, "not 0") else ">= 0"
+            return CExpression(f"{text} < 0 ? -{text} : {text}", INT, CONDITIONAL, value.reads, sign=">= 0")
+        sign = "> 0" if value.sign and implies_sign(value.sign, "not 0") else ">= 0"
         return value._replace(text=f"fabs({value.text})", rank=ATOM, sign=sign, type=FLOAT, constant=None)
 
-    def builtin_max(self, node: ast.Call, mark: str = ">") -> Value:
+    def builtin_max(self, node: ast.Call, mark: str = ">") -> CExpression:
         values = [self.simple(value, "value") for value in self.operands(node.args, self.number)]
         extreme, signs = values[0], {value.sign for value in values}
         if len(values) < 2 or len({value.type.kind for value in values}) > 1:
             raise self.refuse(node, f"{ast.unparse(node)}", "two or more numbers of one type")
         for value in values[1:]:
             # The order of the operands treats NaN like Python.
-            extreme = self.simple(extreme, "extreme") if extreme.rank == CHOICE else extreme
+            extreme = self.simple(extreme, "extreme") if extreme.rank == CONDITIONAL else extreme
             text = f"{value.at(SUM)} {mark} {extreme.at(SUM)} ? {value.text} : {extreme.text}"
-            extreme = Value(text, extreme.type._replace(sign=""), CHOICE, extreme.reads | value.reads)
+            extreme = CExpression(
+                text, extreme.type._replace(sign=""), CONDITIONAL, extreme.reads | value.reads
+            )
         largest = next((sign for sign in ("> 0", ">= 0") if sign in signs), "")
         return extreme._replace(sign=largest if mark == ">" else common([value.sign for value in values]))
 
-    def builtin_min(self, node: ast.Call) -> Value:
+    def builtin_min(self, node: ast.Call) -> CExpression:
         return self.builtin_max(node, "<")
 
-    def builtin_float(self, node: ast.Call) -> Value:
+    def builtin_float(self, node: ast.Call) -> CExpression:
         return self.as_float(self.number(node.args[0]))
 
-    def builtin_bool(self, node: ast.Call) -> Value:
+    def builtin_bool(self, node: ast.Call) -> CExpression:
         return self.truth(node.args[0])
 
-    def builtin_list(self, node: ast.Call) -> Value:
+    def builtin_list(self, node: ast.Call) -> CExpression:
         return self.array(node.args[0], None)
 
-    def builtin_len(self, node: ast.Call) -> Value:
+    def builtin_len(self, node: ast.Call) -> CExpression:
         value = self.expression(node.args[0])
         if value.type.kind != "list":
             raise self.refuse(node, f"len of a {value.type.kind}", "len of a list")
         length = value.type.length
-        return Value(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
+        return CExpression(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
 
-    def builtin_int(self, node: ast.Call, form: str = "{}") -> Value:
+    def builtin_int(self, node: ast.Call, form: str = "{}") -> CExpression:
         """Lower a conversion to int, which fails for values that are not finite or beyond 2^63."""
         value = self.number(node.args[0])
         if value.type.kind == "int" or len(node.args) > 1:
             return value if len(node.args) == 1 else self._no_call(node, "round to digits")
         text = value.at(UNARY) if form == "{}" else form.format(value.text)
-        if not (value.span and max(map(abs, value.span)) < LARGEST_FACTOR):
+        if not (value.span and max(map(abs, value.span)) < MAX_SQUARABLE_INT):
             text = self.temporary(value._replace(text=text, rank=ATOM), "whole").text
-            self.fail_if(f"!(fabs({text}) <= {LARGEST})", node, "an int of a float that may be too large")
-        return Value(f"(int64_t){text}", INT, UNARY, sign=">= 0" if value.sign in ("> 0", ">= 0") else "")
+            self.fail_if(
+                f"!(fabs({text}) <= {MAX_INT64_DOUBLE})", node, "an int of a float that may be too large"
+            )
+        return CExpression(
+            f"(int64_t){text}", INT, UNARY, sign=">= 0" if value.sign in ("> 0", ">= 0") else ""
+        )
 
-    def builtin_round(self, node: ast.Call) -> Value:
-        return self.builtin_int(node, WHOLE["round"])
+    def builtin_round(self, node: ast.Call) -> CExpression:
+        return self.builtin_int(node, INT_CONVERSIONS["round"])
 
-    def _math(self, node: ast.Call, name: str) -> Value:
-        if name in WHOLE:
-            return self.builtin_int(node, WHOLE[name])
-        if (name not in MATH and name not in TESTS) or node.keywords:
+    def _math(self, node: ast.Call, name: str) -> CExpression:
+        if name in INT_CONVERSIONS:
+            return self.builtin_int(node, INT_CONVERSIONS[name])
+        if (name not in MATH_DOMAIN_ERRORS and name not in FLOAT_TESTS) or node.keywords:
             return self._no_call(node, name)
         values = [self.as_float(operand) for operand in self.operands(node.args, self.number)]
-        reads: Keys = frozenset().union(*(operand.reads for operand in values))
-        if name in TESTS:
-            return Value(f"{name}({values[0].text})", BOOL, reads=reads)
-        test, sign = MATH[name], values[0].sign if name in ("sqrt", "log", "fabs") else ""
+        reads: Locations = frozenset().union(*(operand.reads for operand in values))
+        if name in FLOAT_TESTS:
+            return CExpression(f"{name}({values[0].text})", BOOL, reads=reads)
+        test, sign = MATH_DOMAIN_ERRORS[name], values[0].sign if name in ("sqrt", "log", "fabs") else ""
         if (name == "sqrt" and sign in ("> 0", ">= 0")) or (name == "log" and sign == "> 0"):
             test = ""
         values = [self.simple(operand, "operand") for operand in values] if test else values
         text = f"{name}({', '.join(operand.text for operand in values)})"
         positive = {"sqrt": "> 0" if sign == "> 0" else ">= 0", "fabs": ">= 0", "exp": ">= 0"}.get(name, "")
-        value = Value(text, FLOAT, reads=reads, sign=positive)
+        value = CExpression(text, FLOAT, reads=reads, sign=positive)
         if test:
             value = self.temporary(value, f"{name}_value") if "{r}" in test else value
             condition = test.format(*(operand.text for operand in values), r=value.text)
@@ -168,12 +190,14 @@ class Calls(Lists):
             raise self.refuse(node, "these arguments", "one for each parameter")
         return arguments
 
-    def _lowered(self, arguments: dict[str, Any], node: ast.AST) -> dict[str, Value]:
+    def _lowered(self, arguments: dict[str, Any], node: ast.AST) -> dict[str, CExpression]:
         nodes = [argument for argument in arguments.values() if isinstance(argument, ast.expr)]
         lowered, literal = iter(self.operands(nodes)), self.program.literal
         return {k: next(lowered) if isinstance(v, ast.expr) else literal(v) for k, v in arguments.items()}
 
-    def invoke(self, function: Callable[..., Any], receiver: Value | None, node: ast.Call) -> Value:
+    def invoke(
+        self, function: Callable[..., Any], receiver: CExpression | None, node: ast.Call
+    ) -> CExpression:
         """Lower a call of a function or method that has a source."""
         owner = receiver.type.of if receiver else None
         types_ = self.program.parameters(function, owner)
@@ -202,36 +226,38 @@ class Calls(Lists):
             called.reads | (receiver.reads if receiver else frozenset()),
         )
         if not array:
-            return Value(text, returns._replace(sign=""), ATOM, reads, writes, called.fails, returns.sign)
+            return CExpression(
+                text, returns._replace(sign=""), ATOM, reads, writes, called.fails, returns.sign
+            )
         self.emit(f"{text};")
-        self.check(Value("", returns, fails=called.fails))
-        return Value(array, returns, reads=frozenset({("local", array)}))
+        self.check(CExpression("", returns, fails=called.fails))
+        return CExpression(array, returns, reads=frozenset({("local", array)}))
 
-    def _argument(self, node: ast.AST, name: str, wanted: Type, value: Value) -> Type:
+    def _argument(self, node: ast.AST, name: str, wanted: ValueType, value: CExpression) -> ValueType:
         """Return the type that a parameter has in this call."""
         kind = value.type.kind
         if wanted.kind == kind == "list" and wanted.length in (None, value.type.length):
             return value.type
         if wanted.kind != kind and not (wanted.kind == "float" and kind == "int"):
             raise self.refuse(node, f"a {kind} for {name}", f"a {wanted.kind}")
-        if wanted.sign and not (value.sign and implies(value.sign, wanted.sign)):
+        if wanted.sign and not (value.sign and implies_sign(value.sign, wanted.sign)):
             raise self.refuse(node, f"a number of unknown sign for {name}", f"one that is {wanted.sign}")
         return wanted
 
-    def pointer(self, value: Value) -> str:
+    def pointer(self, value: CExpression) -> str:
         """Return the C text of a pointer to an object."""
         return value.text if value.is_pointer else f"&{value.text}"
 
-    def _record(self, target: Any, node: ast.Call) -> Value:
+    def _record(self, target: Any, node: ast.Call) -> CExpression:
         """Lower a NamedTuple into a local constant."""
-        values, record = self._lowered(self._arguments(target, node), node), Type("record", target)
+        values, record = self._lowered(self._arguments(target, node), node), ValueType("record", target)
         wanted = {name: self.program.field_type(self, record, name, node) for name in target._fields}
         texts = [self.program.stored(t, values[name]) for name, t in wanted.items() if t.kind != "text"]
         name = self.fresh("record")
         self.emit(f"const {self.program.c_type(record)} {name} = {{{', '.join(texts)}}};")
-        return Value(name, record)
+        return CExpression(name, record)
 
-    def construct(self, target: Value, class_: type, node: ast.Call) -> None:
+    def construct(self, target: CExpression, class_: type, node: ast.Call) -> None:
         """Lower `self.name = Class(...)` to a construction in place."""
         init = inspect.getattr_static(class_, "__init__", None)
         if inspect.isfunction(init):

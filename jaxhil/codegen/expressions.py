@@ -4,23 +4,23 @@ import ast
 import operator
 from typing import Any
 
-from .core import Core, Fact
+from .lowering import Lowering, NumberFact
 from .subset import (
     AND,
     ATOM,
     BITS,
     BOOL,
-    CHOICE,
+    CONDITIONAL,
     EQUALITY,
     FLOAT,
     INT,
     OR,
-    ORDER,
     PRODUCT,
+    RELATION,
     SUM,
     UNARY,
-    Value,
-    implies,
+    CExpression,
+    implies_sign,
     sign_of,
 )
 from .subset import common_sign as common
@@ -31,7 +31,7 @@ ARITHMETIC = {
     ast.Mult: ("*", PRODUCT, operator.mul),
     ast.Div: ("/", PRODUCT, operator.truediv),
 }
-BIT_MARKS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
+BIT_OPERATORS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
 COMPARISONS = {
     ast.Lt: ("<", operator.lt),
     ast.LtE: ("<=", operator.le),
@@ -40,21 +40,21 @@ COMPARISONS = {
     ast.Eq: ("==", operator.eq),
     ast.NotEq: ("!=", operator.ne),
 }
-HELPED = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
-LARGEST_FACTOR = 3037000499  # largest int whose square is an int64_t
+HELPER_OPERATORS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
+MAX_SQUARABLE_INT = 3037000499  # largest int whose square is an int64_t
 
 
-class Expressions(Core):
+class ExpressionLowering(Lowering):
     """Lowering of expressions; statements that must precede them are emitted."""
 
-    def lower_constant(self, node: ast.Constant) -> Value:
+    def lower_constant(self, node: ast.Constant) -> CExpression:
         return self.program.constant(node.value) or self.unknown(node, repr(node.value))
 
-    def unknown(self, node: ast.AST, what: str) -> Value:
+    def unknown(self, node: ast.AST, what: str) -> CExpression:
         """Raise the error for a name or constant that has no equivalent in C."""
         raise self.refuse(node, what, "a number, a bool, a list of them, a class or a function with a source")
 
-    def lower_name(self, node: ast.Name) -> Value:
+    def lower_name(self, node: ast.Name) -> CExpression:
         if node.id in self.names:
             self.function.reads |= self.names[node.id].reads
             return self.names[node.id]
@@ -62,7 +62,7 @@ class Expressions(Core):
             raise self.refuse(node, f"the name {node.id}", "one that is assigned before, here or above")
         return self.program.named_constant(node.id, self.function.namespace) or self.unknown(node, node.id)
 
-    def as_float(self, value: Value) -> Value:
+    def as_float(self, value: CExpression) -> CExpression:
         """Convert an int to a double."""
         if value.type.kind != "int":
             return value
@@ -70,19 +70,19 @@ class Expressions(Core):
             return value._replace(text=f"{value.text}.0", type=FLOAT, constant=float(value.constant))
         return value._replace(text=f"(double){value.at(UNARY)}", type=FLOAT, rank=UNARY)
 
-    def lower_binop(self, node: ast.BinOp) -> Value:
+    def lower_binop(self, node: ast.BinOp) -> CExpression:
         if isinstance(node.left, (ast.List, ast.Tuple)):
             return self.expression(ast.copy_location(ast.Call(ast.Name("list"), [node], []), node))
         left, right = self.operands([node.left, node.right], self.number)
         kind, reads, op = "int", left.reads | right.reads, type(node.op)
-        if op in BIT_MARKS and left.type.kind == right.type.kind == "int":
-            mark = f" {BIT_MARKS[op]} "
+        if op in BIT_OPERATORS and left.type.kind == right.type.kind == "int":
+            mark = f" {BIT_OPERATORS[op]} "
             first = left.text if left.rank == BITS and left.text.count(mark) else left.at(UNARY)
             writes = left.writes | right.writes
-            return Value(f"{first}{mark}{right.at(UNARY)}", INT, BITS, reads, writes)
+            return CExpression(f"{first}{mark}{right.at(UNARY)}", INT, BITS, reads, writes)
         if "float" in (left.type.kind, right.type.kind) or op in (ast.Div, ast.Pow):
             left, right, kind = self.as_float(left), self.as_float(right), "float"
-        if op in HELPED:
+        if op in HELPER_OPERATORS:
             return self._helped(node, left, right, kind)
         if op not in ARITHMETIC:
             raise self.refuse(node, op.__name__, "+, -, *, /, //, % or ** of numbers, &, | or ^ of ints")
@@ -93,7 +93,7 @@ class Expressions(Core):
             left, right = self.simple(left, "factor"), self.simple(right, "factor")
             for factor in (left, right):
                 if factor.constant is None:
-                    large = f"{factor.text} > {LARGEST_FACTOR} || {factor.text} < -{LARGEST_FACTOR}"
+                    large = f"{factor.text} > {MAX_SQUARABLE_INT} || {factor.text} < -{MAX_SQUARABLE_INT}"
                     self.fail_if(large, node, "a product of ints that may be beyond 2^63")
         constants, span, constant = (left.constant, right.constant), None, None
         if op is not ast.Div and all(isinstance(constant, (int, float)) for constant in constants):
@@ -105,9 +105,11 @@ class Expressions(Core):
         sign = sign_of(constant) or self._sign(node.op, left, right)
         text = f"{left.at(rank)} {mark} {right.at(rank + 1)}"
         type_ = FLOAT if kind == "float" else INT
-        return Value(text, type_, rank, reads, left.writes | right.writes, False, sign, span, "", constant)
+        return CExpression(
+            text, type_, rank, reads, left.writes | right.writes, False, sign, span, "", constant
+        )
 
-    def _sign(self, op: ast.operator, left: Value, right: Value) -> str:
+    def _sign(self, op: ast.operator, left: CExpression, right: CExpression) -> str:
         if not {left.sign, right.sign} <= {"> 0", ">= 0"}:
             return ">= 0" if isinstance(op, ast.Mult) and left.text == right.text else ""
         is_one_positive = "> 0" in (left.sign, right.sign)
@@ -119,28 +121,28 @@ class Expressions(Core):
             return "> 0" if is_one_positive else ">= 0"
         return ">= 0" if isinstance(op, (ast.Mult, ast.Div)) else ""
 
-    def _divisor(self, node: ast.AST, value: Value) -> Value:
+    def _divisor(self, node: ast.AST, value: CExpression) -> CExpression:
         """Emit a test of a divisor unless it cannot be 0; return the divisor."""
-        if value.sign and implies(value.sign, "not 0"):
+        if value.sign and implies_sign(value.sign, "not 0"):
             return value
         value = self.simple(value, "divisor")
         zero = "0.0" if value.type.kind == "float" else "0"
         self.fail_if(f"{value.text} == {zero}", node, "a division whose divisor may be 0")
-        self.facts[value.text] = Fact("> 0" if value.sign else "not 0", value.reads)
+        self.facts[value.text] = NumberFact("> 0" if value.sign else "not 0", value.reads)
         return value
 
-    def _helped(self, node: ast.BinOp, left: Value, right: Value, kind: str) -> Value:
+    def _helped(self, node: ast.BinOp, left: CExpression, right: CExpression, kind: str) -> CExpression:
         """Lower a floor division, a remainder or a power to a helper function."""
-        name = HELPED[type(node.op)] + ("_int" if kind == "int" else "")
+        name = HELPER_OPERATORS[type(node.op)] + ("_int" if kind == "int" else "")
         if name != "power":
             right = self._divisor(node, right)
             sign = right.sign if name.startswith("modulo") and right.sign in ("> 0", ">= 0") else ""
             text = self.program.helper(name, left.text, right.text)
-            return Value(
+            return CExpression(
                 text, left.type._replace(sign=""), reads=left.reads | right.reads, sign=sign and ">= 0"
             )
         left, right = self.simple(left, "base"), self.simple(right, "exponent")
-        value = self.temporary(Value(self.program.helper(name, left.text, right.text), FLOAT), "power")
+        value = self.temporary(CExpression(self.program.helper(name, left.text, right.text), FLOAT), "power")
         base, exponent = left.text, right.text
         tests = [f"(isinf({value.text}) && isfinite({base}) && isfinite({exponent}))"]
         if not (isinstance(right.constant, float) and right.constant.is_integer() and right.constant > 0.0):
@@ -149,7 +151,7 @@ class Expressions(Core):
         self.fail_if(" || ".join(tests), node, "a power that may raise")
         return value
 
-    def lower_unaryop(self, node: ast.UnaryOp) -> Value:
+    def lower_unaryop(self, node: ast.UnaryOp) -> CExpression:
         if isinstance(node.op, ast.Not):
             value = self.truth(node.operand)
             if value.constant is not None:
@@ -162,14 +164,14 @@ class Expressions(Core):
             return value
         if isinstance(node.op, ast.Invert):
             wide = f"~(int64_t){value.text}" if value.constant is not None else f"~{value.at(UNARY)}"
-            return Value(wide, INT, UNARY, value.reads, value.writes)
+            return CExpression(wide, INT, UNARY, value.reads, value.writes)
         constant = None if value.constant is None else -value.constant
         span = value.span and (-value.span[1], -value.span[0])
-        sign = "not 0" if value.sign and implies(value.sign, "not 0") else ""
+        sign = "not 0" if value.sign and implies_sign(value.sign, "not 0") else ""
         text = f"-{value.at(UNARY + 1)}"
         return value._replace(text=text, rank=UNARY, sign=sign, span=span, constant=constant)
 
-    def lower_compare(self, node: ast.Compare) -> Value:
+    def lower_compare(self, node: ast.Compare) -> CExpression:
         op, comparator = type(node.ops[0]), node.comparators[0]
         if len(node.ops) == 1 and op in (ast.Is, ast.IsNot):
             return self._identity(node, op is ast.Is, comparator)
@@ -183,7 +185,7 @@ class Expressions(Core):
         values = self.operands([node.left, *node.comparators])
         if len(values) > 2:
             values[1:-1] = [self.simple(middle, "middle") for middle in values[1:-1]]
-        parts_: list[Value] = []
+        parts_: list[CExpression] = []
         for mark, left, right in zip(node.ops, values, values[1:], strict=False):
             kinds = {left.type.kind, right.type.kind}
             if type(mark) not in COMPARISONS or not (kinds == {"bool"} or kinds <= {"int", "float"}):
@@ -196,13 +198,13 @@ class Expressions(Core):
                 continue
             if len(kinds) > 1:
                 left, right = self.as_float(left), self.as_float(right)
-            rank = EQUALITY if text in ("==", "!=") else ORDER
+            rank = EQUALITY if text in ("==", "!=") else RELATION
             writes = left.writes | right.writes
             text = f"{left.at(SUM)} {text} {right.at(SUM)}"
-            parts_.append(Value(text, BOOL, rank, left.reads | right.reads, writes))
+            parts_.append(CExpression(text, BOOL, rank, left.reads | right.reads, writes))
         return self._together(parts_, True)
 
-    def _identity(self, node: ast.Compare, is_same: bool, comparator: ast.expr) -> Value:
+    def _identity(self, node: ast.Compare, is_same: bool, comparator: ast.expr) -> CExpression:
         value = node.left
         if isinstance(value, ast.Call) and getattr(value.func, "id", "") == "type":
             # `type(x) is float` saves Python a conversion. In C the type is known, so that it is a constant.
@@ -211,9 +213,9 @@ class Expressions(Core):
         parameter = self.names.get(getattr(value, "id", ""))
         if parameter is None or parameter.length != "optional" or getattr(comparator, "value", 0) is not None:
             raise self.refuse(node, "`is`", "`is None` of a parameter `float | None`")
-        return Value(f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
+        return CExpression(f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
 
-    def _together(self, parts: list[Value], is_and: bool) -> Value:
+    def _together(self, parts: list[CExpression], is_and: bool) -> CExpression:
         """Join conditions by `and` or `or`."""
         if any(part.constant is not None and part.constant != is_and for part in parts):
             index = next(
@@ -226,9 +228,9 @@ class Expressions(Core):
         mark, rank = ("&&", AND) if is_and else ("||", OR)
         text = f" {mark} ".join(part.at(rank if part.rank != AND else AND + 1 - is_and) for part in parts)
         reads: Any = frozenset().union(*(part.reads for part in parts))
-        return Value(text, BOOL, rank, reads, frozenset().union(*(part.writes for part in parts)))
+        return CExpression(text, BOOL, rank, reads, frozenset().union(*(part.writes for part in parts)))
 
-    def lower_boolop(self, node: ast.BoolOp) -> Value:
+    def lower_boolop(self, node: ast.BoolOp) -> CExpression:
         is_and, parts, facts = isinstance(node.op, ast.And), [], {}
         for operand in node.values:
             with self.captured() as lines:
@@ -238,14 +240,14 @@ class Expressions(Core):
                 flag = self.fresh("holds")
                 self.emit(f"bool {flag} = {self._together(parts, is_and).text};")
                 self.emit(f"if ({flag if is_and else f'!{flag}'}) {{", *lines, f"{flag} = {value.text};", "}")
-                parts = [Value(flag, BOOL)]
+                parts = [CExpression(flag, BOOL)]
             else:
                 self.emit(*lines)
                 parts.append(value)
             facts |= self.facts_of(operand, is_and)
         return self._together(parts, is_and)
 
-    def lower_ifexp(self, node: ast.IfExp) -> Value:
+    def lower_ifexp(self, node: ast.IfExp) -> CExpression:
         test = self.truth(node.test)
         if test.constant is not None:
             return self.expression(node.body if test.constant else node.orelse)
@@ -266,12 +268,14 @@ class Expressions(Core):
         type_ = body.type._replace(sign="", c_int="int64_t", is_index=False)
         if not (first or second or body.fails or orelse.fails):
             reads = test.reads | body.reads | orelse.reads
-            text = f"{test.at(OR)} ? {body.at(CHOICE + 1)} : {orelse.at(CHOICE)}"
-            return Value(text, type_, CHOICE, reads, test.writes | body.writes | orelse.writes, sign=sign)
+            text = f"{test.at(OR)} ? {body.at(CONDITIONAL + 1)} : {orelse.at(CONDITIONAL)}"
+            return CExpression(
+                text, type_, CONDITIONAL, reads, test.writes | body.writes | orelse.writes, sign=sign
+            )
         name = self.fresh("choice")
         self.emit(f"{self.program.c_type(type_)} {name};", f"if ({test.text}) {{")
         for value, lines, last in ((body, first, "} else {"), (orelse, second, "}")):
             self.emit(*lines, f"{name} = {value.text};")
             self.check(value)
             self.emit(last)
-        return Value(name, type_, ATOM, sign=sign)
+        return CExpression(name, type_, ATOM, sign=sign)

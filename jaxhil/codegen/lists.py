@@ -6,31 +6,31 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from .core import Fact
-from .expressions import Expressions
-from .subset import ATOM, FLOAT, INT, SUM, TEXT, Type, Value, implies
+from .expressions import ExpressionLowering
+from .lowering import NumberFact
+from .subset import ATOM, FLOAT, INT, SUM, TEXT, CExpression, ValueType, implies_sign
 
 
-class Loop(NamedTuple):
+class LoopRange(NamedTuple):
     """Iteration of a loop."""
 
     start: str  # C text of the first index
     stop: str  # C text of the index after the last
-    values: Callable[[str], list[Value]]  # values of an iteration, by its index
+    values: Callable[[str], list[CExpression]]  # values of an iteration, by its index
     count: int | None = None  # number of iterations, if known at export
     step: int = 1
     constants: tuple[Any, ...] = ()  # values of all iterations, if known at export
 
 
-def is_text(values: tuple[Any, ...]) -> bool:
+def has_text(values: tuple[Any, ...]) -> bool:
     """Return whether some of the constants are not numbers."""
     return not all(isinstance(value, (int, float)) for value in values)
 
 
-class Lists(Expressions):
+class ListLowering(ExpressionLowering):
     """Lowering of lists and loops."""
 
-    def lower_list(self, node: ast.expr) -> Value:
+    def lower_list(self, node: ast.expr) -> CExpression:
         return self.array(node, None)
 
     lower_listcomp = lower_list
@@ -42,7 +42,7 @@ class Lists(Expressions):
         is_product = isinstance(node, ast.BinOp) and isinstance(node.left, ast.List)
         return isinstance(node, (ast.List, ast.Tuple, ast.ListComp)) or is_product or called == "list"
 
-    def array(self, node: ast.expr, target: Value | None, named: str = "") -> Value:
+    def array(self, node: ast.expr, target: CExpression | None, named: str = "") -> CExpression:
         """Lower a list to an array: the target, or a new local array if there is none."""
         if target is not None and target.type.length is None:
             self._fill(target.text, node, target.type)
@@ -60,12 +60,12 @@ class Lists(Expressions):
             self.function.taken.discard(name)
             return target
         self.emit(f"{self.program.declaration(type_, name)};", *lines)
-        result = Value(name, type_, reads=frozenset({("local", name)}))
+        result = CExpression(name, type_, reads=frozenset({("local", name)}))
         if target is not None:
             self.copy(target, result, node)
         return result
 
-    def copy(self, target: Value, source: Value, node: ast.AST) -> None:
+    def copy(self, target: CExpression, source: CExpression, node: ast.AST) -> None:
         """Copy a list to another list."""
         length = source.type.length
         if length is None or target.type.length != length:
@@ -73,7 +73,7 @@ class Lists(Expressions):
                 node, f"{length or 'any number of'} elements", f"a list of {target.type.length}"
             )
         with self._each(str(length)) as index:
-            left, right = (Value(f"{value.text}[{index}]", value.type.of) for value in (target, source))
+            left, right = (CExpression(f"{value.text}[{index}]", value.type.of) for value in (target, source))
             if left.type.kind == "list":
                 self.copy(left, right, node)
             else:
@@ -90,18 +90,18 @@ class Lists(Expressions):
         self.emit(*lines, "}")
         self.function.taken.discard(index)
 
-    def _fill(self, target: str, node: ast.expr, wanted: Type | None) -> Type:
+    def _fill(self, target: str, node: ast.expr, wanted: ValueType | None) -> ValueType:
         """Fill the array `target` with the elements of a list; return its type."""
         if isinstance(node, (ast.List, ast.Tuple)):
             element, length = wanted and wanted.of, 0
             for item in node.elts:
                 if isinstance(item, ast.Starred):
                     part = self.expression(item.value)
-                    self.copy(Value(f"({target} + {length})", part.type), part, item)
+                    self.copy(CExpression(f"({target} + {length})", part.type), part, item)
                     element, length = part.type.of, length + (part.type.length or 0)
                 else:
                     element, length = self._put(f"{target}[{length}]", item, element), length + 1
-            return Type("list", element or FLOAT, length)
+            return ValueType("list", element or FLOAT, length)
         if isinstance(node, ast.ListComp):
             return self._comprehension(target, node, wanted)
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "list" and len(node.args) == 1:
@@ -111,14 +111,14 @@ class Lists(Expressions):
             stop = count.text if count.constant is not None else self.program.length_of(self, target, node)
             with self._each(stop) as index:
                 element = self._put(f"{target}[{index}]", node.left.elts[0], wanted and wanted.of)
-            return Type("list", element, count.constant)
+            return ValueType("list", element, count.constant)
         value = self.expression(node)
         if value.type.kind != "list":
             raise self.refuse(node, f"a {value.type.kind}", "a list")
-        self.copy(Value(target, value.type), value, node)
+        self.copy(CExpression(target, value.type), value, node)
         return value.type
 
-    def _put(self, target: str, node: ast.expr, wanted: Type | None) -> Type:
+    def _put(self, target: str, node: ast.expr, wanted: ValueType | None) -> ValueType:
         """Fill one element; return its type."""
         if self.is_display(node) or (wanted is not None and wanted.kind == "list"):
             return self._fill(target, node, wanted)
@@ -128,12 +128,12 @@ class Lists(Expressions):
         self.check(value)
         return element
 
-    def _comprehension(self, target: str, node: ast.ListComp, wanted: Type | None) -> Type:
+    def _comprehension(self, target: str, node: ast.ListComp, wanted: ValueType | None) -> ValueType:
         generator, loop = node.generators[0], self.loop(node.generators[0].iter)
         if len(node.generators) > 1 or generator.ifs or loop.count is None:
             raise self.refuse(node, "this comprehension", "one `for` of known length without `if`")
         element, hidden = wanted and wanted.of, dict(self.names)
-        if is_text(loop.constants):
+        if has_text(loop.constants):
             for index, value in enumerate(loop.constants):
                 self.names[getattr(generator.target, "id", "")] = self.program.literal(value)
                 element = self._put(f"{target}[{index}]", node.elt, element)
@@ -143,7 +143,7 @@ class Lists(Expressions):
                 self.names |= dict(zip(self.targets(generator.target, len(values)), values, strict=True))
                 element = self._put(f"{target}[{index}]", node.elt, element)
         self.names = hidden
-        return Type("list", element or FLOAT, loop.count)
+        return ValueType("list", element or FLOAT, loop.count)
 
     def targets(self, node: ast.expr, count: int) -> list[str]:
         """Return the names that a loop binds."""
@@ -152,7 +152,7 @@ class Lists(Expressions):
             raise self.refuse(node, "this target", f"{count} names")
         return [target.id for target in targets if isinstance(target, ast.Name)]
 
-    def loop(self, node: ast.expr) -> Loop:
+    def loop(self, node: ast.expr) -> LoopRange:
         """Return the iteration of `for ... in` an expression."""
         called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
         if called == "range" and isinstance(node, ast.Call):
@@ -168,23 +168,23 @@ class Lists(Expressions):
             count = min(number for number in counts if number is not None)
             parts = [loop.values for loop in loops]
             if called == "enumerate":
-                parts.insert(0, lambda index: [Value(index, INT, sign=">= 0", span=(0, count - 1))])
-            return Loop("0", str(count), lambda i: [value for part in parts for value in part(i)], count)
+                parts.insert(0, lambda index: [CExpression(index, INT, sign=">= 0", span=(0, count - 1))])
+            return LoopRange("0", str(count), lambda i: [value for part in parts for value in part(i)], count)
         if isinstance(node, ast.Tuple) and all(isinstance(item, ast.Constant) for item in node.elts):
-            value = Value("", TEXT, constant=ast.literal_eval(node))
+            value = CExpression("", TEXT, constant=ast.literal_eval(node))
         else:
             value = self.expression(node)
         constants = value.constant if isinstance(value.constant, tuple) else ()
-        if is_text(constants):
-            return Loop("0", "", lambda index: [], len(constants), constants=constants)
+        if has_text(constants):
+            return LoopRange("0", "", lambda index: [], len(constants), constants=constants)
         if value.type.kind != "list":
             raise self.refuse(node, f"a loop through a {value.type.kind}", "a list, range, zip or enumerate")
         count = value.type.length
-        return Loop(
+        return LoopRange(
             "0", str(count or value.length), lambda i: [self.at(value, i)], count, constants=constants
         )
 
-    def _range(self, node: ast.Call) -> Loop:
+    def _range(self, node: ast.Call) -> LoopRange:
         bounds = self.operands(node.args, self.number)
         start = bounds[0] if len(bounds) > 1 else self.program.literal(0)
         stop, step = bounds[min(1, len(bounds) - 1)], bounds[2].constant if len(bounds) > 2 else 1
@@ -198,19 +198,21 @@ class Lists(Expressions):
         is_up = step == 1 and start.sign in ("> 0", ">= 0")
         sign = ">= 0" if is_up or (span and span[0] >= 0) else ""
 
-        def values(index: str) -> list[Value]:
-            return [Value(index, INT, SUM if " " in index else ATOM, sign=sign, span=span, below=stop.text)]
+        def values(index: str) -> list[CExpression]:
+            return [
+                CExpression(index, INT, SUM if " " in index else ATOM, sign=sign, span=span, below=stop.text)
+            ]
 
-        return Loop(start.text, stop.text, values, count, step)
+        return LoopRange(start.text, stop.text, values, count, step)
 
-    def at(self, value: Value, index: str) -> Value:
+    def at(self, value: CExpression, index: str) -> CExpression:
         """Return the element of a list at a valid index."""
         of, constant = value.type.of, value.constant
         span = (min(constant), max(constant)) if isinstance(constant, tuple) and of.kind == "int" else None
         sign = ">= 0" if span and span[0] >= 0 else of.sign
-        return Value(f"{value.text}[{index}]", of, reads=value.reads, sign=sign, span=span)
+        return CExpression(f"{value.text}[{index}]", of, reads=value.reads, sign=sign, span=span)
 
-    def lower_subscript(self, node: ast.Subscript) -> Value:
+    def lower_subscript(self, node: ast.Subscript) -> CExpression:
         value = self.expression(node.value)
         if value.type.kind == "struct":
             return self._field(node, value)
@@ -223,9 +225,9 @@ class Lists(Expressions):
             raise self.refuse(node, f"[...] of a {value.type.kind}", "an int index into a list")
         return self.at(value, self._index(node, value, index))
 
-    def _index(self, node: ast.AST, value: Value, index: Value) -> str:
+    def _index(self, node: ast.AST, value: CExpression, index: CExpression) -> str:
         """Return the C text of an index; test it where it may be outside the list."""
-        size, is_above = value.type.length, implies(index.sign, ">= 0") and index.sign != ""
+        size, is_above = value.type.length, implies_sign(index.sign, ">= 0") and index.sign != ""
         length = str(size or value.length)
         if index.constant is not None and size and -size <= index.constant < size:
             return str(index.constant % size) if index.constant < 0 else index.text
@@ -237,10 +239,10 @@ class Lists(Expressions):
             low = "" if is_above else f"{index.text} < -{length} || "
             self.fail_if(f"{low}{index.text} >= {length}", node, "an index that may be outside its list")
             if is_above and size:
-                self.facts[index.text] = Fact(index.sign, index.reads, (0, size - 1))
+                self.facts[index.text] = NumberFact(index.sign, index.reads, (0, size - 1))
         return index.text if is_above else f"{index.text} < 0 ? {index.text} + {length} : {index.text}"
 
-    def _field(self, node: ast.Subscript, value: Value) -> Value:
+    def _field(self, node: ast.Subscript, value: CExpression) -> CExpression:
         texts = {name: value.constant for name, value in self.names.items() if value.type.kind == "text"}
         try:
             code = compile(ast.Expression(node.slice), self.function.file, "eval")
@@ -248,9 +250,9 @@ class Lists(Expressions):
             sign = self.program.struct_signs[value.type.of][key]
         except Exception:
             raise self.refuse(node, f"{ast.unparse(node)}", "a gain or limit by its own name") from None
-        return Value(f"{value.text}->{key}", FLOAT, sign=sign)
+        return CExpression(f"{value.text}->{key}", FLOAT, sign=sign)
 
-    def _slice(self, node: ast.Subscript, value: Value, part: ast.Slice) -> Value:
+    def _slice(self, node: ast.Subscript, value: CExpression, part: ast.Slice) -> CExpression:
         length, ends = value.type.length, (part.lower, part.upper)
         bounds = [None if end is None else self.number(end).constant for end in ends]
         is_known = all(end is None or bound is not None for end, bound in zip(ends, bounds, strict=True))

@@ -5,9 +5,9 @@ import re
 import textwrap
 from collections.abc import Iterable
 
-WIDTH = 116
+MAX_LINE_LENGTH = 116
 # Functions that are printed only if used; @ stands for the prefix.
-HELPERS = {
+C_HELPERS = {
     # Without volatile, compilers replace powers with constant exponents by products that round differently.
     "power": """double @power(double base, double exponent) {
 const volatile double exact = exponent;
@@ -39,38 +39,40 @@ return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
 }
 
 
-def plain(text: str) -> str:
+def escape_comment(text: str) -> str:
     """Return a text for a C comment: ASCII, without comment marks."""
     return text.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
 
 
-def comment(text: str | None) -> str:
+def format_comment(text: str | None) -> str:
     """Return a docstring as a C comment, "" if there is none."""
-    lines = plain(inspect.cleandoc(text or "")).splitlines()
+    lines = escape_comment(inspect.cleandoc(text or "")).splitlines()
     if len(lines) < 2:
         return f"/* {lines[0]} */\n" if lines else ""
     return "\n".join([f"/* {lines[0]}", *(f" * {line}".rstrip() for line in lines[1:]), " */\n"])
 
 
-def indented(lines: Iterable[str]) -> str:
+def indent_lines(lines: Iterable[str]) -> str:
     """Return the lines as text, indented by their braces and broken where too long."""
     depth, result = 0, []
     for line in lines:
         depth -= line.startswith("}")
-        result.append(_broken("    " * depth + line))
+        result.append(_break_line("    " * depth + line))
         depth += line.endswith("{")
     return "\n".join(result) + "\n"
 
 
-def _broken(line: str) -> str:
+def _break_line(line: str) -> str:
     """Break a long line after a comma or before an operator, where the fewest parentheses are open."""
     indent = " " * (len(line) - len(line.lstrip()))
-    if len(line) <= WIDTH:
+    if len(line) <= MAX_LINE_LENGTH:
         return line
     if line.lstrip().startswith("/*"):
-        return "\n".join(textwrap.wrap(line, WIDTH, initial_indent="", subsequent_indent=f"{indent} * "))
+        return "\n".join(
+            textwrap.wrap(line, MAX_LINE_LENGTH, initial_indent="", subsequent_indent=f"{indent} * ")
+        )
     breaks, depth = [], 0
-    for index, character in enumerate(line[:WIDTH]):
+    for index, character in enumerate(line[:MAX_LINE_LENGTH]):
         depth += {"(": 1, ")": -1}.get(character, 0)
         is_break = line[index - 1 : index + 1] == ", " or re.match(r" (&&|\|\||[-+*/?:]) ", line[index:])
         if is_break and index > len(indent) + 12:
@@ -81,5 +83,5 @@ def _broken(line: str) -> str:
     return (
         line[:index].rstrip()
         + "\n"
-        + _broken(indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip())
+        + _break_line(indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip())
     )

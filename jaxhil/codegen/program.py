@@ -7,59 +7,61 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from .core import Core
-from .printing import HELPERS, comment, indented, plain
-from .records import Records
-from .source import constant_comment, definition_of, hints_of, places_of
-from .statements import Body
+from .lowering import Lowering
+from .printing import C_HELPERS, escape_comment, format_comment, indent_lines
+from .python_source import find_annotations, find_definition, find_name_lines, read_constant_comment
+from .records import StructLowering
+from .statements import BodyLowering
 from .subset import (
     BOOL,
+    C_RESERVED_WORDS,
     FLOAT,
     INT,
-    RESERVED,
     TEXT,
     UNARY,
-    Keys,
+    CExpression,
+    Locations,
     SubsetError,
-    Type,
-    Value,
+    ValueType,
     sign_of,
-    type_of_hint,
+    type_of_annotation,
 )
 
 
-class Function:
+class CFunction:
     """C function for a Python function with these types of parameters."""
 
-    def __init__(self, function: Callable[..., Any], owner: type | None, types: Mapping[str, Type]) -> None:
-        self.node, self.file = definition_of(function)
+    def __init__(
+        self, function: Callable[..., Any], owner: type | None, types: Mapping[str, ValueType]
+    ) -> None:
+        self.node, self.file = find_definition(function)
         self.function, self.owner, self.returns = function, owner, types["return"]
         self.namespace = {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
         self.parameters = {
             name: type_ for name, type_ in types.items() if type_.kind != "text" and name != "return"
         }
         self.texts = [name for name, type_ in types.items() if type_.kind == "text" and name != "return"]
-        self.places = places_of(self.node)
+        self.places = find_name_lines(self.node)
         names = {node.id for node in ast.walk(self.node) if isinstance(node, ast.Name)} | {*types, "self"}
-        self.taken = {f"{name}_" if name in RESERVED else name for name in names} | RESERVED
-        self.reads: Keys = frozenset()
-        self.writes: Keys = frozenset()
+        self.taken = {f"{name}_" if name in C_RESERVED_WORDS else name for name in names} | C_RESERVED_WORDS
+        self.reads: Locations = frozenset()
+        self.writes: Locations = frozenset()
         self.changes: set[str] = set()  # parameters whose lists it changes
-        self.retained: dict[str, Keys] = {}  # parameters whose lists it assigns to attributes
+        self.retained: dict[str, Locations] = {}  # parameters whose lists it assigns to attributes
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
         self.fails, self.reason = False, ""  # whether it may fail; file, line and reason
         self.name, self.error = "", "error"
         self.lines: list[str] = []
 
 
-class Output(NamedTuple):
+class GeneratedCode(NamedTuple):
     """C text of a program."""
 
     declarations: str  # structs and public prototypes
     definitions: str  # constants, helpers, functions
 
 
-class Program(Records):
+class CProgram(StructLowering):
     """Lowered functions with their structs, constants and helpers.
 
     Args:
@@ -83,25 +85,25 @@ class Program(Records):
         super().__init__(prefix, names or {}, bindings or {})
         self.struct_signs, self.public = structs or {}, public or {}
         self.enumerators = enumerators or {}
-        self.functions: dict[Any, Function] = {}
+        self.functions: dict[Any, CFunction] = {}
         self.under_way: list[Any] = []
         self.constants: dict[str, tuple[str, str]] = {}  # text and comment, by name
         self.helpers: set[str] = set()
 
-    def add(self, function: Callable[..., Any], owner: type | None = None) -> Function:
+    def add(self, function: Callable[..., Any], owner: type | None = None) -> CFunction:
         """Lower a function or method with the types of its annotations."""
         return self.function(function, owner, self.parameters(function, owner), None)
 
-    def parameters(self, function: Callable[..., Any], owner: type | None) -> dict[str, Type]:
+    def parameters(self, function: Callable[..., Any], owner: type | None) -> dict[str, ValueType]:
         """Return the types of a function's parameters and of its result ("return")."""
-        hints = hints_of(
+        hints = find_annotations(
             function, next((protocol for protocol, bound in self.bindings.items() if bound is owner), None)
         )
         types = {}
         for name in [*inspect.signature(function).parameters, "return"]:
-            type_ = type_of_hint(hints.get(name, None if name == "return" else ...), self.bindings)
+            type_ = type_of_annotation(hints.get(name, None if name == "return" else ...), self.bindings)
             if type_ is None and name != "self":
-                node, file = definition_of(function)
+                node, file = find_definition(function)
                 what = f"no type in C for {name} of {function.__name__}"
                 raise SubsetError(
                     f"{file}:{node.lineno}: found {what}, expected an annotation: float, int, bool..."
@@ -111,17 +113,21 @@ class Program(Records):
         return types
 
     def function(
-        self, function: Callable[..., Any], owner: type | None, types: Mapping[str, Type], caller: Core | None
-    ) -> Function:
+        self,
+        function: Callable[..., Any],
+        owner: type | None,
+        types: Mapping[str, ValueType],
+        caller: Lowering | None,
+    ) -> CFunction:
         """Return the C function for these types; lower it on the first call."""
         key = (function, owner, *((n, t.length, t.of) for n, t in types.items() if t.kind == "list"))
         if key in self.under_way and caller is not None:
             raise caller.refuse(caller.function.node, f"{function.__name__} calling itself", "a loop")
         if key not in self.functions:
-            result = Function(function, owner, types)
+            result = CFunction(function, owner, types)
             self.under_way.append(key)
             result.name = self._name(result)
-            result.lines = Body(self, result).run()
+            result.lines = BodyLowering(self, result).run()
             self.under_way.pop()
             result.writes, result.reads = (
                 frozenset(access for access in keys if access[0] not in ("local", "parameter"))
@@ -133,7 +139,7 @@ class Program(Records):
             self.functions[key] = result
         return self.functions[key]
 
-    def _name(self, function: Function) -> str:
+    def _name(self, function: CFunction) -> str:
         if function.function in self.public:
             return self.public[function.function]
         name = "init" if function.node.name == "__init__" else function.node.name.strip("_")
@@ -144,20 +150,20 @@ class Program(Records):
         alternatives = (f"{base}_{lengths}", f"{self.prefix}{module}_{name}", f"{base}_{len(taken)}")
         return next(text for text in (base, *alternatives) if text not in taken and not text.endswith("_"))
 
-    def local_type(self, function: Function, node: ast.expr) -> Type | None:
+    def local_type(self, function: CFunction, node: ast.expr) -> ValueType | None:
         """Return the type of a local annotation."""
         try:
             hint = eval(compile(ast.Expression(node), function.file, "eval"), function.namespace)
         except Exception:
             return None
-        return type_of_hint(hint, self.bindings)
+        return type_of_annotation(hint, self.bindings)
 
-    def constant(self, value: Any) -> Value | None:
+    def constant(self, value: Any) -> CExpression | None:
         """Return a constant; None if it is no number, bool, text or sequence."""
         if isinstance(value, (str, tuple, list, frozenset)):
-            return Value("", TEXT, constant=value)
+            return CExpression("", TEXT, constant=value)
         if isinstance(value, bool):
-            return Value("true" if value else "false", BOOL, constant=value)
+            return CExpression("true" if value else "false", BOOL, constant=value)
         if not isinstance(value, (int, float)):
             return None
         special = {math.inf: "INFINITY", -math.inf: "-INFINITY"}
@@ -165,13 +171,13 @@ class Program(Records):
         span = (value, value) if math.isfinite(value) else None
         rank = UNARY if text.startswith("-") else 16
         type_ = INT if isinstance(value, int) else FLOAT
-        return Value(text, type_, rank, sign=sign_of(value), span=span, constant=value)
+        return CExpression(text, type_, rank, sign=sign_of(value), span=span, constant=value)
 
-    def literal(self, value: Any) -> Value:
+    def literal(self, value: Any) -> CExpression:
         """Return a constant, whose text is empty if it has none in C."""
-        return self.constant(value) or Value("", TEXT, constant=value)
+        return self.constant(value) or CExpression("", TEXT, constant=value)
 
-    def named_constant(self, name: str, namespace: dict[str, Any]) -> Value | None:
+    def named_constant(self, name: str, namespace: dict[str, Any]) -> CExpression | None:
         """Return a module's constant with its name in C; None if C has no equivalent."""
         value = namespace[name]
         result, named = self.constant(value), f"{self.prefix}{name}".upper()
@@ -182,14 +188,14 @@ class Program(Records):
             joined = ", ".join(repr(float(element) if type_ is FLOAT else element) for element in value)
             named = f"{self.prefix}{name.lstrip('_')}".lower()
             text = f"static const {self.c_type(type_)} {named}[{len(value)}] = {{{joined}}};"
-            result = Value(named, Type("list", type_, len(value)), constant=value)
+            result = CExpression(named, ValueType("list", type_, len(value)), constant=value)
         elif result is None or not isinstance(value, (int, float)) or not math.isfinite(value):
             return result
         else:
             text, result = result.at(16), result._replace(text=named, rank=16)
         if self.constants.get(named, (text, ""))[0] != text:
             return self.constant(value)  # another module has the name for another value
-        self.constants[named] = (text, constant_comment(name, namespace))
+        self.constants[named] = (text, read_constant_comment(name, namespace))
         return result
 
     def helper(self, name: str, *texts: str) -> str:
@@ -197,7 +203,7 @@ class Program(Records):
         self.helpers.add(name)
         return f"{self.prefix}{name}({', '.join(texts)})"
 
-    def stored(self, wanted: Type, value: Value) -> str:
+    def stored(self, wanted: ValueType, value: CExpression) -> str:
         """Return the C text of a value that is assigned to, or passed for, a type."""
         if wanted.kind == "object":
             return value.text if value.is_pointer else f"&{value.text}"
@@ -207,7 +213,7 @@ class Program(Records):
         is_cast = wanted.kind == "int" and wanted.c_int not in ("int64_t", value.type.c_int)
         return f"({wanted.c_int}){value.at(UNARY)}" if is_cast and value.constant is None else value.text
 
-    def output(self) -> Output:
+    def output(self) -> GeneratedCode:
         """Return the C text of all lowered functions and what they need."""
         for keys, error in self.shared:
             if self.changed_in_place & keys:
@@ -219,19 +225,19 @@ class Program(Records):
                 raise SubsetError(
                     f"{function.reason} within {function.name}, expected what cannot raise, or try around it"
                 )
-        prototypes = (f"\n{comment(ast.get_docstring(f.node))}{self._signature(f)};\n" for f in public)
+        prototypes = (f"\n{format_comment(ast.get_docstring(f.node))}{self._signature(f)};\n" for f in public)
         structs = self.structs([function.owner for function in lowered if function.owner])
         functions = "".join(self._definition(function) for function in lowered)
         texts = []
         for name, (value, note) in self.constants.items():
             if re.search(rf"\b{name}\b", functions):
                 head = value if value.startswith("static") else f"#define {name} {value}"
-                texts.append(f"{head} /* {plain(note)} */\n" if note else f"{head}\n")
+                texts.append(f"{head} /* {escape_comment(note)} */\n" if note else f"{head}\n")
         for name in sorted(self.helpers):
-            texts.append("\nstatic " + indented(HELPERS[name].replace("@", self.prefix).splitlines()))
-        return Output(structs + "".join(prototypes), "".join(texts) + functions)
+            texts.append("\nstatic " + indent_lines(C_HELPERS[name].replace("@", self.prefix).splitlines()))
+        return GeneratedCode(structs + "".join(prototypes), "".join(texts) + functions)
 
-    def _signature(self, function: Function) -> str:
+    def _signature(self, function: CFunction) -> str:
         constant, parts = "" if function.writes else "const ", []
         if function.owner:
             parts.append(f"{constant}{self.class_name(function.owner)} *self")
@@ -247,7 +253,7 @@ class Program(Records):
         static = "" if function.function in self.public else "static "
         return f"{static}{self.c_type(function.returns)} {function.name}({', '.join(parts) or 'void'})"
 
-    def _parameter(self, function: Function, local: str, name: str, type_: Type) -> str:
+    def _parameter(self, function: CFunction, local: str, name: str, type_: ValueType) -> str:
         if type_.kind == "list" and type_.of.kind == "list":
             return f"{self.c_type(type_.of.of)} (*{local})[{type_.of.length}]"
         if type_.kind == "list":
@@ -256,10 +262,10 @@ class Program(Records):
             return f"const {'double' if type_.kind == 'optional' else self.c_type(type_)} *{local}"
         return f"{self.c_type(type_)} {'*' if type_.kind == 'object' else ''}{local}"
 
-    def _definition(self, function: Function) -> str:
+    def _definition(self, function: CFunction) -> str:
         lines = [line.replace("@const@", "" if function.writes else "const ") for line in function.lines]
         names = ["self"] * bool(function.owner)
         names += [*map(self.local, function.parameters), *self.samples_in(function.owner)]
         unused = [f"(void){name};" for name in names if not re.search(rf"\b{name}\b", "\n".join(lines))]
-        note = "" if function.function in self.public else comment(ast.get_docstring(function.node))
-        return f"\n{note}{indented([f'{self._signature(function)} {{', *unused, *lines, '}'])}"
+        note = "" if function.function in self.public else format_comment(ast.get_docstring(function.node))
+        return f"\n{note}{indent_lines([f'{self._signature(function)} {{', *unused, *lines, '}'])}"

@@ -7,22 +7,22 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from .printing import comment, indented
-from .source import definition_of
-from .subset import FLOAT, INT, RESERVED, SubsetError, Type, Value, type_of_hint
+from .printing import format_comment, indent_lines
+from .python_source import find_definition
+from .subset import C_RESERVED_WORDS, FLOAT, INT, CExpression, SubsetError, ValueType, type_of_annotation
 
 if TYPE_CHECKING:
-    from .core import Core
+    from .lowering import Lowering
 
 
-class Records:
+class StructLowering:
     """Structs of a C program."""
 
-    literal: Callable[[Any], Value]
+    literal: Callable[[Any], CExpression]
 
     def __init__(self, prefix: str, names: Mapping[type, str], bindings: Mapping[type, type]) -> None:
         self.prefix, self.names, self.bindings = prefix, names, bindings
-        self.fields: dict[type, dict[str, Type]] = {}
+        self.fields: dict[type, dict[str, ValueType]] = {}
         self.samples: dict[type, list[str]] = {}  # lists of run-time length
         self.owned: dict[type, dict[str, str]] = {}  # arrays of samples for parts of a class, and their keys
         self.changed_in_place: frozenset[Any] = frozenset()
@@ -34,14 +34,14 @@ class Records:
         snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", class_.__name__).lower()
         return self.prefix + self.names.get(class_, snake)
 
-    def c_type(self, type_: Type) -> str:
+    def c_type(self, type_: ValueType) -> str:
         """Return the C type of a number or a struct."""
         simple = {"float": "double", "int": type_.c_int, "bool": "bool", "none": "void", "list": "void"}
         if type_.kind == "struct":
             return f"{self.prefix}{type_.of}"
         return simple[type_.kind] if type_.kind in simple else self.class_name(type_.of)
 
-    def declaration(self, type_: Type, name: str) -> str:
+    def declaration(self, type_: ValueType, name: str) -> str:
         """Return the declaration of a name, without the semicolon."""
         while type_.kind == "list":
             name, type_ = f"{name}[{type_.length}]", type_.of
@@ -49,7 +49,7 @@ class Records:
 
     def local(self, name: str) -> str:
         """Return a local name in C."""
-        return f"{name}_" if name in RESERVED else name
+        return f"{name}_" if name in C_RESERVED_WORDS else name
 
     def class_of(self, function: Any, node: ast.expr) -> type | None:
         """Return the class that a call constructs in place, None if there is none."""
@@ -58,14 +58,16 @@ class Records:
         is_class = inspect.isclass(value) and not issubclass(value, tuple) and value.__module__ != "builtins"
         return value if is_class else None
 
-    def field(self, body: "Core", value: Value, name: str, node: ast.AST) -> Value:
+    def field(self, body: "Lowering", value: CExpression, name: str, node: ast.AST) -> CExpression:
         """Return an attribute of an object."""
         class_, plain = value.type.of, name.lstrip("_")
         keys = frozenset({(class_, name)})
         body.function.reads |= keys
         if name in self.samples.get(class_, ()):
             text = value.samples[self.samples[class_].index(name)]
-            return Value(text, Type("list", FLOAT), reads=keys, length=self._access(value, f"{plain}_length"))
+            return CExpression(
+                text, ValueType("list", FLOAT), reads=keys, length=self._access(value, f"{plain}_length")
+            )
         type_ = self.fields.get(class_, {}).get(name)
         if type_ is None and (constant := self._class_constant(class_, name)) is not None:
             return constant
@@ -73,9 +75,9 @@ class Records:
         parts = self.samples_in(type_.of) if type_.kind == "object" else ()
         samples = tuple(self._access(value, f"{plain}_{part}") for part in parts)
         text = self._access(value, self._field_name(class_, name))
-        return Value(text, type_, reads=value.reads | keys, sign=type_.sign, samples=samples)
+        return CExpression(text, type_, reads=value.reads | keys, sign=type_.sign, samples=samples)
 
-    def _access(self, value: Value, name: str) -> str:
+    def _access(self, value: CExpression, name: str) -> str:
         return f"{value.text}->{name}" if value.is_pointer else f"{value.text}.{name}"
 
     def _field_name(self, class_: type, name: str) -> str:
@@ -83,14 +85,14 @@ class Records:
         taken = {*self.fields.get(class_, {}), *getattr(class_, "__slots__", ())}
         return self.local(plain if plain == name or plain not in taken else f"{plain}_")
 
-    def _class_constant(self, class_: type, name: str) -> Value | None:
+    def _class_constant(self, class_: type, name: str) -> CExpression | None:
         """Return a constant attribute of the class, None if there is none or methods assign it."""
         static = inspect.getattr_static(class_, name, None)
         if not isinstance(static, (bool, int, float)):
             return None
         owners = [owner for owner in class_.__mro__ if owner.__module__ not in ("builtins", "typing")]
         methods = [value for owner in owners for value in vars(owner).values() if inspect.isfunction(value)]
-        nodes = (node for method in methods for node in ast.walk(definition_of(method)[0]))
+        nodes = (node for method in methods for node in ast.walk(find_definition(method)[0]))
         if any(
             isinstance(node, ast.Attribute) and node.attr == name and isinstance(node.ctx, ast.Store)
             for node in nodes
@@ -102,12 +104,12 @@ class Records:
             source = ""
         named = re.search(rf"^    {name}\b.*= ([A-Z_]+)$", source, re.MULTILINE)
         if named and self.enumerators.get(named[1]) == static:
-            return Value(f"{self.prefix}{named[1]}".upper(), INT, constant=static)
+            return CExpression(f"{self.prefix}{named[1]}".upper(), INT, constant=static)
         return self.literal(static)
 
-    def field_type(self, body: "Core", type_: Type, name: str, node: ast.AST) -> Type:
+    def field_type(self, body: "Lowering", type_: ValueType, name: str, node: ast.AST) -> ValueType:
         """Return the annotated type of an attribute. Raise SubsetError if there is none."""
-        hinted = type_of_hint(self._hints(type_.of).get(name, ...), self.bindings)
+        hinted = type_of_annotation(self._hints(type_.of).get(name, ...), self.bindings)
         if hinted is None:
             what = f"{name} of {type_.of.__name__}, whose type is not known here"
             raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
@@ -116,7 +118,7 @@ class Records:
     def _hints(self, class_: type) -> dict[str, Any]:
         return typing.get_type_hints(class_, include_extras=True)
 
-    def known_field(self, body: "Core", owner: Value, target: ast.Attribute) -> Value | None:
+    def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:
         """Return an attribute, None if its type is not known yet."""
         class_, name = owner.type.of, target.attr
         if owner.type.kind != "object":
@@ -124,7 +126,9 @@ class Records:
         fields = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *self._hints(class_)}
         return self.field(body, owner, name, target) if name in fields else None
 
-    def new_field(self, body: "Core", owner: Value, target: ast.Attribute, type_: Type) -> Value:
+    def new_field(
+        self, body: "Lowering", owner: CExpression, target: ast.Attribute, type_: ValueType
+    ) -> CExpression:
         """Return an attribute; its type is this one unless it is known already."""
         field = self.known_field(body, owner, target)
         if field is not None:
@@ -133,7 +137,9 @@ class Records:
         self.fields.setdefault(owner.type.of, {})[target.attr] = plain
         return self.field(body, owner, target.attr, target)
 
-    def new_samples(self, body: "Core", owner: Value, target: ast.Attribute, count: Value) -> None:
+    def new_samples(
+        self, body: "Lowering", owner: CExpression, target: ast.Attribute, count: CExpression
+    ) -> None:
         """Record a list of run-time length; emit a test that it fits its capacity."""
         class_, name, plain = owner.type.of, target.attr, target.attr.lstrip("_")
         if body.function.node.name != "__init__" or owner.text != "self":
@@ -146,7 +152,7 @@ class Records:
         body.fail_if(condition, target, "a list longer than its capacity")
         body.emit(f"self->{plain}_length = {count.text};")
 
-    def length_of(self, body: "Core", target: str, node: ast.AST) -> str:
+    def length_of(self, body: "Lowering", target: str, node: ast.AST) -> str:
         """Return the C text of the length of a list that `new_samples` knows."""
         if body.function.owner is None or target not in self.samples_in(body.function.owner):
             raise body.refuse(node, "a list of a computed length", "a constant length")
@@ -156,7 +162,7 @@ class Records:
         """Return the parameters for the lists of run-time length of a class."""
         return tuple(name.lstrip("_") for name in self.samples.get(class_, ()))
 
-    def capacities(self, body: "Core", class_: type, target: Value, node: ast.Call) -> list[str]:
+    def capacities(self, body: "Lowering", class_: type, target: CExpression, node: ast.Call) -> list[str]:
         """Return a constructor's arguments for its lists: arrays of the owner and their capacities."""
         first, key, arguments = node.args[0] if node.args else None, target.type.key, []
         if isinstance(first, ast.Subscript) and isinstance(first.slice, ast.Constant) and not key:
@@ -185,8 +191,8 @@ class Records:
             for field, key in self.owned.get(class_, {}).items():
                 lines.append(f"double {field}[{self.prefix.upper()}{key.upper()}_SAMPLES];")
             lines = lines or ["char nothing; /* C has no empty structs */"]
-            text = indented([f"typedef struct {name} {{", *lines, f"}} {name};"])
-            texts[class_] = f"\n{comment(inspect.getdoc(class_))}{text}"
+            text = indent_lines([f"typedef struct {name} {{", *lines, f"}} {name};"])
+            texts[class_] = f"\n{format_comment(inspect.getdoc(class_))}{text}"
 
         for class_ in dict.fromkeys([*self.fields, *owners]):
             if class_ not in texts:

@@ -3,33 +3,33 @@
 import ast
 from typing import TYPE_CHECKING
 
-from .calls import Calls
-from .core import Fact
-from .lists import is_text
-from .subset import ATOM, FLOAT, INT, TEXT, UNARY, Keys, Type, Value, implies
+from .calls import CallLowering
+from .lists import has_text
+from .lowering import NumberFact
+from .subset import ATOM, FLOAT, INT, TEXT, UNARY, CExpression, Locations, ValueType, implies_sign
 
 if TYPE_CHECKING:
-    from .program import Function, Program
+    from .program import CFunction, CProgram
 
 
-class Body(Calls):
+class BodyLowering(CallLowering):
     """Lowering of the statements of one function."""
 
-    def __init__(self, program: "Program", function: "Function") -> None:
+    def __init__(self, program: "CProgram", function: "CFunction") -> None:
         super().__init__(program, function)
         self.span = (0, 0)  # lines of the block
         self.hoisted: list[str] = []  # declarations at the function's top
         for name, type_ in function.parameters.items():
             text, is_list = program.local(name), type_.kind == "list"
-            reads: Keys = frozenset({("parameter", name)}) if is_list else frozenset()
-            value = Value(text, type_, reads=reads, sign=type_.sign, is_pointer=type_.kind == "object")
+            reads: Locations = frozenset({("parameter", name)}) if is_list else frozenset()
+            value = CExpression(text, type_, reads=reads, sign=type_.sign, is_pointer=type_.kind == "object")
             if type_.kind == "optional":
                 value = value._replace(text=f"*{text}", type=FLOAT, rank=UNARY, length="optional")
             self.names[name] = value
-        self.names |= dict.fromkeys(function.texts, Value("", TEXT))
+        self.names |= dict.fromkeys(function.texts, CExpression("", TEXT))
         if function.owner is not None:
-            owner, samples = Type("object", function.owner), program.samples_in(function.owner)
-            self.names["self"] = Value("self", owner, is_pointer=True, samples=samples)
+            owner, samples = ValueType("object", function.owner), program.samples_in(function.owner)
+            self.names["self"] = CExpression("self", owner, is_pointer=True, samples=samples)
 
     def run(self) -> list[str]:
         """Lower the whole function."""
@@ -94,11 +94,13 @@ class Body(Calls):
             else:
                 self._store(node, element, value)
 
-    def _assign(self, node: ast.stmt, target: ast.expr, source: ast.expr, wanted: Type | None = None) -> None:
+    def _assign(
+        self, node: ast.stmt, target: ast.expr, source: ast.expr, wanted: ValueType | None = None
+    ) -> None:
         class_ = self.program.class_of(self.function, source)
         if isinstance(target, ast.Attribute) and isinstance(source, ast.Call) and class_ is not None:
             owner = self.expression(target.value)
-            field = self.program.new_field(self, owner, target, Type("object", class_))
+            field = self.program.new_field(self, owner, target, ValueType("object", class_))
             self.construct(field, class_, source)
         elif self.is_display(source):
             self._assign_list(node, target, source)
@@ -109,7 +111,7 @@ class Body(Calls):
             elif value.type.kind != "text":
                 self._store(node, target, value, wanted)
 
-    def _alias(self, node: ast.stmt, target: ast.Name, value: Value) -> None:
+    def _alias(self, node: ast.stmt, target: ast.Name, value: CExpression) -> None:
         """Let a local name stand for an object or a list."""
         places = self.function.places[target.id]
         is_local = all(self.span[0] <= line <= self.span[1] for line, _ in places)
@@ -147,7 +149,9 @@ class Body(Calls):
         self.array(source, field)
         self.changed(field, isinstance(target, ast.Subscript))
 
-    def _store(self, node: ast.stmt, target: ast.expr, value: Value, wanted: Type | None = None) -> None:
+    def _store(
+        self, node: ast.stmt, target: ast.expr, value: CExpression, wanted: ValueType | None = None
+    ) -> None:
         """Assign a value to a name, an attribute or an element."""
         if isinstance(target, ast.Name):
             self._store_name(node, target.id, value, wanted)
@@ -169,15 +173,15 @@ class Body(Calls):
             self._emit_store(node, field, value)
         self.changed(field, isinstance(target, ast.Subscript))
         if value.sign:
-            self.facts[field.text] = Fact(value.sign, field.reads)
+            self.facts[field.text] = NumberFact(value.sign, field.reads)
 
-    def _emit_store(self, node: ast.stmt, field: Value, value: Value) -> None:
+    def _emit_store(self, node: ast.stmt, field: CExpression, value: CExpression) -> None:
         wanted, source = field.type, value.type
         if (wanted.kind, wanted.of) != (source.kind, source.of) and not (
             wanted.kind == "float" and value.is_number
         ):
             raise self.refuse(node, f"a {source.kind} for a {wanted.kind}", "one type for each name")
-        if wanted.sign and not (value.sign and implies(value.sign, wanted.sign)):
+        if wanted.sign and not (value.sign and implies_sign(value.sign, wanted.sign)):
             raise self.refuse(node, "a number of unknown sign", f"one that is {wanted.sign}")
         text = self.program.stored(wanted, value)
         if text[: len(field.text) + 1] == f"{field.text} " and text[len(field.text) + 1 :][1:2] == " ":
@@ -188,7 +192,7 @@ class Body(Calls):
         if text != field.text:
             self.emit(f"{field.text} = {text};")
 
-    def _store_name(self, node: ast.stmt, name: str, value: Value, wanted: Type | None) -> None:
+    def _store_name(self, node: ast.stmt, name: str, value: CExpression, wanted: ValueType | None) -> None:
         text, existing = self.program.local(name), self.names.get(name)
         if existing is None:
             places = self.function.places[name]
@@ -205,15 +209,15 @@ class Body(Calls):
             else:
                 self.hoisted.append(f"{declared}{zero};")
                 self.emit(f"{text} = {self.program.stored(type_, value)};")
-            self.names[name] = Value(text, type_, sign=type_.sign, span=value.span if is_once else None)
+            self.names[name] = CExpression(text, type_, sign=type_.sign, span=value.span if is_once else None)
         else:
             self._emit_store(node, existing._replace(text=text), value)
         self.check(value)
         self.facts.pop(text, None)
         if value.sign:
-            self.facts[text] = Fact(value.sign)
+            self.facts[text] = NumberFact(value.sign)
 
-    def changed(self, field: Value, in_place: bool) -> None:
+    def changed(self, field: CExpression, in_place: bool) -> None:
         """Record an assignment to an attribute or an element."""
         self.note(field.reads)
         self.function.changes |= {name for kind, name in field.reads if kind == "parameter"}
@@ -222,7 +226,7 @@ class Body(Calls):
             for key in field.reads & self.function.shared.keys():
                 raise self.function.shared[key]
 
-    def share(self, node: ast.AST, target: Keys, value: Value) -> None:
+    def share(self, node: ast.AST, target: Locations, value: CExpression) -> None:
         """Record a list that an attribute shares with another name; it must not change in place."""
         error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
         for key in value.reads:
@@ -246,20 +250,20 @@ class Body(Calls):
         if node.value is None or returns.kind == "none":
             self.emit("return;")
         elif returns.kind == "list":
-            self.array(node.value, Value("result", returns))
+            self.array(node.value, CExpression("result", returns))
             self.emit("return;")
         else:
             self._return(node, self.expression(node.value))
         return True
 
-    def _return(self, node: ast.stmt, value: Value) -> None:
+    def _return(self, node: ast.stmt, value: CExpression) -> None:
         self.emit(f"return {self.program.stored(self.function.returns, value)};")
         returns = self.function.returns
         if (returns.kind, returns.of) != (value.type.kind, value.type.of) and not (
             returns.kind == "float" and value.is_number
         ):
             raise self.refuse(node, f"a {value.type.kind} returned", f"a {returns.kind}")
-        if returns.sign and not (value.sign and implies(value.sign, returns.sign)):
+        if returns.sign and not (value.sign and implies_sign(value.sign, returns.sign)):
             raise self.refuse(node, "a number of unknown sign", f"one that is {returns.sign}")
 
     def do_raise(self, node: ast.Raise) -> bool:
@@ -295,14 +299,14 @@ class Body(Calls):
 
     def do_for(self, node: ast.For) -> None:
         loop = self.loop(node.iter)
-        if node.orelse or not loop.stop or is_text(loop.constants):
+        if node.orelse or not loop.stop or has_text(loop.constants):
             raise self.refuse(node, "a loop through text, or with else", "a loop through numbers, and a flag")
         names = self.targets(node.target, len(loop.values("")))
         is_range = loop.values("i")[0].text == "i" and len(names) == 1 and names[0] != "_"
         index = self.program.local(names[0]) if is_range else self.fresh("i")
         stop = loop.stop
         if loop.count is None and not stop.replace("->", "").isidentifier():
-            stop = self.temporary(Value(stop, INT), "stop").text
+            stop = self.temporary(CExpression(stop, INT), "stop").text
         test, step = ("<", "++") if loop.step == 1 else (">", "--")
         self.emit(f"for (int64_t {index} = {loop.start}; {index} {test} {stop}; {index}{step}) {{")
         hidden, self.facts = dict(self.names), {}

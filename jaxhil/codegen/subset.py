@@ -18,8 +18,8 @@ import types
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
-ATOM, UNARY, PRODUCT, SUM, ORDER, EQUALITY, BITS, AND, OR, CHOICE = 16, 14, 13, 12, 10, 9, 8, 5, 4, 3
-RESERVED = frozenset(
+ATOM, UNARY, PRODUCT, SUM, RELATION, EQUALITY, BITS, AND, OR, CONDITIONAL = 16, 14, 13, 12, 10, 9, 8, 5, 4, 3
+C_RESERVED_WORDS = frozenset(
     "auto bool break case catch char class const continue default delete do double else enum explicit export "
     "extern false float for friend goto if inline int long mutable namespace new operator private protected "
     "public register restrict return short signed sizeof static struct switch template this throw true try "
@@ -32,7 +32,7 @@ class SubsetError(ValueError):
     """Error for a construct outside the subset: one line with file, line, what was found and expected."""
 
 
-class Type(NamedTuple):
+class ValueType(NamedTuple):
     """Type of a value."""
 
     kind: str  # float, int, bool, text, none, list, object, record, struct (of gains or limits), optional
@@ -44,18 +44,18 @@ class Type(NamedTuple):
     is_index: bool = False  # of an int: trusted as an index
 
 
-FLOAT, INT, BOOL, TEXT, NONE = (Type(kind) for kind in ("float", "int", "bool", "text", "none"))
-Keys = frozenset[tuple[Any, str]]  # attributes, local lists and parameters: owner and name
+FLOAT, INT, BOOL, TEXT, NONE = (ValueType(kind) for kind in ("float", "int", "bool", "text", "none"))
+Locations = frozenset[tuple[Any, str]]  # attributes, local lists and parameters: owner and name
 
 
-class Value(NamedTuple):
+class CExpression(NamedTuple):
     """Expression in C."""
 
     text: str  # C text
-    type: Type
+    type: ValueType
     rank: int = ATOM  # precedence of its operator in C
-    reads: Keys = frozenset()
-    writes: Keys = frozenset()  # what its evaluation changes
+    reads: Locations = frozenset()
+    writes: Locations = frozenset()  # what its evaluation changes
     fails: bool = False  # whether the error flag must be tested afterwards
     sign: str = ""
     span: tuple[Any, Any] | None = None  # least and largest value, if known at export
@@ -75,34 +75,34 @@ class Value(NamedTuple):
         return self.type.kind in ("float", "int")
 
 
-def type_of_hint(hint: Any, bindings: Mapping[Any, Any]) -> Type | None:
+def type_of_annotation(hint: Any, bindings: Mapping[Any, Any]) -> ValueType | None:
     """Return the type of an annotation, None if it has no equivalent in C."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        type_ = type_of_hint(arguments[0], bindings)
-        return type_ and _noted(type_, arguments[1:])
+        type_ = type_of_annotation(arguments[0], bindings)
+        return type_ and _apply_annotations(type_, arguments[1:])
     hint = bindings.get(hint, hint) if isinstance(hint, type) else hint
     simple = {float: FLOAT, int: INT, bool: BOOL, str: TEXT, None: NONE, type(None): NONE}
     if hint is None or (isinstance(hint, type) and hint in simple):
         return simple[hint]
     if origin is tuple and arguments and all(argument is float for argument in arguments):
-        return Type("list", FLOAT, len(arguments))
+        return ValueType("list", FLOAT, len(arguments))
     if origin in (list, Sequence):
-        element = type_of_hint(arguments[0], bindings)
-        return element and Type("list", element)
+        element = type_of_annotation(arguments[0], bindings)
+        return element and ValueType("list", element)
     if origin is Mapping:
-        return Type("struct", "gains")
+        return ValueType("struct", "gains")
     if origin is types.UnionType and arguments == (float, type(None)):
-        return Type("optional", FLOAT)
+        return ValueType("optional", FLOAT)
     if isinstance(hint, type) and hint.__module__ != "builtins":
-        return Type("record" if issubclass(hint, tuple) else "object", hint)
+        return ValueType("record" if issubclass(hint, tuple) else "object", hint)
     return None
 
 
-def _noted(type_: Type, notes: Sequence[Any]) -> Type:
+def _apply_annotations(type_: ValueType, notes: Sequence[Any]) -> ValueType:
     for index, note in enumerate(notes):
         if isinstance(note, int):
-            inner = type_.of if index + 1 == len(notes) else _noted(type_.of, notes[index + 1 :])
+            inner = type_.of if index + 1 == len(notes) else _apply_annotations(type_.of, notes[index + 1 :])
             return type_._replace(length=note, of=inner)
         if note in (">= 0", "> 0"):
             type_ = type_._replace(sign=note)
@@ -121,11 +121,13 @@ def sign_of(value: Any) -> str:
     return "> 0" if value > 0 else ">= 0" if value == 0 else "not 0" if value < 0 else ""
 
 
-def implies(sign: str, wanted: str) -> bool:
+def implies_sign(sign: str, wanted: str) -> bool:
     """Return whether every number of one sign also has the wanted sign."""
     return wanted in ("", sign) or sign == "> 0"
 
 
 def common_sign(signs: Sequence[str]) -> str:
     """Return the strongest sign that all these signs imply, "" if there is none."""
-    return next((s for s in ("> 0", ">= 0", "not 0") if all(sign and implies(sign, s) for sign in signs)), "")
+    return next(
+        (s for s in ("> 0", ">= 0", "not 0") if all(sign and implies_sign(sign, s) for sign in signs)), ""
+    )

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, dataclass_transform
 import numpy as np
 
 from jaxhil.contact.float_law import FloatLaw
-from jaxhil.contact.keys import Key
-from jaxhil.contact.regression import Family, Regression
-from jaxhil.errors import InputError, shown
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.regression import Regression, RegressionFamily
+from jaxhil.errors import InputError, format_value
 
 if TYPE_CHECKING:
-    from jaxhil.contact.reference import Reference
+    from jaxhil.contact.ideal_contact import IdealContact
 
 __all__ = ["ContactLaw"]
 
@@ -41,7 +41,7 @@ class ContactLaw(abc.ABC):
 
     name: ClassVar[str] = ""  # name in mechanism files
     # Keys that only some laws have and that this law uses; None: unspecified, the law may use any of them.
-    keys: ClassVar[tuple[Key, ...] | None] = None
+    keys: ClassVar[tuple[ContactKey, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
     damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
@@ -125,15 +125,15 @@ class ContactLaw(abc.ABC):
         """Return the penetrations [m] at which the slope of the force changes; none by default."""
         return ()
 
-    def reference(self, parameters: Any, mass: Any, velocity: Any) -> Reference:
+    def reference(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
         """Return the ideal contact of equivalent `mass` [kg] and approach `velocity` [m/s].
 
-        By default its motion is integrated (`jaxhil.contact.reference_motion`).
+        By default its motion is integrated (`jaxhil.contact.ideal_contact_motion`).
         """
-        from jaxhil.contact.reference import Reference
-        from jaxhil.contact.reference_motion import integrate_contact
+        from jaxhil.contact.ideal_contact import IdealContact
+        from jaxhil.contact.ideal_contact_motion import integrate_contact
 
-        return Reference(*integrate_contact(self, parameters, mass, velocity)[:3])
+        return IdealContact(*integrate_contact(self, parameters, mass, velocity)[:3])
 
     # Scales of the contact, from the parameters of scenarios as NumPy arrays
 
@@ -142,7 +142,7 @@ class ContactLaw(abc.ABC):
         import jax
         import jax.numpy as jnp
 
-        from jaxhil.contact.reference_motion import integrate_contact
+        from jaxhil.contact.ideal_contact_motion import integrate_contact
 
         shape = np.shape(parameters.stiffness)
         undamped = parameters._replace(damping=np.zeros_like(parameters.damping))
@@ -201,7 +201,7 @@ class ContactLaw(abc.ABC):
         """Return the law as a sum of known functions. Raise `InputError` if the law does not define this."""
         raise self._unstated("that is fitted to logs", "regression")
 
-    def families(self, deepest: float, entries: int) -> list[Family]:
+    def families(self, deepest: float, entries: int) -> list[RegressionFamily]:
         """Return the regression families that identification tries; none by default.
 
         Args:
@@ -221,4 +221,4 @@ class ContactLaw(abc.ABC):
     def _unstated(self, which: str, method: str) -> InputError:
         """Return the error for a law that lacks an optional `method`."""
         expected = f"a law {which} (ContactLaw.{method})"
-        return InputError(f"contact.law: found {shown(self.name)}, expected {expected}")
+        return InputError(f"contact.law: found {format_value(self.name)}, expected {expected}")

@@ -8,9 +8,9 @@ from jaxhil.contact.arrays import jnp
 from jaxhil.contact.float_law import FloatLaw
 from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.regression import Regression, RegressionFamily
 
-DEPTH = 1e-3  # m, reference depth that identification writes into a file
+DEFAULT_REFERENCE_DEPTH = 1e-3  # m, reference depth that identification writes into a file
 
 
 class DepthDamped(PowerLaw):
@@ -70,7 +70,11 @@ class DepthDamped(PowerLaw):
         return _regression(contact.exponent, contact.reference_depth)
 
     def families(self, deepest, entries):
-        return [Family(lambda exponent: _regression(exponent, DEPTH), 1.0, 3.0, COMMON_EXPONENTS)]
+        return [
+            RegressionFamily(
+                lambda exponent: _regression(exponent, DEFAULT_REFERENCE_DEPTH), 1.0, 3.0, COMMON_EXPONENTS
+            )
+        ]
 
 
 def _regression(exponent: float, reference_depth: float) -> Regression:

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-__all__ = ["StepEnd", "StepResult", "along", "take_rolled_step", "take_step"]
+__all__ = ["StepEnd", "StepResult", "interpolate_step", "take_looped_step", "take_step"]
 
 # Nodes and stage coefficients; the last stage is the solution of order 5. The error is the difference between
 # the solutions of order 5 and 4.
 _NODES = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-_STAGES = (
+_STAGE_COEFFICIENTS = (
     (),
     (1 / 5,),
     (3 / 40, 9 / 40),
@@ -22,11 +22,11 @@ _STAGES = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
     (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
-_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+_ERROR_COEFFICIENTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 # Function of the time since the step's start [s] and of y, a tree of arrays. It returns y' and any other
 # result that is needed at the step's end.
-Slope = Callable[[Array, Any], tuple[Any, Any]]
+SlopeFunction = Callable[[Array, Any], tuple[Any, Any]]
 
 
 class StepResult(NamedTuple):
@@ -38,7 +38,7 @@ class StepResult(NamedTuple):
     error: Any  # error estimate of y
 
 
-def take_step(slope: Slope, start: Any, length: Array) -> StepResult:
+def take_step(slope: SlopeFunction, start: Any, length: Array) -> StepResult:
     """Take a step of `length` [s] from y = `start`."""
 
     def increment(row, slopes):
@@ -49,15 +49,15 @@ def take_step(slope: Slope, start: Any, length: Array) -> StepResult:
         )
 
     end, slopes, extra = start, [], None
-    for node, row in zip(_NODES, _STAGES, strict=True):
+    for node, row in zip(_NODES, _STAGE_COEFFICIENTS, strict=True):
         if row:
             end = jax.tree.map(lambda leaf, change: leaf + change, start, increment(row, slopes))
         stage, extra = slope(node * length, end)
         slopes.append(stage)
-    return StepResult(end, slopes, extra, increment(_ERROR, slopes))
+    return StepResult(end, slopes, extra, increment(_ERROR_COEFFICIENTS, slopes))
 
 
-def take_rolled_step(slope: Slope, start: Any, length: Float[Array, "*batch"]) -> StepResult:
+def take_looped_step(slope: SlopeFunction, start: Any, length: Float[Array, "*batch"]) -> StepResult:
     """Take the same step with a loop over its stages, which compiles in a fraction of the time."""
     stages, batch_axes = len(_NODES), [1] * length.ndim
 
@@ -76,11 +76,11 @@ def take_rolled_step(slope: Slope, start: Any, length: Float[Array, "*batch"]) -
     def empty(tree: Any, *leading: int) -> Any:
         return jax.tree.map(lambda leaf: jnp.zeros((*leading, *leaf.shape), leaf.dtype), tree)
 
-    rows = [(*row, *[0.0] * (stages - len(row))) for row in _STAGES]
+    rows = [(*row, *[0.0] * (stages - len(row))) for row in _STAGE_COEFFICIENTS]
     coefficients = jnp.arange(stages), jnp.asarray(rows, length.dtype), jnp.asarray(_NODES, length.dtype)
     extra = empty(jax.eval_shape(lambda: slope(length, start)[1]))
     (slopes, end, extra), _ = lax.scan(take_stage, (empty(start, stages), start, extra), coefficients)
-    return StepResult(end, slopes, extra, increment(jnp.asarray(_ERROR, length.dtype), slopes))
+    return StepResult(end, slopes, extra, increment(jnp.asarray(_ERROR_COEFFICIENTS, length.dtype), slopes))
 
 
 class StepEnd(NamedTuple):
@@ -92,7 +92,7 @@ class StepEnd(NamedTuple):
     last: Array  # acceleration at its end [m/s^2]
 
 
-def along(
+def interpolate_step(
     s: Array | float, length: Array, depth: Array, velocity: Array, end: StepEnd
 ) -> tuple[Array, Array]:
     """Return position [m] and velocity [m/s] at the fraction s of a step (quintic Hermite polynomial)."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import FloatLaw, clamped
-from jaxhil.contact.keys import Key
+from jaxhil.contact.float_law import FloatLaw, clamp_force
+from jaxhil.contact.keys import ContactKey
 
 
 class Elastoplastic(ContactLaw):
@@ -24,7 +24,7 @@ class Elastoplastic(ContactLaw):
 
     name: ClassVar[str] = "elastoplastic"
     keys: ClassVar = (
-        Key(
+        ContactKey(
             "unloading_ratio",
             "ratio of the unloading slope to the loading slope, for {laws}",
             "1",
@@ -67,11 +67,11 @@ class Elastoplastic(ContactLaw):
 
     def reference(self, parameters, mass, velocity):
         """Return a quarter period of the frequency sqrt(k/M) inward and of sqrt(k_u/M) outward."""
-        from jaxhil.contact.reference import Reference
+        from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
         restitution = 1 / jnp.sqrt(parameters.unloading_ratio)
-        return Reference(
+        return IdealContact(
             restitution=restitution,
             peak_force=mass * velocity * frequency,
             duration=jnp.pi / 2 / frequency * (1 + restitution),
@@ -102,4 +102,4 @@ def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> Floa
     def loaded(depth: float) -> FloatLaw:
         return _in_floats(stiffness, unloading_ratio, depth)
 
-    return clamped(spring, lambda rate: 0.0)._replace(loaded=loaded)
+    return clamp_force(spring, lambda rate: 0.0)._replace(loaded=loaded)

@@ -3,22 +3,22 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-__all__ = ["FloatLaw", "clamped"]
+__all__ = ["FloatLaw", "clamp_force"]
 
-Formula = Callable[[float, float], float]
+ForceFunction = Callable[[float, float], float]
 
 
 class FloatLaw(NamedTuple):
     """Contact law of one contact: functions of penetration d [m] and rate d' [m/s]."""
 
-    force: Formula  # force [N] at d > 0; 0 where the surfaces separate
-    hold: Formula  # [N or 1]; positive until penetrated surfaces separate (`ContactLaw.hold`)
+    force: ForceFunction  # force [N] at d > 0; 0 where the surfaces separate
+    hold: ForceFunction  # [N or 1]; positive until penetrated surfaces separate (`ContactLaw.hold`)
     edge: Callable[[float], float]  # limit of the force [N] as d goes to 0 from above, a function of d' only
     # for a law with memory: returns the law after a deepest penetration [m]; 0 gives the undeformed law
     loaded: "Callable[[float], FloatLaw] | None" = None
 
 
-def clamped(spring: Formula, edge: Callable[[float], float]) -> FloatLaw:
+def clamp_force(spring: ForceFunction, edge: Callable[[float], float]) -> FloatLaw:
     """Return the law whose force is `spring` clamped at 0; `edge` is the unclamped limit at d = 0."""
 
     def force(depth: float, rate: float) -> float:

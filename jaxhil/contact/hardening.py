@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import clamped
+from jaxhil.contact.float_law import clamp_force
 from jaxhil.contact.keys import REFERENCE_DEPTH
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class Hardening(ContactLaw):
@@ -67,7 +67,7 @@ class Hardening(ContactLaw):
         def spring(depth: float, rate: float) -> float:
             return stiffness * depth * (1.0 + (depth / reference_depth) ** 2) + damping * rate
 
-        return clamped(spring, lambda rate: damping * rate)
+        return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
         """Return F = k d + k d^3/d_0^2 + b d' with the coefficients k, k/d_0^2 and b."""
@@ -75,7 +75,7 @@ class Hardening(ContactLaw):
         return Regression("hardening", lambda d, v: [d, d**3], names, lambda d, v: [v])
 
     def families(self, deepest, entries):
-        return [Family(lambda _: self.regression(None))] if entries == 1 else []
+        return [RegressionFamily(lambda _: self.regression(None))] if entries == 1 else []
 
     def coefficients(self, contact, stiffness, damping):
         return [stiffness, stiffness / contact.reference_depth**2, damping]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.float_law import FloatLaw
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class HuntCrossley(PowerLaw):
@@ -43,9 +43,11 @@ class HuntCrossley(PowerLaw):
         return 1 + 1.5 * parameters.damping * rate
 
     def reference(self, parameters, mass, velocity):
-        from jaxhil.contact.reference import hunt_crossley
+        from jaxhil.contact.ideal_contact import ideal_hunt_crossley
 
-        return hunt_crossley(mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity)
+        return ideal_hunt_crossley(
+            mass, parameters.stiffness, parameters.exponent, parameters.damping, velocity
+        )
 
     def damping_ratio(self, damping, mass, velocity, frequency):
         """Return chi v/pi, which follows from e = 1 - chi v."""
@@ -71,7 +73,7 @@ class HuntCrossley(PowerLaw):
         return _regression(contact.exponent)
 
     def families(self, deepest, entries):
-        return [Family(_regression, 1.05, 3.0, COMMON_EXPONENTS[1:])]
+        return [RegressionFamily(_regression, 1.05, 3.0, COMMON_EXPONENTS[1:])]
 
     def coefficients(self, contact, stiffness, damping):
         return [stiffness, stiffness * damping]

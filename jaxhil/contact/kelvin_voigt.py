@@ -6,16 +6,16 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import FloatLaw, clamped
-from jaxhil.contact.keys import Key
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.float_law import FloatLaw, clamp_force
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class KelvinVoigt(ContactLaw):
     """Contact law F = k d + b d', clamped at 0 unless tension is allowed."""
 
     name: ClassVar[str] = "kelvin_voigt"
-    keys: ClassVar = (Key("tension", "whether {laws} may pull", default=False),)
+    keys: ClassVar = (ContactKey("tension", "whether {laws} may pull", default=False),)
     is_linear: ClassVar[bool] = True
 
     @property
@@ -36,9 +36,11 @@ class KelvinVoigt(ContactLaw):
         return jnp.where(parameters.tension, 1, force)
 
     def reference(self, parameters, mass, velocity):
-        from jaxhil.contact.reference import kelvin_voigt
+        from jaxhil.contact.ideal_contact import ideal_kelvin_voigt
 
-        return kelvin_voigt(mass, parameters.stiffness, parameters.damping, velocity, parameters.tension)
+        return ideal_kelvin_voigt(
+            mass, parameters.stiffness, parameters.damping, velocity, parameters.tension
+        )
 
     def undamped_peak_force(self, parameters, mass, velocity):
         return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
@@ -53,13 +55,13 @@ class KelvinVoigt(ContactLaw):
 
         if contact.tension:
             return FloatLaw(spring, lambda depth, rate: 1.0, lambda rate: damping * rate)
-        return clamped(spring, lambda rate: damping * rate)
+        return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
         return _kelvin_voigt(contact.tension)
 
     def families(self, deepest, entries):
-        return [Family(lambda _, pulls=pulls: _kelvin_voigt(pulls)) for pulls in (False, True)]
+        return [RegressionFamily(lambda _, pulls=pulls: _kelvin_voigt(pulls)) for pulls in (False, True)]
 
 
 class Linear(KelvinVoigt):
@@ -81,7 +83,7 @@ class Linear(KelvinVoigt):
         return Regression("linear", lambda d, v: [d], ("stiffness",))
 
     def families(self, deepest, entries):
-        return [Family(lambda _: self.regression(None))]
+        return [RegressionFamily(lambda _: self.regression(None))]
 
     def coefficients(self, contact, stiffness, damping):
         return [stiffness]

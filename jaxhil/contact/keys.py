@@ -5,12 +5,12 @@ from typing import Annotated, Any, NamedTuple
 
 from msgspec import Meta, field
 
-__all__ = ["DEPTHS", "EXPONENT", "REFERENCE_DEPTH", "Key", "says"]
+__all__ = ["DEPTHS", "EXPONENT", "REFERENCE_DEPTH", "ContactKey", "key_metadata"]
 
 MAX_DEPTHS = 20  # depths at which a piecewise-linear law changes its slope
 
 
-def says(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
+def key_metadata(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
     """Return the metadata of a key's type.
 
     Args:
@@ -23,7 +23,7 @@ def says(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
     return Meta(description=meaning, extra=extra, extra_json_schema=unit_entry, **limits)
 
 
-class Key(NamedTuple):
+class ContactKey(NamedTuple):
     """Key of a contact law: a flag if the default is a bool, a list if it is a list, else a number."""
 
     name: str
@@ -35,7 +35,7 @@ class Key(NamedTuple):
     name_in_six_axes: str = ""  # name in six-axis files, if it differs
     meaning_in_six_axes: str = ""  # description in six-axis files, if the name differs
 
-    def in_six_axes(self) -> "Key":
+    def in_six_axes(self) -> "ContactKey":
         """Return the key as it is in six-axis files."""
         if not self.name_in_six_axes:
             return self
@@ -45,18 +45,18 @@ class Key(NamedTuple):
         """Return name, type and default for `msgspec.defstruct`; `laws` names the laws that have the key."""
         meaning = self.meaning.format(laws=laws)
         if isinstance(self.default, bool):
-            return self.name, Annotated[bool, says(meaning)], self.default
+            return self.name, Annotated[bool, key_metadata(meaning)], self.default
         if isinstance(self.default, list):
-            entry = Annotated[float, says(meaning.split(",")[0], self.unit, **self.limits)]
+            entry = Annotated[float, key_metadata(meaning.split(",")[0], self.unit, **self.limits)]
             kind = Annotated[list[entry], Meta(max_length=MAX_DEPTHS, description=meaning)]
             return self.name, kind, field(default_factory=list)
-        number: Any = Annotated[float, says(meaning, self.unit, **self.limits)]
+        number: Any = Annotated[float, key_metadata(meaning, self.unit, **self.limits)]
         return self.name, number | None if self.default is None else number, self.default
 
 
-EXPONENT = Key("exponent", "exponent of the depth, for {laws}", "1", {"ge": 1.0}, default=1.5)
-DEPTHS = Key("depths", "depths where the slope changes, for {laws}", "m", {"gt": 0.0}, default=[])
-REFERENCE_DEPTH = Key(
+EXPONENT = ContactKey("exponent", "exponent of the depth, for {laws}", "1", {"ge": 1.0}, default=1.5)
+DEPTHS = ContactKey("depths", "depths where the slope changes, for {laws}", "m", {"gt": 0.0}, default=[])
+REFERENCE_DEPTH = ContactKey(
     "reference_depth",
     "depth where hardening has four times its initial slope, and where depth_damped has its damping",
     "m",

@@ -14,26 +14,26 @@ from jaxhil.contact.elastoplastic import Elastoplastic
 from jaxhil.contact.hardening import Hardening
 from jaxhil.contact.hunt_crossley import HuntCrossley
 from jaxhil.contact.kelvin_voigt import KelvinVoigt, Linear
-from jaxhil.contact.keys import Key
+from jaxhil.contact.keys import ContactKey
 from jaxhil.contact.piecewise_linear import PiecewiseLinear
 from jaxhil.contact.preloaded import Preloaded
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 
 __all__ = [
-    "KEYS",
-    "LAWS",
+    "CONTACT_KEYS",
+    "CONTACT_LAWS",
     "ContactLaw",
     "ContactParameters",
     "HuntCrossley",
     "KelvinVoigt",
     "PiecewiseLinear",
-    "contact_law",
+    "compute_two_sided_force",
     "deflection",
-    "laws_with",
-    "two_sided",
+    "find_contact_law",
+    "laws_with_key",
 ]
 
-LAWS: dict[str, ContactLaw] = {
+CONTACT_LAWS: dict[str, ContactLaw] = {
     law.name: law
     for law in (
         Linear(),
@@ -47,21 +47,25 @@ LAWS: dict[str, ContactLaw] = {
     )
 }
 # All keys that only some laws have, in the order of the laws.
-KEYS: dict[str, Key] = {key.name: key for law in LAWS.values() for key in law.keys or ()}
+CONTACT_KEYS: dict[str, ContactKey] = {
+    key.name: key for law in CONTACT_LAWS.values() for key in law.keys or ()
+}
 
 
-def contact_law(name: str) -> ContactLaw:
+def find_contact_law(name: str) -> ContactLaw:
     """Return the contact law of this name. Raise `InputError` if there is none."""
-    if name not in LAWS:
-        raise InputError(f"contact.law: found {shown(name)}, expected one of {', '.join(LAWS)}")
-    return LAWS[name]
+    if name not in CONTACT_LAWS:
+        raise InputError(
+            f"contact.law: found {format_value(name)}, expected one of {', '.join(CONTACT_LAWS)}"
+        )
+    return CONTACT_LAWS[name]
 
 
-def laws_with(key: Key) -> tuple[str, ...]:
+def laws_with_key(key: ContactKey) -> tuple[str, ...]:
     """Return the names of the laws that have the key, given in its one-axis or its six-axis form."""
     return tuple(
         law.name
-        for law in LAWS.values()
+        for law in CONTACT_LAWS.values()
         if any(key in (law_key, law_key.in_six_axes()) for law_key in law.keys or ())
     )
 
@@ -71,8 +75,8 @@ if TYPE_CHECKING:
     class ContactParameters(NamedTuple):
         """Parameters of one contact, or of several along a leading axis.
 
-        There is a further field for each of `KEYS`, (...); without a value in the file it has the key's
-        neutral value.
+        There is a further field for each of `CONTACT_KEYS`, (...); without a value in the file it has the
+        key's neutral value.
         """
 
         stiffness: Any  # [N/m], or [N/m^n] for a law with an exponent n; (segments, ...) if segmented
@@ -83,7 +87,7 @@ if TYPE_CHECKING:
 
 else:
     ContactParameters = namedtuple(
-        "ContactParameters", ["stiffness", "damping", *KEYS, "kind"], defaults=[None]
+        "ContactParameters", ["stiffness", "damping", *CONTACT_KEYS, "kind"], defaults=[None]
     )
 
 
@@ -98,7 +102,7 @@ def deflection(position: Any, clearance: Any | None) -> Any:
     return jnp.where(position > 0, position, jnp.where(far < 0, far, 0))
 
 
-def two_sided(law, parameters, state, position, velocity, clearance):
+def compute_two_sided_force(law, parameters, state, position, velocity, clearance):
     """Return the signed contact force [N] and the next state of the law, for one surface or two.
 
     The force is law(d, d') with d = x at the first surface, and -law(d, d') with d = -c - x at the second,

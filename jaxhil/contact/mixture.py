@@ -10,11 +10,11 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.laws import ContactLaw, ContactParameters
-from jaxhil.contact.reference import Reference
 
 
-class AnyOf(ContactLaw):
+class LawMixture(ContactLaw):
     """Contact law that applies the law number `parameters.kind` of `laws` to each batch element.
 
     Stiffness and depths have a leading axis of segments, as for the piecewise-linear law; the other laws take
@@ -65,12 +65,12 @@ class AnyOf(ContactLaw):
         return self._choose(parameters, values)
 
     def reference(self, parameters, mass, velocity):
-        unknown = Reference(*[jnp.full_like(velocity, jnp.nan)] * 3)
+        unknown = IdealContact(*[jnp.full_like(velocity, jnp.nan)] * 3)
         references = [
             law.reference(numbers, mass, velocity) if law.closed_form or not self.beforehand else unknown
             for law, numbers in zip(self.laws, self._per_law(parameters), strict=True)
         ]
-        return Reference(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
+        return IdealContact(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
 
     def _per_law(self, parameters: ContactParameters) -> list[ContactParameters]:
         """Return the parameters as each law takes them."""

@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import clamped
+from jaxhil.contact.float_law import clamp_force
 from jaxhil.contact.keys import DEPTHS
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class PiecewiseLinear(ContactLaw):
@@ -46,9 +46,11 @@ class PiecewiseLinear(ContactLaw):
         return jnp.where(force > 0, force, 0)
 
     def reference(self, parameters, mass, velocity):
-        from jaxhil.contact.reference import piecewise_linear
+        from jaxhil.contact.ideal_contact import ideal_piecewise_linear
 
-        return piecewise_linear(mass, parameters.stiffness, parameters.depths, parameters.damping, velocity)
+        return ideal_piecewise_linear(
+            mass, parameters.stiffness, parameters.depths, parameters.damping, velocity
+        )
 
     def undamped_peak_force(self, parameters, mass, velocity):
         """Add up segments: a force F at a segment's start grows to sqrt(F^2 + 2 k E) over an energy E."""
@@ -82,13 +84,13 @@ class PiecewiseLinear(ContactLaw):
                     return level + slope * (depth - start) + damping * rate
             raise ValueError("the penetration is not a number")
 
-        return clamped(spring, lambda rate: damping * rate)
+        return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
         return _regression(tuple(contact.depths))
 
     def families(self, deepest, entries):
-        return [Family(lambda depth: _regression((depth,)), 0.1 * deepest, 0.9 * deepest)]
+        return [RegressionFamily(lambda depth: _regression((depth,)), 0.1 * deepest, 0.9 * deepest)]
 
     def coefficients(self, contact, stiffness, damping):
         return [*stiffness, damping]

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.keys import EXPONENT, Key
+from jaxhil.contact.keys import EXPONENT, ContactKey
 
 COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
 
@@ -11,7 +11,7 @@ COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
 class PowerLaw(ContactLaw):
     """Base class of laws with F = k d^n without damping; k is `stiffness` [N/m^n], n is `exponent`."""
 
-    keys: ClassVar[tuple[Key, ...] | None] = (EXPONENT,)
+    keys: ClassVar[tuple[ContactKey, ...] | None] = (EXPONENT,)
     stiffness_unit: ClassVar[str] = "N/m^n"
 
     def undamped_peak_force(self, parameters, mass, velocity):

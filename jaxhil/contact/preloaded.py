@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import clamped
-from jaxhil.contact.keys import Key
+from jaxhil.contact.float_law import clamp_force
+from jaxhil.contact.keys import ContactKey
 
 
 class Preloaded(ContactLaw):
@@ -24,8 +24,8 @@ class Preloaded(ContactLaw):
 
     name: ClassVar[str] = "preloaded"
     keys: ClassVar = (
-        Key("preload", "spring force at the touch, for {laws}", "N", {"ge": 0.0}, default=0.0),
-        Key(
+        ContactKey("preload", "spring force at the touch, for {laws}", "N", {"ge": 0.0}, default=0.0),
+        ContactKey(
             "friction",
             "dry friction force against the motion, for {laws}",
             "N",
@@ -54,7 +54,7 @@ class Preloaded(ContactLaw):
         return self._constant(parameters, rate) + parameters.stiffness * penetration
 
     def reference(self, parameters, mass, velocity):
-        from jaxhil.contact.reference import Reference
+        from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
         inward = (parameters.preload + parameters.friction) / parameters.stiffness
@@ -68,7 +68,7 @@ class Preloaded(ContactLaw):
         end = jnp.where(outward > 0, outward, 0)
         speed = jnp.sqrt((amplitude - end) * (amplitude + end))
         duration = (jnp.arctan2(swing, inward) + jnp.arctan2(speed, end)) / frequency
-        return Reference(
+        return IdealContact(
             restitution=jnp.where(sticks, 0, speed / swing),
             peak_force=parameters.stiffness * turning,
             duration=jnp.where(sticks, jnp.inf, duration),
@@ -92,7 +92,7 @@ class Preloaded(ContactLaw):
         def spring(depth: float, rate: float) -> float:
             return constant(rate) + stiffness * depth
 
-        return clamped(spring, constant)
+        return clamp_force(spring, constant)
 
     def _constant(self, parameters, rate):
         """Return the part of the force that does not depend on depth [N]."""

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["Family", "Regression"]
+__all__ = ["Regression", "RegressionFamily"]
 
-Functions = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
+BasisFunctions = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 
 
 def _no_functions(depth: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
@@ -22,9 +22,11 @@ class Regression:
     """Contact law F = sum_i c_i phi_i(d, d') with a fixed shape (an exponent, depths)."""
 
     name: str  # name of the law in mechanism files
-    own: Functions = field(repr=False)  # phi(d [m], d' [m/s]) whose coefficients differ between entries
+    entry_functions: BasisFunctions = field(
+        repr=False
+    )  # phi(d [m], d' [m/s]) whose coefficients differ between entries
     names: tuple[str, ...]  # names of the coefficients of `own`, then of `shared`
-    shared: Functions = field(
+    shared: BasisFunctions = field(
         repr=False, default=_no_functions
     )  # phi with coefficients common to all entries
     pulls: bool = False  # whether the force may be negative
@@ -36,10 +38,10 @@ class Regression:
         return len(self.names) + len(self.shape.get("depths", ())) + ("exponent" in self.shape)
 
 
-class Family(NamedTuple):
+class RegressionFamily(NamedTuple):
     """Regressions of one contact law that differ in one number, the shape, which a fit chooses."""
 
     make: Callable[[float], Regression]  # returns the regression of a shape
     low: float = 0.0  # smallest shape that the fit tries
     high: float = 0.0  # largest shape that the fit tries; equal to `low` if the shape is fixed
-    usual: tuple[float, ...] = ()  # shapes that are preferred if they fit equally well
+    preferred: tuple[float, ...] = ()  # shapes that are preferred if they fit equally well

@@ -14,7 +14,7 @@ _FOLDER = Path(__file__).parent
 
 
 @cache
-def names(axes: int = 1) -> tuple[str, ...]:
+def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
     """Return the names of the compensators: `none`, then the others in alphabetical order.
 
     Args:

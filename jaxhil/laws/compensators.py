@@ -7,23 +7,26 @@ package's folders, and those that `jaxhil.register` adds.
 from importlib import import_module
 from typing import Any
 
-from jaxhil.laws import names
+from jaxhil.laws import built_in_compensators
 from jaxhil.laws.simulation_base import Compensator
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 
 
-def _table(axes: int) -> dict[str, Compensator]:
-    return {name: import_module(f"jaxhil.laws.{name}.simulation").COMPENSATOR for name in names(axes)}
+def _load_compensators(axes: int) -> dict[str, Compensator]:
+    return {
+        name: import_module(f"jaxhil.laws.{name}.simulation").COMPENSATOR
+        for name in built_in_compensators(axes)
+    }
 
 
-COMPENSATORS = _table(1)
-SIX_AXES = _table(6)  # each treats the channels of the wrench separately
+COMPENSATORS = _load_compensators(1)
+SIX_AXIS_COMPENSATORS = _load_compensators(6)  # each treats the channels of the wrench separately
 
 
-def compensator_of(name: str) -> Compensator:
+def get_compensator(name: str) -> Compensator:
     """Return the compensator with this name, for one axis or for six. Raise KeyError if there is none."""
-    return COMPENSATORS[name] if name in COMPENSATORS else SIX_AXES[name]
+    return COMPENSATORS[name] if name in COMPENSATORS else SIX_AXIS_COMPENSATORS[name]
 
 
 def literature_gains(
@@ -39,7 +42,7 @@ def literature_gains(
     Raises:
         KeyError: if there is no such compensator or setting.
     """
-    law = compensator_of(compensator)
+    law = get_compensator(compensator)
     chosen = law.settings[setting] if setting is not None else {}
     # For six axes the rules read only the force sensor and the control period, which both classes have.
     source: Any = mechanism

@@ -38,7 +38,7 @@ class Gain(NamedTuple):
     begins: Callable[[Mechanism], float] | None = None
 
 
-_UNITS = {name: gain.unit for law in ON_THE_RIG.values() for name, gain in law.gains.items()}
+_GAIN_UNITS = {name: gain.unit for law in ON_THE_RIG.values() for name, gain in law.gains.items()}
 
 
 def rig_gain(
@@ -52,7 +52,7 @@ def rig_gain(
 
     The other arguments are fields of `Gain`. Raise KeyError if no compensator of the rig has the gain.
     """
-    return Gain(name, _UNITS[name], lower, upper, nominal, **others)
+    return Gain(name, _GAIN_UNITS[name], lower, upper, nominal, **others)
 
 
 class Signals(NamedTuple):
@@ -65,14 +65,14 @@ class Signals(NamedTuple):
     age: Int[Array, "*batch"]  # ticks since this run began, 0 on its first tick
 
 
-class Constants(NamedTuple):
+class KnownConstants(NamedTuple):
     """Constants of the rig that the compensator knows."""
 
     control_period: Float[Array, "*batch"]  # T [s]
     clearance: Float[Array, "*batch"]  # of a two-sided contact [m]; infinite for a one-sided one
 
 
-def cleared(state: Any, begins: Array) -> Any:
+def clear_lanes(state: Any, begins: Array) -> Any:
     """Set the state to zero on the lanes where a run begins."""
     return jax.tree.map(lambda leaf: jnp.where(begins, 0, leaf), state)
 
@@ -81,7 +81,7 @@ class Compensator(eqx.Module):
     """Interface of a compensator; see the module's docstring."""
 
     name: eqx.AbstractClassVar[str]
-    # Required knowledge of mechanism and rig, by the names in `jaxhil.laws.shared.estimates`.
+    # Required knowledge of mechanism and rig, by the names in `jaxhil.laws.shared.nominal_values`.
     knows: eqx.AbstractClassVar[tuple[str, ...]]
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
     # Named sets of gains that serve any mechanism; each has only the gains that differ from the nominal ones.
@@ -98,11 +98,11 @@ class Compensator(eqx.Module):
     # Whether its step is so large that solvers are compiled separately from its runs.
     is_large: ClassVar[bool] = False
 
-    def prepare(self, gains: Gains, constants: Constants) -> Any:
+    def prepare(self, gains: Gains, constants: KnownConstants) -> Any:
         """Return what `step` computes from the gains only once per run; by default the gains."""
         return gains
 
-    def init(self, gains: Gains, constants: Constants, ring: int) -> Any:
+    def init(self, gains: Gains, constants: KnownConstants, ring: int) -> Any:
         """Return the state before the first tick; by default there is none.
 
         Args:
@@ -124,7 +124,7 @@ class Compensator(eqx.Module):
             fresh: lanes where this is the next contact of a schedule; elsewhere the same run continues, with
                 its estimates, after a skipped free flight.
         """
-        return cleared(state, begins)
+        return clear_lanes(state, begins)
 
     @abc.abstractmethod
     def step(self, prepared: Any, state: Any, signals: Signals, tick: Array) -> tuple[Array, Any]:
@@ -151,7 +151,7 @@ class Compensator(eqx.Module):
         """
         return position, state
 
-    def noise_amplification(self, gains: Gains, constants: Constants) -> Float[Array, "*batch"]:
+    def noise_amplification(self, gains: Gains, constants: KnownConstants) -> Float[Array, "*batch"]:
         """Return the standard deviation of F_c in steady contact over that of white force noise [1].
 
         It is 1 by default, for the measured force itself, and differentiable with respect to the gains.

@@ -17,37 +17,37 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from jaxhil.errors import one_line, shown
+from jaxhil.errors import format_value, to_one_line
 from jaxhil.mechanism.structs import (
-    MAGNITUDES,
-    PLAIN,
+    MAGNITUDE_LIMITS,
+    NO_METADATA,
     Mechanism,
     is_computable,
+    mechanism_type,
     range_of,
-    schema_type,
 )
 
 __all__ = [
-    "NUMBER_FOR_LIST",
+    "SCALAR_LIST_KEYS",
+    "KeyPath",
     "KeyProblem",
-    "Path",
-    "allowed_at",
-    "allowed_of",
-    "close_match",
-    "computable",
-    "dotted",
-    "entry_count",
-    "step_into",
+    "add_magnitude_limits",
+    "describe_allowed",
+    "describe_allowed_at",
+    "find_member_type",
+    "format_entry_count",
+    "format_key_path",
+    "suggest_names",
     "to_mechanism",
     "to_struct",
 ]
 
 AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
-Path = tuple[str | int, ...]
-Extra = Mapping[str, Any]  # metadata that `jaxhil.mechanism.structs.says` adds to a type
+KeyPath = tuple[str | int, ...]
+TypeMetadata = Mapping[str, Any]  # metadata that `jaxhil.mechanism.structs.says` adds to a type
 
 # Lists for which a bare number stands for a list of one entry.
-NUMBER_FOR_LIST = ("contact", "stiffness"), ("contact", "damping")
+SCALAR_LIST_KEYS = ("contact", "stiffness"), ("contact", "damping")
 # Polynomials, whose leading zeros have no effect and are dropped.
 _POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
 
@@ -58,18 +58,18 @@ _type_info = functools.cache(inspect.type_info)
 class KeyProblem(Exception):
     """Error for a key with an unusable value: its path, the value found and the allowed values, in words."""
 
-    def __init__(self, path: Path, found: str, allowed: str):
+    def __init__(self, path: KeyPath, found: str, allowed: str):
         super().__init__(path, found, allowed)
         self.path = path
         self.found = found
         self.allowed = allowed
 
     def __str__(self) -> str:
-        where = f"{dotted(self.path)}: " if self.path else ""
-        return f"{where}found {self.found}, allowed {self.allowed}"
+        where = f"{format_key_path(self.path)}: " if self.path else ""
+        return f"{where}found {self.found}, expected {self.allowed}"
 
 
-def dotted(path: Path) -> str:
+def format_key_path(path: KeyPath) -> str:
     """Return a path as printable TOML text: ``uncertainty."contact.stiffness".factor[0]``."""
     text = ""
     for part in path:
@@ -77,25 +77,25 @@ def dotted(path: Path) -> str:
             text += f"[{part}]"
             continue
         bare = re.fullmatch(r"[A-Za-z0-9_-]+", part) and len(part) <= 60
-        quoted = one_line(part[:61].replace("\\", "\\\\").replace('"', '\\"'), 60)
+        quoted = to_one_line(part[:61].replace("\\", "\\\\").replace('"', '\\"'), 60)
         text += "." * bool(text) + (part if bare else f'"{quoted}"')
     return text
 
 
-def close_match(word: str, known: Iterable[str]) -> str:
+def suggest_names(word: str, known: Iterable[str]) -> str:
     """Return ` (did you mean X?)` with the known words closest to `word`, or an empty text."""
     matches = difflib.get_close_matches(word[:200], list(known), n=3, cutoff=0.6)
     return f" (did you mean {' or '.join(matches)}?)" if matches else ""
 
 
-def entry_count(entries: Sequence[object]) -> str:
+def format_entry_count(entries: Sequence[object]) -> str:
     """Return the text `a list of N entries`."""
     return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
 
 
-def computable(allowed: object) -> str:
+def add_magnitude_limits(allowed: object) -> str:
     """Return the text `allowed`, extended by the range of magnitudes that computations support."""
-    return f"{allowed}, of a magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}"
+    return f"{allowed}, of a magnitude from {MAGNITUDE_LIMITS[0]:g} to {MAGNITUDE_LIMITS[1]:g}"
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
@@ -104,26 +104,26 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
     Integers are accepted as numbers, and a single number for the lists `contact.stiffness` and
     `contact.damping`; leading zeros of a transfer function's polynomials are dropped.
     """
-    return msgspec.convert(_clean(schema_type(), raw, (), PLAIN), Mechanism)
+    return msgspec.convert(_convert(mechanism_type(), raw, (), NO_METADATA), Mechanism)
 
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
     """Convert a raw table to a struct of a type with metadata like `Mechanism`'s. Raise `KeyProblem`."""
-    return msgspec.convert(_clean(_type_info(kind), raw, (), PLAIN), kind)
+    return msgspec.convert(_convert(_type_info(kind), raw, (), NO_METADATA), kind)
 
 
-def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
+def find_member_type(kind: inspect.Type, part: str | int, path: KeyPath) -> inspect.Type:
     """Return the type of the key or list entry `part` in a value of type `kind`. Raise `KeyProblem`."""
     match kind:
         case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
-            return step_into(inner, 0, path)
+            return find_member_type(inner, 0, path)
         case inspect.Metadata(type=inner):
-            return step_into(inner, part, path)
+            return find_member_type(inner, part, path)
         case inspect.UnionType(types=members):
             inside = inspect.ListType if isinstance(part, int) else (inspect.ListType, inspect.StructType)
-            inner = [member for member in members if isinstance(_bare(member), inside)]
+            inner = [member for member in members if isinstance(_strip_metadata(member), inside)]
             if inner:
-                return step_into(inner[0], part, path)
+                return find_member_type(inner[0], part, path)
         case inspect.StructType(fields=fields) if isinstance(part, str):
             for entry in fields:
                 if entry.encode_name == part:
@@ -135,23 +135,27 @@ def step_into(kind: inspect.Type, part: str | int, path: Path) -> inspect.Type:
             return item
         case _:
             pass
-    raise KeyProblem((*path, part), "no such key", allowed_of(kind, PLAIN) + f" at {dotted(path)}")
+    raise KeyProblem(
+        (*path, part), "no such key", describe_allowed(kind, NO_METADATA) + f" at {format_key_path(path)}"
+    )
 
 
-def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
+def describe_allowed(kind: inspect.Type, extra: TypeMetadata = NO_METADATA) -> str:
     """Return the allowed values of a type, in words."""
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             return f"one of {', '.join(names)}"
         case inspect.Metadata(type=inner, extra={"six": names}):
-            entry = allowed_of(inner.item_type, PLAIN) if isinstance(inner, inspect.ListType) else ""
+            entry = (
+                describe_allowed(inner.item_type, NO_METADATA) if isinstance(inner, inspect.ListType) else ""
+            )
             return f"{entry}, {{ {', '.join(names)} }} of two, or a list of six"
         case inspect.Metadata(type=inner, extra={"square": size}):
             return f"one number for all entries, or a list of {size} rows of {size} entries"
         case inspect.Metadata(type=inner):
-            return allowed_of(inner, kind.extra or PLAIN)
+            return describe_allowed(inner, kind.extra or NO_METADATA)
         case inspect.UnionType(types=members):
-            kinds = [allowed_of(m, extra) for m in members if not isinstance(m, inspect.NoneType)]
+            kinds = [describe_allowed(m, extra) for m in members if not isinstance(m, inspect.NoneType)]
             return " or ".join(kinds)
         case inspect.FloatType():
             return str(range_of(kind, extra))
@@ -166,58 +170,58 @@ def allowed_of(kind: inspect.Type, extra: Extra = PLAIN) -> str:
         case inspect.ListType(item_type=item):
             shortest, longest = kind.min_length or 0, kind.max_length
             length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
-            return f"a list of {length} entries, each {allowed_of(item, PLAIN)}"
+            return f"a list of {length} entries, each {describe_allowed(item, NO_METADATA)}"
         case _:
             return "a table"
 
 
-def allowed_at(kind: type[msgspec.Struct], key: str) -> str:
+def describe_allowed_at(kind: type[msgspec.Struct], key: str) -> str:
     """Return the allowed values of a struct's key, in words."""
     info = _type_info(kind)
     assert isinstance(info, inspect.StructType)
     [key_type] = (entry.type for entry in info.fields if entry.encode_name == key)
-    return allowed_of(key_type)
+    return describe_allowed(key_type)
 
 
-def _bare(kind: inspect.Type) -> inspect.Type:
+def _strip_metadata(kind: inspect.Type) -> inspect.Type:
     """Return a type without its metadata."""
-    return _bare(kind.type) if isinstance(kind, inspect.Metadata) else kind
+    return _strip_metadata(kind.type) if isinstance(kind, inspect.Metadata) else kind
 
 
-def _unknown_key(kind: inspect.StructType, key: str, path: Path) -> KeyProblem:
+def _unknown_key(kind: inspect.StructType, key: str, path: KeyPath) -> KeyProblem:
     names = [entry.encode_name for entry in kind.fields]
-    allowed = f"one of {', '.join(names)}{close_match(key, names)}"
+    allowed = f"one of {', '.join(names)}{suggest_names(key, names)}"
     return KeyProblem((*path, key), "an unknown key", allowed)
 
 
-def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
+def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata) -> Any:
     """Return `value` as plain data of type `kind`, with numbers as floats. Raise `KeyProblem`."""
-    if path in NUMBER_FOR_LIST and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if path in SCALAR_LIST_KEYS and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             if isinstance(value, str) and value in names:
                 return value
         case inspect.Metadata(type=inner, extra={"six": names}):
-            return _clean(inner, _six_entries(kind, names, value, path), path, PLAIN)
+            return _convert(inner, _expand_six_entries(kind, names, value, path), path, NO_METADATA)
         case inspect.Metadata(type=inner, extra={"square": size}):
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            return _clean(inner, [[value] * size] * size if number else value, path, PLAIN)
+            return _convert(inner, [[value] * size] * size if number else value, path, NO_METADATA)
         case inspect.Metadata(type=inner):
-            return _clean(inner, value, path, kind.extra or PLAIN)
+            return _convert(inner, value, path, kind.extra or NO_METADATA)
         case inspect.UnionType(types=members):
-            return _clean(_member(members, value), value, path, extra)
+            return _convert(_choose_member(members, value), value, path, extra)
         case inspect.NoneType():
             return None
         case inspect.StructType() if isinstance(value, Mapping):
-            return _clean_struct(kind, value, path)
+            return _convert_struct(kind, value, path)
         case inspect.DictType(value_type=inner) if isinstance(value, Mapping):
-            return {key: _clean(inner, entry, (*path, key), PLAIN) for key, entry in value.items()}
+            return {key: _convert(inner, entry, (*path, key), NO_METADATA) for key, entry in value.items()}
         case inspect.ListType(item_type=item) if isinstance(value, (list, tuple)):
             shortest, longest = kind.min_length or 0, kind.max_length
             if len(value) < shortest or (longest is not None and len(value) > longest):
-                raise KeyProblem(path, entry_count(value), allowed_of(kind, PLAIN))
-            cleaned = [_clean(item, entry, (*path, i), PLAIN) for i, entry in enumerate(value)]
+                raise KeyProblem(path, format_entry_count(value), describe_allowed(kind, NO_METADATA))
+            cleaned = [_convert(item, entry, (*path, i), NO_METADATA) for i, entry in enumerate(value)]
             while path in _POLYNOMIALS and len(cleaned) > 1 and cleaned[0] == 0.0:
                 del cleaned[0]
             return cleaned
@@ -228,10 +232,10 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
                 number = math.nan
             if range_of(kind, extra).allows(number):
                 if not is_computable(number):
-                    raise KeyProblem(path, shown(value), computable(range_of(kind, extra)))
+                    raise KeyProblem(path, format_value(value), add_magnitude_limits(range_of(kind, extra)))
                 return number
         case inspect.IntType() if isinstance(value, int) and not isinstance(value, bool):
-            if range_of(kind, PLAIN).allows(value):
+            if range_of(kind, NO_METADATA).allows(value):
                 return value
         case inspect.BoolType() if isinstance(value, bool):
             return value
@@ -243,10 +247,10 @@ def _clean(kind: inspect.Type, value: Any, path: Path, extra: Extra) -> Any:
             return value
         case _:
             pass
-    raise KeyProblem(path, shown(value), allowed_of(kind, extra))
+    raise KeyProblem(path, format_value(value), describe_allowed(kind, extra))
 
 
-def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path) -> dict[str, Any]:
+def _convert_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: KeyPath) -> dict[str, Any]:
     """Return a table as plain data of the struct type `kind`. Raise `KeyProblem`."""
     names = {entry.encode_name for entry in kind.fields}
     for key in value:
@@ -257,13 +261,13 @@ def _clean_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Path
     for entry in kind.fields:
         name = entry.encode_name
         if name in value:
-            cleaned[name] = _clean(entry.type, value[name], (*path, name), PLAIN)
+            cleaned[name] = _convert(entry.type, value[name], (*path, name), NO_METADATA)
         elif entry.required:
-            raise KeyProblem((*path, name), "nothing", allowed_of(entry.type, PLAIN))
+            raise KeyProblem((*path, name), "nothing", describe_allowed(entry.type, NO_METADATA))
     return cleaned
 
 
-def _six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path: Path) -> Any:
+def _expand_six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path: KeyPath) -> Any:
     """Return the six entries that one number, or a table of two numbers with the keys `names`, stands for.
 
     A list is returned unchanged. Raise `KeyProblem` for any other value.
@@ -274,10 +278,10 @@ def _six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path:
         return [value[name] for name in names for _ in range(3)]
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return [value] * 6
-    raise KeyProblem(path, shown(value), allowed_of(kind, PLAIN))
+    raise KeyProblem(path, format_value(value), describe_allowed(kind, NO_METADATA))
 
 
-def _member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
+def _choose_member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
     """Return the member of a union type that fits the form of a value: None, a list, or a scalar."""
     kinds = list(members)
     none = [kind for kind in kinds if isinstance(kind, inspect.NoneType)]

@@ -21,21 +21,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, close_match
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import KeyProblem, suggest_names
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Correlation, Mechanism
 
-__all__ = ["certain", "check_correlation", "correlated", "correlated_groups", "remaining"]
+__all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
 
 AnyMechanism = Mechanism | SixAxisMechanism
 
-LEAST_EIGENVALUE = 1e-10  # a matrix with a smaller eigenvalue does not count as positive definite
+MIN_EIGENVALUE = 1e-10  # a matrix with a smaller eigenvalue does not count as positive definite
 
-_LEAST, _LARGEST = 2.0**-54, 1.0 - 2.0**-53  # bounds of uniform numbers, so that normal numbers are finite
+_MIN_UNIFORM, _MAX_UNIFORM = (
+    2.0**-54,
+    1.0 - 2.0**-53,
+)  # bounds of uniform numbers, so that normal numbers are finite
 
 
-def correlated(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the uniform numbers (draws, columns) of every key after applying the mechanism's correlation."""
     table = mechanism.correlation
     if table is None:
@@ -44,8 +47,8 @@ def correlated(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> di
 
     order = sorted(range(len(table.keys)), key=lambda i: uniform[table.keys[i]].shape[1] > 1)
     keys = [table.keys[i] for i in order]
-    factor = _factor(_matrix(table)[np.ix_(order, order)])
-    normal = [special.ndtri(np.clip(uniform[key], _LEAST, _LARGEST)) for key in keys]
+    factor = _cholesky_factor(_full_matrix(table)[np.ix_(order, order)])
+    normal = [special.ndtri(np.clip(uniform[key], _MIN_UNIFORM, _MAX_UNIFORM)) for key in keys]
     changed = {}
     for i, key in enumerate(keys):
         if np.any(factor[i, :i]):
@@ -54,27 +57,27 @@ def correlated(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> di
             mixed = sum(
                 factor[i, j] * normal[j][:, np.minimum(columns, normal[j].shape[1] - 1)] for j in range(i + 1)
             )
-            changed[key] = np.clip(special.ndtr(mixed), 0.0, _LARGEST)
+            changed[key] = np.clip(special.ndtr(mixed), 0.0, _MAX_UNIFORM)
     return {**uniform, **changed}
 
 
-def correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
+def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
     """Return the keys of ``[correlation]`` in mutually independent groups, in the order of the table."""
     table = mechanism.correlation
     if table is None:
         return []
-    linked = _matrix(table) != 0.0
+    linked = _full_matrix(table) != 0.0
     for _ in table.keys:
         linked = linked @ linked
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in linked)
     return [tuple(table.keys[i] for i in group) for group in groups]
 
 
-def certain(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
+def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
     """Return the mechanism with these keys fixed at their nominal values; the others vary as before."""
     uncertainty = {key: entry for key, entry in mechanism.uncertainty.items() if key not in keys}
     table = mechanism.correlation
-    rest = table and remaining(table.keys, table.matrix, keys)
+    rest = table and remove_keys(table.keys, table.matrix, keys)
     return msgspec.structs.replace(
         mechanism,
         uncertainty=uncertainty,
@@ -82,7 +85,7 @@ def certain(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
     )
 
 
-def remaining(
+def remove_keys(
     keys: Sequence[str], matrix: Sequence[Sequence[Any]], gone: Collection[str]
 ) -> tuple[list[str], list[list[Any]]] | None:
     """Return keys and lower triangle of the matrix without the keys `gone`, or None if no key remains."""
@@ -103,10 +106,10 @@ def check_correlation(mechanism: AnyMechanism) -> None:
     for index, key in enumerate(table.keys):
         where = ("correlation", "keys", index)
         if key not in uncertain:
-            allowed = f"a key of [uncertainty]{close_match(key, uncertain)}, or no correlation"
-            raise KeyProblem(where, shown(key), allowed)
+            allowed = f"a key of [uncertainty]{suggest_names(key, uncertain)}, or no correlation"
+            raise KeyProblem(where, format_value(key), allowed)
         if key in table.keys[:index]:
-            raise KeyProblem(where, f"{shown(key)} once more", "each key once")
+            raise KeyProblem(where, f"{format_value(key)} once more", "each key once")
     if len(table.matrix) != len(table.keys):
         raise KeyProblem(
             ("correlation", "matrix"), f"{len(table.matrix)} rows", f"{len(table.keys)}, one a key"
@@ -117,15 +120,15 @@ def check_correlation(mechanism: AnyMechanism) -> None:
             allowed = f"{index + 1}: the matrix up to its diagonal"
             raise KeyProblem(path, f"{len(row)} entries", allowed)
         if row[-1] != 1.0:
-            raise KeyProblem((*path, index), shown(row[-1]), "1 on the diagonal")
-    least = float(np.linalg.eigvalsh(_matrix(table))[0])
-    if not least > LEAST_EIGENVALUE:
+            raise KeyProblem((*path, index), format_value(row[-1]), "1 on the diagonal")
+    least = float(np.linalg.eigvalsh(_full_matrix(table))[0])
+    if not least > MIN_EIGENVALUE:
         found = f"a least eigenvalue of {least:.3g}"
-        allowed = f"a positive definite matrix, with one > {LEAST_EIGENVALUE:g}"
+        allowed = f"a positive definite matrix, with one > {MIN_EIGENVALUE:g}"
         raise KeyProblem(("correlation", "matrix"), found, allowed)
 
 
-def _matrix(table: Correlation) -> np.ndarray:
+def _full_matrix(table: Correlation) -> np.ndarray:
     """Return the full symmetric matrix (keys, keys)."""
     matrix = np.zeros((len(table.keys), len(table.keys)))
     for index, row in enumerate(table.matrix):
@@ -133,7 +136,7 @@ def _matrix(table: Correlation) -> np.ndarray:
     return matrix
 
 
-def _factor(matrix: np.ndarray) -> np.ndarray:
+def _cholesky_factor(matrix: np.ndarray) -> np.ndarray:
     """Return the Cholesky factor L; it uses the same operations on every machine, so that draws repeat."""
     factor = np.zeros_like(matrix)
     for row in range(len(matrix)):

@@ -17,45 +17,45 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism import rules as mechanism_rules
-from jaxhil.mechanism.conversion import KeyProblem, close_match, to_mechanism, to_struct
+from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_mechanism, to_struct
 from jaxhil.mechanism.overrides import apply_override, parse_override
-from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism, is_six_axes
-from jaxhil.mechanism.six_axes_rules import check_legs, check_named, check_six_axes
+from jaxhil.mechanism.six_axes import SIX_AXIS_SCHEMA, SixAxisMechanism, is_six_axes
+from jaxhil.mechanism.six_axes_rules import check_contact_names, check_leg_values, check_six_axes
 from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
 
 __all__ = [
-    "DEFAULT",
+    "DEFAULT_MECHANISM",
     "AnyMechanism",
-    "LoadedAny",
+    "LoadedAnyMechanism",
     "LoadedMechanism",
-    "any_from_builtins",
+    "any_from_plain_data",
     "builtin_names",
     "builtin_path",
-    "from_builtins",
+    "from_plain_data",
     "load",
     "load_any",
     "six_axis_names",
     "source_sha256",
     "suite_names",
-    "to_builtins",
+    "to_plain_data",
 ]
 
-DEFAULT = "varying"
+DEFAULT_MECHANISM = "varying"
 
 Overrides = Sequence[str] | Mapping[str, Any]
 AnyMechanism = Mechanism | SixAxisMechanism
-Kind = TypeVar("Kind", Mechanism, AnyMechanism)
+MechanismType = TypeVar("MechanismType", Mechanism, AnyMechanism)
 
-SUITE = "suite-"  # prefix of the names of the standard suites
+SUITE_PREFIX = "suite-"  # prefix of the names of the standard suites
 
-_UNLIMITED = [math.inf] * 6  # default of keys with six limits
-_sources: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
+_SIX_INFINITIES = [math.inf] * 6  # default of keys with six limits
+_file_hashes: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
 
-_FOLDER = Path(__file__).parent / "builtin"
-_SIX_AXES = _FOLDER / "six_axes"
+_BUILTIN_FOLDER = Path(__file__).parent / "builtin"
+_SIX_AXIS_FOLDER = _BUILTIN_FOLDER / "six_axes"
 
 
 class LoadedMechanism(NamedTuple):
@@ -66,7 +66,7 @@ class LoadedMechanism(NamedTuple):
     label: str  # printable name of the file, for messages
 
 
-class LoadedAny(NamedTuple):
+class LoadedAnyMechanism(NamedTuple):
     """Validated mechanism with one axis or with six; fields as in `LoadedMechanism`."""
 
     mechanism: AnyMechanism
@@ -90,25 +90,29 @@ def load(
     Raises:
         InputError: if the file or a change is wrong, or the mechanism has six axes.
     """
-    raw, sha256, label = _read(path_or_name)
-    return LoadedMechanism(_registered(from_builtins(raw, label, overrides, unset), sha256), sha256, label)
+    raw, sha256, label = _read_table(path_or_name)
+    return LoadedMechanism(
+        _store_file_hash(from_plain_data(raw, label, overrides, unset), sha256), sha256, label
+    )
 
 
 def load_any(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
-) -> LoadedAny:
+) -> LoadedAnyMechanism:
     """Load a mechanism with one axis or with six, as `load` does."""
-    raw, sha256, label = _read(path_or_name)
-    return LoadedAny(_registered(any_from_builtins(raw, label, overrides, unset), sha256), sha256, label)
+    raw, sha256, label = _read_table(path_or_name)
+    return LoadedAnyMechanism(
+        _store_file_hash(any_from_plain_data(raw, label, overrides, unset), sha256), sha256, label
+    )
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
     """Return the SHA-256 (hex) of the file from which an equal mechanism was read, else of its content."""
     content = _content_sha256(mechanism)
-    return _sources.get(content, content)
+    return _file_hashes.get(content, content)
 
 
-def from_builtins(
+def from_plain_data(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> Mechanism:
     """Return the validated one-axis mechanism of plain data, such as a parsed TOML or JSON table.
@@ -118,42 +122,44 @@ def from_builtins(
     """
     if is_six_axes(raw):
         allowed = f"{SCHEMA}: six axes are known to init, mechanisms, simulate, tune, sweep and report"
-        raise InputError(f"{one_line(label)}: schema: found {SCHEMA_SIX}, six axes, allowed {allowed}")
-    mechanism = any_from_builtins(raw, label, overrides, unset)
+        raise InputError(
+            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA}, six axes, expected {allowed}"
+        )
+    mechanism = any_from_plain_data(raw, label, overrides, unset)
     assert isinstance(mechanism, Mechanism)
     return mechanism
 
 
-def any_from_builtins(
+def any_from_plain_data(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> AnyMechanism:
-    """Return the validated mechanism of plain data with one axis or with six, as `from_builtins` does."""
-    changed, label = raw, one_line(label)
-    all_changes = _changes(overrides, unset)
+    """Return the validated mechanism of plain data with one axis or with six, as `from_plain_data` does."""
+    changed, label = raw, to_one_line(label)
+    all_changes = _requested_changes(overrides, unset)
     for option, changes in all_changes.items():
         for change in changes:
             try:
                 changed = apply_override(changed, *parse_override(change))
             except KeyProblem as problem:
-                raise InputError(f"{label}: {option} {_short(change)}: {problem}") from None
+                raise InputError(f"{label}: {option} {_format_change(change)}: {problem}") from None
     try:
-        return _validated(changed)
+        return _validate(changed)
     except KeyProblem as problem:
-        options = "" if str(problem) == _problem_of(raw) else _listed(all_changes)
+        options = "" if str(problem) == _find_problem(raw) else _format_changes(all_changes)
         raise InputError(f"{label}{options}: {problem}") from None
 
 
-def to_builtins(mechanism: AnyMechanism) -> dict[str, Any]:
-    """Return the mechanism as plain data for JSON, from which `from_builtins` makes an equal mechanism.
+def to_plain_data(mechanism: AnyMechanism) -> dict[str, Any]:
+    """Return the mechanism as plain data for JSON, from which `from_plain_data` makes an equal mechanism.
 
     Keys without a value and infinite numbers, both defaults of their keys, are omitted.
     """
-    return _without_empty(msgspec.to_builtins(mechanism))
+    return _drop_empty(msgspec.to_builtins(mechanism))
 
 
 def builtin_names() -> list[str]:
     """Return the names of the built-in one-axis mechanisms, without the standard suites."""
-    return [name for name in _names() if not name.startswith(SUITE)]
+    return [name for name in _builtin_paths() if not name.startswith(SUITE_PREFIX)]
 
 
 def suite_names() -> list[str]:
@@ -161,12 +167,12 @@ def suite_names() -> list[str]:
 
     They are built-in mechanism files of one rig, each with one difficulty, for comparing compensators.
     """
-    return [name for name in _names() if name.startswith(SUITE)]
+    return [name for name in _builtin_paths() if name.startswith(SUITE_PREFIX)]
 
 
 def six_axis_names() -> list[str]:
     """Return the names of the built-in six-axis mechanisms."""
-    return sorted(path.stem for path in _SIX_AXES.glob("*.toml"))
+    return sorted(path.stem for path in _SIX_AXIS_FOLDER.glob("*.toml"))
 
 
 def builtin_path(name: str) -> Path:
@@ -174,76 +180,78 @@ def builtin_path(name: str) -> Path:
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if name not in names:
         raise InputError(
-            f"{one_line(name)}: found no built-in mechanism of this name, "
-            f"allowed {', '.join(names)}{close_match(name, names)}"
+            f"{to_one_line(name)}: found no built-in mechanism of this name, "
+            f"expected {', '.join(names)}{suggest_names(name, names)}"
         )
-    return (_SIX_AXES if name in six_axis_names() else _FOLDER) / f"{name}.toml"
+    return (_SIX_AXIS_FOLDER if name in six_axis_names() else _BUILTIN_FOLDER) / f"{name}.toml"
 
 
-def _read(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
+def _read_table(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
     """Return the table of a file, the SHA-256 of its bytes, and its printable name."""
-    name = DEFAULT if path_or_name is None else path_or_name
+    name = DEFAULT_MECHANISM if path_or_name is None else path_or_name
     if isinstance(name, str) and name in (*builtin_names(), *suite_names(), *six_axis_names()):
         path, label = builtin_path(name), name
     else:
-        path, label = Path(name), one_line(str(name)) or "''"
+        path, label = Path(name), to_one_line(str(name)) or "''"
     try:
         data = read_bytes(path, label, "a mechanism")
     except FileNotFoundError:
-        raise _missing(label) from None
+        raise _make_missing_error(label) from None
     return parse_toml(data, label, "a mechanism"), hashlib.sha256(data).hexdigest(), label
 
 
-def _registered(mechanism: Kind, sha256: str) -> Kind:
+def _store_file_hash(mechanism: MechanismType, sha256: str) -> MechanismType:
     """Store the SHA-256 of the mechanism's file for `source_sha256`, and return the mechanism."""
-    _sources[_content_sha256(mechanism)] = sha256
+    _file_hashes[_content_sha256(mechanism)] = sha256
     return mechanism
 
 
 def _content_sha256(mechanism: AnyMechanism) -> str:
-    content = json.dumps(to_builtins(mechanism), sort_keys=True, separators=(",", ":"))
+    content = json.dumps(to_plain_data(mechanism), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def _names() -> list[str]:
-    return sorted(path.stem for path in _FOLDER.glob("*.toml"))
+def _builtin_paths() -> list[str]:
+    return sorted(path.stem for path in _BUILTIN_FOLDER.glob("*.toml"))
 
 
-def _missing(label: str) -> InputError:
+def _make_missing_error(label: str) -> InputError:
     """Return the error for a file that does not exist."""
     names = [*builtin_names(), *six_axis_names()]
-    hint = close_match(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
-    return InputError(f"{label}: found no such file, allowed a mechanism file{hint}")
+    hint = suggest_names(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
+    return InputError(f"{label}: found no such file, expected a mechanism file{hint}")
 
 
-def _validated(raw: Mapping[str, Any]) -> AnyMechanism:
+def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
     """Return the validated mechanism of a raw table. Raise `KeyProblem`."""
     if is_six_axes(raw):
-        check_named(raw)
+        check_contact_names(raw)
         six_axis_mechanism = to_struct(SixAxisMechanism, raw)
-        check_legs(raw)
+        check_leg_values(raw)
         check_six_axes(six_axis_mechanism)
         return six_axis_mechanism
     if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:
-        raise KeyProblem(("schema",), shown(raw["schema"]), f"{SCHEMA}, or {SCHEMA_SIX} of six axes")
+        raise KeyProblem(
+            ("schema",), format_value(raw["schema"]), f"{SCHEMA}, or {SIX_AXIS_SCHEMA} of six axes"
+        )
     if isinstance(raw, Mapping) and {"target", "chaser"} <= set(raw):
-        found = f"{shown(raw['schema'])} beside" if "schema" in raw else "nothing beside"
-        raise KeyProblem(("schema",), f"{found} target and chaser", f"{SCHEMA_SIX}, of six axes")
+        found = f"{format_value(raw['schema'])} beside" if "schema" in raw else "nothing beside"
+        raise KeyProblem(("schema",), f"{found} target and chaser", f"{SIX_AXIS_SCHEMA}, of six axes")
     mechanism = to_mechanism(raw)
-    mechanism_rules.check(mechanism)
+    mechanism_rules.check_mechanism_rules(mechanism)
     return mechanism
 
 
-def _problem_of(raw: Mapping[str, Any]) -> str:
+def _find_problem(raw: Mapping[str, Any]) -> str:
     """Return the message about a raw table's first problem, or an empty text."""
     try:
-        _validated(raw)
+        _validate(raw)
     except KeyProblem as problem:
         return str(problem)
     return ""
 
 
-def _changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
+def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
     """Return the requested changes by the name of the command's option or of the function's argument."""
     is_mapping = isinstance(overrides, Mapping)
     return {
@@ -252,25 +260,27 @@ def _changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]
     }
 
 
-def _listed(all_changes: Mapping[str, Sequence[Any]]) -> str:
+def _format_changes(all_changes: Mapping[str, Sequence[Any]]) -> str:
     """Return the first three changes of each option as a text for a message."""
     options = [
-        " ".join([option, *map(_short, changes[:3]), *["..."][: len(changes) > 3]])
+        " ".join([option, *map(_format_change, changes[:3]), *["..."][: len(changes) > 3]])
         for option, changes in all_changes.items()
         if changes
     ]
     return f": {' '.join(options)}" if options else ""
 
 
-def _short(change: object) -> str:
+def _format_change(change: object) -> str:
     """Return a change's text, or its key if it is a pair of key and value."""
     text = change[0] if isinstance(change, tuple) else change
-    return one_line(text, 60) if isinstance(text, str) else shown(text)
+    return to_one_line(text, 60) if isinstance(text, str) else format_value(text)
 
 
-def _without_empty(value: Any) -> Any:
+def _drop_empty(value: Any) -> Any:
     """Return plain data without keys that have no value or infinite numbers."""
     if isinstance(value, dict):
-        entries = {key: _without_empty(entry) for key, entry in value.items()}
-        return {key: entry for key, entry in entries.items() if entry not in (None, math.inf, _UNLIMITED)}
+        entries = {key: _drop_empty(entry) for key, entry in value.items()}
+        return {
+            key: entry for key, entry in entries.items() if entry not in (None, math.inf, _SIX_INFINITIES)
+        }
     return value

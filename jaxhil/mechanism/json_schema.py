@@ -10,23 +10,26 @@ from typing import Any
 
 import msgspec
 
-from jaxhil.contact.laws import LAWS
-from jaxhil.mechanism.conversion import NUMBER_FOR_LIST
-from jaxhil.mechanism.six_axes import SCHEMA_SIX, SixAxisMechanism
+from jaxhil.contact.laws import CONTACT_LAWS
+from jaxhil.mechanism.conversion import SCALAR_LIST_KEYS
+from jaxhil.mechanism.six_axes import SIX_AXIS_SCHEMA, SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism, numeric_keys
 
-__all__ = ["json_schema"]
+__all__ = ["build_json_schema"]
 
-SIX = "SixAxes."  # prefix of the names of six-axis tables
+SIX_AXIS_PREFIX = "SixAxes."  # prefix of the names of six-axis tables
 
 
-def json_schema() -> dict[str, Any]:
+def build_json_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) as plain data, with the registered contact laws.
 
     A file's key `schema` selects the one-axis or the six-axis tables.
     """
-    has_six_axes = {"properties": {"schema": {"const": SCHEMA_SIX}}, "required": ["schema"]}
-    kinds = {"then": {"$ref": f"#/$defs/{SIX}SixAxisMechanism"}, "else": {"$ref": "#/$defs/Mechanism"}}
+    has_six_axes = {"properties": {"schema": {"const": SIX_AXIS_SCHEMA}}, "required": ["schema"]}
+    kinds = {
+        "then": {"$ref": f"#/$defs/{SIX_AXIS_PREFIX}SixAxisMechanism"},
+        "else": {"$ref": "#/$defs/Mechanism"},
+    }
     tables = {**_one_axis(), **_six_axes()}
     draft = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": draft, "if": has_six_axes, **kinds, "$defs": tables}
@@ -35,7 +38,7 @@ def json_schema() -> dict[str, Any]:
 def _one_axis() -> dict[str, Any]:
     """Return the one-axis tables; some lists may also be a single number."""
     tables = _tables(Mechanism)
-    for table, name in NUMBER_FOR_LIST:
+    for table, name in SCALAR_LIST_KEYS:
         properties = tables[table.capitalize()]["properties"]
         entry = properties[name]["items"]
         number = entry["anyOf"][0] if "anyOf" in entry else entry
@@ -47,41 +50,45 @@ def _one_axis() -> dict[str, Any]:
 
 def _six_axes() -> dict[str, Any]:
     """Return the six-axis tables, with a prefix because one-axis tables have the same names."""
-    return {f"{SIX}{name}": _renamed(table) for name, table in _tables(SixAxisMechanism).items()}
+    return {
+        f"{SIX_AXIS_PREFIX}{name}": _add_prefix(table) for name, table in _tables(SixAxisMechanism).items()
+    }
 
 
 def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
     """Return the schema of each table of a struct type, by name."""
-    tables = {name: _tidy(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
-    tables["Contact"]["properties"]["law"]["enum"] = list(LAWS)
+    tables = {name: _clean_schema(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
+    tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
     return tables
 
 
-def _renamed(node: Any) -> Any:
+def _add_prefix(node: Any) -> Any:
     """Return a schema whose references to tables have the six-axis prefix."""
     if isinstance(node, list):
-        return [_renamed(entry) for entry in node]
+        return [_add_prefix(entry) for entry in node]
     if not isinstance(node, dict):
         return node
     root = "#/$defs/"
     return {
-        key: value.replace(root, root + SIX) if key == "$ref" and isinstance(value, str) else _renamed(value)
+        key: value.replace(root, root + SIX_AXIS_PREFIX)
+        if key == "$ref" and isinstance(value, str)
+        else _add_prefix(value)
         for key, value in node.items()
     }
 
 
-def _tidy(node: Any) -> Any:
+def _clean_schema(node: Any) -> Any:
     """Return a schema with units in the descriptions, without null values and infinite defaults.
 
     TOML has no null, and JSON has no infinite numbers.
     """
     if isinstance(node, list):
-        return [_tidy(entry) for entry in node]
+        return [_clean_schema(entry) for entry in node]
     if not isinstance(node, dict):
         return node
     if "six" in node or "square" in node:
-        return _with_short_forms(node)
-    tidied = {key: _tidy(value) for key, value in node.items() if key not in ("unit", "default")}
+        return _add_short_forms(node)
+    tidied = {key: _clean_schema(value) for key, value in node.items() if key not in ("unit", "default")}
     if (unit := node.get("unit")) not in (None, "", "1"):
         tidied["description"] += f" [{unit}]"
     default = node.get("default")
@@ -94,9 +101,11 @@ def _tidy(node: Any) -> Any:
     return tidied
 
 
-def _with_short_forms(node: dict[str, Any]) -> dict[str, Any]:
+def _add_short_forms(node: dict[str, Any]) -> dict[str, Any]:
     """Return the schema of six numbers or of a matrix, extended by the forms with one or two numbers."""
-    full = _tidy({key: value for key, value in node.items() if key not in ("six", "square", "description")})
+    full = _clean_schema(
+        {key: value for key, value in node.items() if key not in ("six", "square", "description")}
+    )
     number = full["items"]["items"] if "square" in node else full["items"]
     forms = [number]
     if names := node.get("six"):

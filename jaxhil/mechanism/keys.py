@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import NODEFAULT, inspect
 
-from jaxhil.contact.laws import KEYS, LAWS, laws_with
-from jaxhil.mechanism.conversion import allowed_of
+from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, laws_with_key
+from jaxhil.mechanism.conversion import describe_allowed
 from jaxhil.mechanism.rules import KEYS_OF_MODELS
 from jaxhil.mechanism.structs import Mechanism
 
-__all__ = ["Key", "Table", "tables"]
+__all__ = ["KeyDescription", "TableDescription", "describe_tables"]
 
 
-class Key(NamedTuple):
+class KeyDescription(NamedTuple):
     """Key of a table."""
 
     name: str
@@ -32,23 +32,23 @@ class Key(NamedTuple):
     users: tuple[str, ...]  # contact laws or motion simulator models that use the key; () if all do
 
 
-class Table(NamedTuple):
+class TableDescription(NamedTuple):
     """Table of a mechanism file."""
 
     path: str  # dotted path; '' for the head of the file
     meaning: str  # description
-    keys: tuple[Key, ...]
+    keys: tuple[KeyDescription, ...]
 
 
-def tables(kind: type[msgspec.Struct] = Mechanism) -> tuple[Table, ...]:
+def describe_tables(kind: type[msgspec.Struct] = Mechanism) -> tuple[TableDescription, ...]:
     """Return the tables of a struct, each before its subtables; `"KEY"` stands for any key of a dictionary.
 
     Raise ValueError for a key without a description, or a number without a unit.
     """
-    return tuple(_tables(inspect.type_info(kind), ""))
+    return tuple(_describe_tables(inspect.type_info(kind), ""))
 
 
-def _tables(kind: inspect.Type, path: str) -> Iterator[Table]:
+def _describe_tables(kind: inspect.Type, path: str) -> Iterator[TableDescription]:
     """Yield the table of a struct type at a path, then its subtables."""
     assert isinstance(kind, inspect.StructType)
     keys, subtables = [], []
@@ -56,14 +56,14 @@ def _tables(kind: inspect.Type, path: str) -> Iterator[Table]:
         key_path = f"{path}.{field.encode_name}".lstrip(".")
         inner = _table_of(field.type)
         if inner is None:
-            keys.append(_key(field, key_path))
+            keys.append(_describe_key(field, key_path))
         elif isinstance(inner, inspect.DictType):
             subtables.append((inner.value_type, f'{key_path}."KEY"'))
         else:
             subtables.append((inner, key_path))
-    yield Table(path, _first_paragraph(kind), tuple(keys))
+    yield TableDescription(path, _first_paragraph(kind), tuple(keys))
     for inner, key_path in subtables:
-        yield from _tables(inner, key_path)
+        yield from _describe_tables(inner, key_path)
 
 
 def _first_paragraph(kind: inspect.StructType) -> str:
@@ -84,30 +84,35 @@ def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | Non
             return None
 
 
-def _key(field: inspect.Field, path: str) -> Key:
+def _describe_key(field: inspect.Field, path: str) -> KeyDescription:
     """Return the description of the key at a path. Raise ValueError if it is incomplete."""
-    meaning = next(_meanings(field.type), "")
+    meaning = next(_find_descriptions(field.type), "")
     if not meaning:
         raise ValueError(f"{path}: its type does not say what it means")
     default = None if field.default is NODEFAULT else field.default
     if field.default_factory is not NODEFAULT:
         default = field.default_factory()
-    return Key(
-        field.encode_name, meaning, _unit(field.type, path), allowed_of(field.type), field.required, default,
-        _users(path),
-    )  # fmt: skip
+    return KeyDescription(
+        field.encode_name,
+        meaning,
+        _unit(field.type, path),
+        describe_allowed(field.type),
+        field.required,
+        default,
+        _find_users(path),
+    )
 
 
-def _meanings(kind: inspect.Type) -> Iterator[str]:
+def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
     """Yield the descriptions of a type, the outermost first."""
     match kind:
         case inspect.Metadata(type=inner, extra_json_schema=schema):
             if schema and schema.get("description"):
                 yield schema["description"]
-            yield from _meanings(inner)
+            yield from _find_descriptions(inner)
         case inspect.UnionType(types=members):
             for member in members:
-                yield from _meanings(member)
+                yield from _find_descriptions(member)
         case _:
             return
 
@@ -129,13 +134,13 @@ def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None)
             return None
 
 
-def _users(path: str) -> tuple[str, ...]:
+def _find_users(path: str) -> tuple[str, ...]:
     """Return the contact laws or motion simulator models that use the key at a path; () for all."""
     table, _, name = path.rpartition(".")
     if table == "contact":
         if name == "damping":
-            return tuple(law.name for law in LAWS.values() if not law.dissipates_by)
-        return laws_with(KEYS[name]) if name in KEYS else ()
+            return tuple(law.name for law in CONTACT_LAWS.values() if not law.dissipates_by)
+        return laws_with_key(CONTACT_KEYS[name]) if name in CONTACT_KEYS else ()
     if table == "rig.simulator":
         return tuple(model for model, keys in KEYS_OF_MODELS.items() if name in keys)
     return ()

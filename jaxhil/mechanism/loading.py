@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism import file
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
@@ -15,7 +15,7 @@ __all__ = ["as_any_mechanism", "as_mechanism", "load"]
 
 
 def load(
-    name_or_path: str | os.PathLike[str] = file.DEFAULT, overrides: Mapping[str, Any] | None = None
+    name_or_path: str | os.PathLike[str] = file.DEFAULT_MECHANISM, overrides: Mapping[str, Any] | None = None
 ) -> Any:
     """Load a mechanism from a TOML file, or a built-in one.
 
@@ -37,7 +37,9 @@ def load(
         0.003
     """
     if not (overrides is None or isinstance(overrides, Mapping)):
-        raise InputError(f"overrides: found {shown(overrides)}, allowed a dict from dotted paths to values")
+        raise InputError(
+            f"overrides: found {format_value(overrides)}, expected a dict from dotted paths to values"
+        )
     return file.load_any(_source(name_or_path), overrides or {}).mechanism
 
 
@@ -46,14 +48,14 @@ def as_mechanism(given: object) -> Mechanism:
     if not isinstance(given, (Mechanism, SixAxisMechanism)):
         return file.load(_source(given)).mechanism
     # Structs do not validate their fields: a mechanism that was not read from a file is unchecked.
-    return file.from_builtins(file.to_builtins(given), f"mechanism {shown(given.name)}")
+    return file.from_plain_data(file.to_plain_data(given), f"mechanism {format_value(given.name)}")
 
 
 def as_any_mechanism(given: object) -> file.AnyMechanism:
     """Validate a mechanism with one axis or with six, or load that of a name or path. Raise `InputError`."""
     if not isinstance(given, (Mechanism, SixAxisMechanism)):
         return file.load_any(_source(given)).mechanism
-    return file.any_from_builtins(file.to_builtins(given), f"mechanism {shown(given.name)}")
+    return file.any_from_plain_data(file.to_plain_data(given), f"mechanism {format_value(given.name)}")
 
 
 def _source(argument: object) -> str | os.PathLike[str]:
@@ -61,4 +63,4 @@ def _source(argument: object) -> str | os.PathLike[str]:
     if isinstance(argument, (str, os.PathLike)) and isinstance(os.fspath(argument), str):
         return argument
     allowed = "a Mechanism, the name of a built-in one or a path"
-    raise InputError(f"mechanism: found {shown(argument)}, allowed {allowed}")
+    raise InputError(f"mechanism: found {format_value(argument)}, expected {allowed}")

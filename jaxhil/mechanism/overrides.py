@@ -12,73 +12,80 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, Path, close_match, dotted, entry_count, step_into
-from jaxhil.mechanism.correlation import remaining
-from jaxhil.mechanism.six_axes import is_six_axes, numeric_keys_beside, six_axis_type
-from jaxhil.mechanism.structs import MAX_CONTACTS, Range, numeric_keys, schema_type
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import (
+    KeyPath,
+    KeyProblem,
+    find_member_type,
+    format_entry_count,
+    format_key_path,
+    suggest_names,
+)
+from jaxhil.mechanism.correlation import remove_keys
+from jaxhil.mechanism.six_axes import is_six_axes, numeric_keys_with, six_axis_type
+from jaxhil.mechanism.structs import MAX_CONTACTS, Range, mechanism_type, numeric_keys
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
 
 _EXAMPLE = "PATH=VALUE, such as approach.velocity=0.01"
 _EXAMPLE_KEY = "a dotted path, such as 'approach.velocity' or 'contact.stiffness[1]'"
-_PART = re.compile(r"""\s*("(?:[^"\\]|\\.)*"|'[^']*'|[A-Za-z0-9_-]+)\s*""")
-_INDEX = re.compile(r"\[\s*([0-9]{1,6})\s*\]\s*")
-_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
-_MAX_LENGTH = 100_000
+_KEY_PATTERN = re.compile(r"""\s*("(?:[^"\\]|\\.)*"|'[^']*'|[A-Za-z0-9_-]+)\s*""")
+_INDEX_PATTERN = re.compile(r"\[\s*([0-9]{1,6})\s*\]\s*")
+_WORD_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+_MAX_OVERRIDE_LENGTH = 100_000
 
 
-def parse_override(override: str | tuple[object, Any]) -> tuple[Path, Any]:
+def parse_override(override: str | tuple[object, Any]) -> tuple[KeyPath, Any]:
     """Return path and value of a ``PATH=VALUE`` text, or of a pair (PATH, value). Raise `KeyProblem`."""
     if not isinstance(override, str):
         key, value = override
-        return parse_key(key), _plain(value)
+        return parse_key(key), _to_python(value)
     return _parse_text(override)
 
 
-def parse_key(key: object) -> Path:
+def parse_key(key: object) -> KeyPath:
     """Return the path that a dotted key names. Raise `KeyProblem`."""
     if isinstance(key, str):
         path, end = _parse_path(f"{key}=", key)
         if end == len(key) + 1:
             return path
-    raise KeyProblem((), shown(key), _EXAMPLE_KEY)
+    raise KeyProblem((), format_value(key), _EXAMPLE_KEY)
 
 
-def _plain(value: Any) -> Any:
+def _to_python(value: Any) -> Any:
     """Return a value with the numbers and arrays of NumPy and JAX converted to those of Python."""
     if isinstance(value, (list, tuple)):
         if len(value) > MAX_CONTACTS:
             return value  # validation rejects it for its length, so that its entries do not matter
-        return [_plain(entry) for entry in value]
+        return [_to_python(entry) for entry in value]
     if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _to_python(entry) for key, entry in value.items()}
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def _parse_text(text: str) -> tuple[Path, Any]:
+def _parse_text(text: str) -> tuple[KeyPath, Any]:
     """Return path and value of a ``PATH=VALUE`` text. Raise `KeyProblem`."""
     path, position = _parse_path(text)
     written = text[position:].strip()
-    if len(written) > _MAX_LENGTH:
-        raise KeyProblem(path, f"{len(written)} characters", f"at most {_MAX_LENGTH}")
+    if len(written) > _MAX_OVERRIDE_LENGTH:
+        raise KeyProblem(path, f"{len(written)} characters", f"at most {_MAX_OVERRIDE_LENGTH}")
     try:
         table = tomllib.loads(f"value = {written}")
     except RecursionError:
         raise KeyProblem(path, "values nested too deeply", "a TOML value") from None
     except ValueError:
-        if _WORD.fullmatch(written):
+        if _WORD_PATTERN.fullmatch(written):
             return path, written
-        found = shown(written) if written else "nothing after ="
+        found = format_value(written) if written else "nothing after ="
         raise KeyProblem(
             path, found, 'a TOML value, such as 0.5, [1.0, 2.0], "text" or a bare word'
         ) from None
     if list(table) != ["value"]:
-        raise KeyProblem(path, shown(written), "one TOML value")
+        raise KeyProblem(path, format_value(written), "one TOML value")
     return path, table["value"]
 
 
-def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, Any]:
+def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[str, Any]:
     """Return a copy of a raw table with a new value at `path`; missing tables on the path are created.
 
     The value None removes the key, and the entries of ``[uncertainty]`` and ``[correlation]`` for it and for
@@ -86,50 +93,52 @@ def apply_override(raw: Mapping[str, Any], path: Path, value: Any) -> dict[str, 
     to remove does not exist.
     """
     has_six_axes = is_six_axes(raw)
-    kind = six_axis_type() if has_six_axes else schema_type()
+    kind = six_axis_type() if has_six_axes else mechanism_type()
     for depth, part in enumerate(path):
         try:
-            kind = step_into(kind, part, path[:depth])
+            kind = find_member_type(kind, part, path[:depth])
         except KeyProblem as problem:
-            hint = close_match(dotted(path), _numeric_keys(raw) if has_six_axes else numeric_keys())
+            hint = suggest_names(
+                format_key_path(path), _numeric_keys(raw) if has_six_axes else numeric_keys()
+            )
             if hint and "did you mean" not in problem.allowed:
                 problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
             raise problem from None
-    return _removed(raw, path) if value is None else _replaced(raw, path, 0, value)
+    return _remove_key(raw, path) if value is None else _replace_value(raw, path, 0, value)
 
 
 def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
     """Return the numeric keys of a raw six-axis table, with their ranges."""
     tables = (raw.get(key) for key in ("contact", "latch"))
-    return numeric_keys_beside(*(tuple(map(str, t)) if isinstance(t, Mapping) else () for t in tables))
+    return numeric_keys_with(*(tuple(map(str, t)) if isinstance(t, Mapping) else () for t in tables))
 
 
-def _parse_path(text: str, key: str | None = None) -> tuple[Path, int]:
+def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
     """Return the path before ``=`` and the position after it; messages show `key` if it is not None."""
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
     while True:
-        part = _PART.match(text, position)
+        part = _KEY_PATTERN.match(text, position)
         if part is None or len(path) > 16:
-            raise KeyProblem((), shown(source), example)
+            raise KeyProblem((), format_value(source), example)
         word = part.group(1)
         try:
             path.append(next(iter(tomllib.loads(f"{word} = 0"))))
         except ValueError:
-            raise KeyProblem((), shown(source), example) from None
+            raise KeyProblem((), format_value(source), example) from None
         position = part.end()
-        while index := _INDEX.match(text, position):
+        while index := _INDEX_PATTERN.match(text, position):
             path.append(int(index.group(1)))
             position = index.end()
         if text[position : position + 1] == "=":
             return tuple(path), position + 1
         if text[position : position + 1] != ".":
-            raise KeyProblem((), shown(source), example)
+            raise KeyProblem((), format_value(source), example)
         position += 1
 
 
-def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
+def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
     """Return a copy of a node at `path[:depth]` with a new value at `path`. Raise `KeyProblem`."""
     if depth == len(path):
         return value
@@ -138,35 +147,35 @@ def _replaced(node: Any, path: Path, depth: int, value: Any) -> Any:
         # A bare number stands for a list of one entry.
         entries = list(node) if isinstance(node, (list, tuple)) else [node]
         if node is None or part >= len(entries):
-            found = "no list to change" if node is None else entry_count(entries)
+            found = "no list to change" if node is None else format_entry_count(entries)
             raise KeyProblem(path[: depth + 1], found, "an index into the list, or a whole list")
-        entries[part] = _replaced(entries[part], path, depth + 1, value)
+        entries[part] = _replace_value(entries[part], path, depth + 1, value)
         return entries
     if not isinstance(node, Mapping):
-        raise KeyProblem(path[:depth], shown(node), "a table")
+        raise KeyProblem(path[:depth], format_value(node), "a table")
     missing = {} if depth + 1 < len(path) and isinstance(path[depth + 1], str) else None
-    return {**node, part: _replaced(node.get(part, missing), path, depth + 1, value)}
+    return {**node, part: _replace_value(node.get(part, missing), path, depth + 1, value)}
 
 
-def _removed(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def _remove_key(raw: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
     """Return a raw table without the key at `path` and its uncertainty and correlation."""
-    changed, key = _without(raw, path, 0), dotted(path)
+    changed, key = _remove_from_table(raw, path, 0), format_key_path(path)
     if isinstance(table := changed.get("uncertainty"), Mapping):
         entries = {name: entry for name, entry in table.items() if not f"{name}.".startswith(f"{key}.")}
         changed["uncertainty"] = entries
     certain = [
         name for name in raw.get("uncertainty") or () if name not in (changed.get("uncertainty") or ())
     ]
-    return _uncorrelated(changed, certain)
+    return _remove_correlations(changed, certain)
 
 
-def _uncorrelated(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
+def _remove_correlations(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
     """Return a raw table without the correlations of the keys that are now `certain`."""
     table = raw.get("correlation")
     if not certain or table is None:
         return raw
     try:
-        correlation = remaining(table["keys"], table["matrix"], certain)
+        correlation = remove_keys(table["keys"], table["matrix"], certain)
     except (TypeError, LookupError):
         return raw  # The table is malformed; validation reports it later.
     others = {name: value for name, value in raw.items() if name != "correlation"}
@@ -175,7 +184,7 @@ def _uncorrelated(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
     return others | {"correlation": {**table, "keys": correlation[0], "matrix": correlation[1]}}
 
 
-def _without(node: Any, path: Path, depth: int) -> dict[str, Any]:
+def _remove_from_table(node: Any, path: KeyPath, depth: int) -> dict[str, Any]:
     """Return a copy of a table at `path[:depth]` without the key at `path`. Raise `KeyProblem`."""
     part = path[depth]
     if isinstance(path[-1], int):
@@ -183,4 +192,6 @@ def _without(node: Any, path: Path, depth: int) -> dict[str, Any]:
     if not isinstance(node, Mapping) or part not in node:
         raise KeyProblem(path, "no such key there", "a key that is there")
     others = {name: value for name, value in node.items() if name != part}
-    return others | ({str(part): _without(node[part], path, depth + 1)} if depth + 1 < len(path) else {})
+    return others | (
+        {str(part): _remove_from_table(node[part], path, depth + 1)} if depth + 1 < len(path) else {}
+    )

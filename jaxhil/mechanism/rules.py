@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.contact.keys import Key
-from jaxhil.contact.laws import KEYS, ContactLaw, contact_law, laws_with
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.laws import CONTACT_KEYS, ContactLaw, find_contact_law, laws_with_key
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
     Contact,
@@ -31,15 +31,15 @@ from jaxhil.mechanism.structs import (
 from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
 __all__ = [
-    "FIXED",
+    "FIXED_KEYS",
     "KEYS_OF_MODELS",
-    "check",
-    "check_law",
-    "check_model",
+    "check_contact_law",
+    "check_mechanism_rules",
+    "check_simulator_model",
     "check_texts",
+    "format_allowed_velocity_limit",
     "is_damped",
     "is_hurwitz",
-    "velocity_limit_allowed",
 ]
 
 # Keys that each model of the motion simulator uses and needs.
@@ -50,16 +50,16 @@ KEYS_OF_MODELS = {
     "third_order": ("coefficients",),
     "transfer_function": ("numerator", "denominator"),
 }
-_OF_SOME_MODEL = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
-FIXED = ("rig.simulator.numerator", "rig.simulator.denominator")
+_ALL_MODEL_KEYS = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
+FIXED_KEYS = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
-def check(mechanism: Mechanism) -> None:
+def check_mechanism_rules(mechanism: Mechanism) -> None:
     """Check every rule. Raise `KeyProblem` for the first violation."""
     check_texts(mechanism)
     _check_bodies(mechanism)
-    check_law(("contact",), mechanism.contact, mechanism.uncertainty, KEYS.values())
-    check_model(mechanism.rig.simulator)
+    check_contact_law(("contact",), mechanism.contact, mechanism.uncertainty, CONTACT_KEYS.values())
+    check_simulator_model(mechanism.rig.simulator)
     _check_hold(mechanism)
     spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
     check_correlation(mechanism)
@@ -89,9 +89,9 @@ def is_hurwitz(polynomial: Sequence[float]) -> bool:
 def check_texts(mechanism: Any) -> None:
     """Check that name and source are printable. Raise `KeyProblem`."""
     if not mechanism.name.isprintable():
-        raise KeyProblem(("name",), shown(mechanism.name), "printable characters")
+        raise KeyProblem(("name",), format_value(mechanism.name), "printable characters")
     if not mechanism.source.replace("\n", "").replace("\t", "").isprintable():
-        raise KeyProblem(("source",), shown(mechanism.source), "printable characters and new lines")
+        raise KeyProblem(("source",), format_value(mechanism.source), "printable characters and new lines")
 
 
 def _check_bodies(mechanism: Mechanism) -> None:
@@ -108,11 +108,11 @@ def _check_bodies(mechanism: Mechanism) -> None:
         raise KeyProblem(("bodies", key), "nothing", either)
     if not 0.0 < bodies.mass < math.inf:
         allowed = "masses whose equivalent mass is a finite number > 0"
-        raise KeyProblem(("bodies",), shown(bodies.mass), allowed)
+        raise KeyProblem(("bodies",), format_value(bodies.mass), allowed)
 
 
-def check_law(
-    path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[Key]
+def check_contact_law(
+    path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[ContactKey]
 ) -> None:
     """Check that a contact has the keys of its contact law. Raise `KeyProblem`.
 
@@ -122,23 +122,23 @@ def check_law(
         uncertainties: the file's table `[uncertainty]`.
         keys: keys that only some laws have, by their names in this schema.
     """
-    law = contact_law(contact.law)
+    law = find_contact_law(contact.law)
     _check_depths(path, law, contact.depths)
     is_list = isinstance(contact, Contact)  # A one-axis file has one entry for each successive contact.
     for i, entry in enumerate(contact.stiffness if is_list else [contact.stiffness]):
         where = (*path, "stiffness", *[i] * is_list)
         if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
             allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
-            raise KeyProblem(where, shown(entry), allowed)
+            raise KeyProblem(where, format_value(entry), allowed)
         if isinstance(entry, list) and not law.segmented:
-            raise KeyProblem(where, shown(entry), f"a number > 0 N/m (law {law.name})")
+            raise KeyProblem(where, format_value(entry), f"a number > 0 N/m (law {law.name})")
     _check_keys(path, law, contact, uncertainties, keys)
     if law.dissipates_by and is_damped(path, contact, uncertainties):
-        damping = shown(contact.damping) if np.any(contact.damping) else "an uncertain damping"
+        damping = format_value(contact.damping) if np.any(contact.damping) else "an uncertain damping"
         raise KeyProblem((*path, "damping"), damping, f"0 (law {law.name} dissipates by {law.dissipates_by})")
 
 
-def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
+def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> None:
     """Check that a segmented law has depths, and that they increase. Raise `KeyProblem`."""
     if law.segmented and not depths:
         allowed = f"a list of at least one depth (law {law.name} needs it)"
@@ -146,55 +146,55 @@ def _check_depths(path: Path, law: ContactLaw, depths: Sequence[float]) -> None:
     for i, (depth, deeper) in enumerate(pairwise(depths)):
         if deeper <= depth:
             raise KeyProblem(
-                (*path, "depths", i + 1), shown(deeper), f"a depth > the one before, {depth:g} m"
+                (*path, "depths", i + 1), format_value(deeper), f"a depth > the one before, {depth:g} m"
             )
 
 
 def _check_keys(
-    path: Path, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[Key]
+    path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[ContactKey]
 ) -> None:
     """Check that, among the `keys` that only some laws have, the contact has those of its law."""
     for key in keys:
         value = getattr(contact, key.name)
-        laws = laws_with(key)
+        laws = laws_with_key(key)
         if law.name in laws and value is None:
-            allowed = f"{allowed_at(type(contact), key.name)} (law {law.name} needs it)"
+            allowed = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
             raise KeyProblem((*path, key.name), "nothing", allowed)
         if law.keys is not None and law.name not in laws:
             only = f"only for law {' or '.join(laws)}"
             if value != key.default:
-                raise KeyProblem((*path, key.name), shown(value), f"nothing ({only})")
+                raise KeyProblem((*path, key.name), format_value(value), f"nothing ({only})")
             where = ".".join((*map(str, path), key.name))
             if where in uncertain and value not in (None, []):
                 raise KeyProblem(("uncertainty", where), f"a key {only}", "keys that the law uses")
 
 
 def is_damped(
-    path: Path, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
+    path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
 ) -> bool:
     """Return whether the key `by` of the contact is nonzero, or may be so in a random draw."""
     uncertain = uncertainties.get(".".join((*map(str, path), by)))
     return bool(np.any(getattr(contact, by))) or (uncertain is not None and uncertain.factor is None)
 
 
-def check_model(simulator: Any) -> None:
+def check_simulator_model(simulator: Any) -> None:
     """Check that the motion simulator has the keys of its model and is stable. Raise `KeyProblem`."""
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
-            allowed = f"{allowed_at(type(simulator), key)} ({simulator.model} needs it)"
+            allowed = f"{describe_allowed_at(type(simulator), key)} ({simulator.model} needs it)"
             raise KeyProblem((*path, key), "nothing", allowed)
-    for key in _OF_SOME_MODEL:
+    for key in _ALL_MODEL_KEYS:
         value = getattr(simulator, key)
         if value is not None and key not in KEYS_OF_MODELS[simulator.model]:
             allowed = f"nothing ({simulator.model} does not use it: unset it)"
-            raise KeyProblem((*path, key), shown(value), allowed)
+            raise KeyProblem((*path, key), format_value(value), allowed)
     if simulator.model == "first_order" and not np.all(simulator.time_constant):
         raise KeyProblem((*path, "time_constant"), "0.0", "a number > 0 (first_order), or ideal")
     if simulator.model == "third_order" and simulator.coefficients is not None:
         if not is_hurwitz([*reversed(simulator.coefficients), 1.0]):
             allowed = "a stable motion simulator: a1 a2 > a3"
-            raise KeyProblem((*path, "coefficients"), shown(simulator.coefficients), allowed)
+            raise KeyProblem((*path, "coefficients"), format_value(simulator.coefficients), allowed)
     if simulator.model == "transfer_function":
         _check_transfer_function(simulator.numerator or [], simulator.denominator or [])
 
@@ -208,7 +208,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
         raise KeyProblem((*path, "numerator"), found, allowed)
     if not is_hurwitz(denominator):
         allowed = "a stable motion simulator: every pole in the open left half plane"
-        raise KeyProblem((*path, "denominator"), shown(denominator), allowed)
+        raise KeyProblem((*path, "denominator"), format_value(denominator), allowed)
     if not abs(Fraction(numerator[-1]) - Fraction(denominator[-1])) <= (
         Fraction(1, 10**9) * abs(Fraction(denominator[-1]))
     ):
@@ -220,14 +220,14 @@ def _check_hold(mechanism: Mechanism) -> None:
     """Check that a damped contact has a velocity to act on. Raise `KeyProblem`."""
     # An ideal simulator with zero-order hold jumps at the ticks and has no velocity between them.
     rig, contact = mechanism.rig, mechanism.contact
-    law, arguments = contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
+    law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
     dissipates = (law.damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
         allowed = '"linear" for an ideal simulator with contact damping (or another model)'
-        raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
+        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), allowed)
 
 
-def _extremes(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
+def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
     """Return a function of a path and of 0 or 1 that gives the least or the greatest value at the path.
 
     A normal distribution has no useful bounds; the function gives the nominal value instead.
@@ -244,13 +244,13 @@ def _extremes(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str,
 def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Check that the drives can follow the approach. Raise `KeyProblem`."""
     # Drives that are slower than the approach have no steady state from which a run could start.
-    extreme, path = _extremes(mechanism, spans), "rig.simulator.velocity_limit"
+    extreme, path = _build_extreme_function(mechanism, spans), "rig.simulator.velocity_limit"
     fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
     if limit < fastest:
-        raise KeyProblem(tuple(path.split(".")), shown(limit), velocity_limit_allowed(fastest))
+        raise KeyProblem(tuple(path.split(".")), format_value(limit), format_allowed_velocity_limit(fastest))
 
 
-def velocity_limit_allowed(approach: float) -> str:
+def format_allowed_velocity_limit(approach: float) -> str:
     """Return the allowed velocity limits for an approach speed [m/s], in words."""
     return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
 
@@ -259,7 +259,7 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Check that the start of the approach lies between the two surfaces. Raise `KeyProblem`."""
     # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T); x_a lags behind by the motion
     # simulator's delay and lag and by the command latency.
-    extreme = _extremes(mechanism, spans)
+    extreme = _build_extreme_function(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
     period = extreme("rig.control_period", 1)
     delay = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period
@@ -267,12 +267,14 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     start = float(extreme("approach.velocity", 1) * (0.02 + period + delay))
     if clearance <= start:
         allowed = f"a clearance > {start:g}, v (0.02 s + T + the motion simulator's delay and lag): "
-        raise KeyProblem(("contact", "clearance"), shown(clearance), allowed + "the start lies within it")
+        raise KeyProblem(
+            ("contact", "clearance"), format_value(clearance), allowed + "the start lies within it"
+        )
     limit = clearance - start
     for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
         if not abs(plane) < limit:
             allowed = f"a number > {-limit:g} and < {limit:g}, the clearance less what the start needs"
-            raise KeyProblem(("rig", "contact_plane"), shown(plane), allowed)
+            raise KeyProblem(("rig", "contact_plane"), format_value(plane), allowed)
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
@@ -293,7 +295,7 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
 
 def _check_uncertainty(mechanism: Mechanism, path: str) -> Span:
     """Return the least and greatest values of an uncertain key. Raise `KeyProblem` for invalid draws."""
-    low, high = check_uncertainty(mechanism, path, numeric_keys(), FIXED)
+    low, high = check_uncertainty(mechanism, path, numeric_keys(), FIXED_KEYS)
     where, independent = ("uncertainty", path), mechanism.uncertainty[path].independent
     if path == "contact.depths" and independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.contact.laws import contact_law
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, Path, allowed_at
-from jaxhil.mechanism.rules import check_law
+from jaxhil.contact.laws import find_contact_law
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at
+from jaxhil.mechanism.rules import check_contact_law
 from jaxhil.mechanism.six_axes import (
     KEYS_IN_SIX_AXES,
     Contact,
@@ -42,7 +42,7 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
 
     Raise `KeyProblem`.
     """
-    path: Path = ("contact", name)
+    path: KeyPath = ("contact", name)
     for body in ("chaser", "target"):
         _check_shape((*path, body), getattr(contact, body))
     _check_pair(path, contact)
@@ -50,24 +50,24 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
         raise KeyProblem(
             (*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } beside it"
         )
-    check_law(path, contact, mechanism.uncertainty, KEYS_IN_SIX_AXES.values())
-    law = contact_law(contact.law)
+    check_contact_law(path, contact, mechanism.uncertainty, KEYS_IN_SIX_AXES.values())
+    law = find_contact_law(contact.law)
     if not (law.damped or law.dissipates_by) and contact.damping:
         allowed = f"0 (law {law.name} has none), or {law.damped_as}"
-        raise KeyProblem((*path, "damping"), shown(contact.damping), allowed)
+        raise KeyProblem((*path, "damping"), format_value(contact.damping), allowed)
     if contact.friction is not None:
         _check_friction((*path, "friction"), contact.friction)
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
     """Check that the latch has one spring and the conditions for catching. Raise `KeyProblem`."""
-    path: Path = ("latch", name)
+    path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
         allowed = "false: an approach is free until the first touch ([start] says where a latch holds)"
         raise KeyProblem((*path, "latched"), "true", allowed)
     for key in ("depth", "angle"):
         if not latch.latched and getattr(latch, key) is None:
-            allowed = f"{allowed_at(Latch, key)}, or latched = true: held from the start on"
+            allowed = f"{describe_allowed_at(Latch, key)}, or latched = true: held from the start on"
             raise KeyProblem((*path, key), "nothing", allowed)
     if (latch.stiffness is None) == (latch.stiffness_matrix is None):
         found = "nothing" if latch.stiffness is None else "stiffness_matrix beside it"
@@ -82,17 +82,19 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
             )
 
 
-def _check_shape(path: Path, shape: Shape) -> None:
+def _check_shape(path: KeyPath, shape: Shape) -> None:
     """Check the keys of a shape. Raise `KeyProblem`."""
     required, optional = KEYS_OF_SHAPES[shape.shape]
     for key, value in _file_values(shape).items():
         if key in required and value is None:
-            allowed = f"{allowed_at(Shape, key)} ({shape.shape} needs it)"
+            allowed = f"{describe_allowed_at(Shape, key)} ({shape.shape} needs it)"
             raise KeyProblem((*path, key), "nothing", allowed)
         if key not in (*required, *optional) and value not in (None, False):
-            raise KeyProblem((*path, key), shown(value), f"nothing ({shape.shape} does not use it: unset it)")
+            raise KeyProblem(
+                (*path, key), format_value(value), f"nothing ({shape.shape} does not use it: unset it)"
+            )
     if shape.shape == "plane" and not np.any(shape.normal):
-        raise KeyProblem((*path, "normal"), shown(shape.normal), "a direction, outwards from the body")
+        raise KeyProblem((*path, "normal"), format_value(shape.normal), "a direction, outwards from the body")
     if shape.shape == "capsule" and shape.start == shape.end:
         raise KeyProblem((*path, "to"), "the point that is from", "another point; a sphere has one")
     if shape.shape == "sphere" and shape.inside and not shape.radius:
@@ -101,16 +103,16 @@ def _check_shape(path: Path, shape: Shape) -> None:
         least = (shape.bottom_radius or 0.0) * math.cos(shape.half_angle or 0.0)
         if not shape.mouth_radius > least:
             allowed = f"a number > {least:g} m, where the rounded bottom ends"
-            raise KeyProblem((*path, "mouth_radius"), shown(shape.mouth_radius), allowed)
+            raise KeyProblem((*path, "mouth_radius"), format_value(shape.mouth_radius), allowed)
     if shape.shape == "box":
         smallest = min(shape.half_lengths or [0.0])
         if (shape.rounding or 0.0) > smallest:
             raise KeyProblem(
-                (*path, "rounding"), shown(shape.rounding), f"at most half_lengths, {smallest:g} m"
+                (*path, "rounding"), format_value(shape.rounding), f"at most half_lengths, {smallest:g} m"
             )
 
 
-def _check_pair(path: Path, contact: Contact) -> None:
+def _check_pair(path: KeyPath, contact: Contact) -> None:
     """Check that contact between the two shapes is supported and that they fit. Raise `KeyProblem`."""
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
@@ -123,25 +125,29 @@ def _check_pair(path: Path, contact: Contact) -> None:
         raise KeyProblem((*path, "target", "shape"), found, "a sphere on either body, or two capsules")
     if target.mouth_radius is not None and not chaser.radius:
         allowed = "a number > 0 m: a drogue with a mouth is a thin shell"
-        raise KeyProblem((*path, "chaser", "radius"), shown(chaser.radius), allowed)
+        raise KeyProblem((*path, "chaser", "radius"), format_value(chaser.radius), allowed)
     for body, ball, socket in (("chaser", chaser, target), ("target", target, chaser)):
         narrow = (
             socket.bottom_radius if socket.shape == "drogue" else socket.radius if socket.inside else None
         )
         if narrow is not None and not (ball.radius or 0.0) < narrow:
             allowed = f"a number < {narrow:g} m, the radius that it is to fit into"
-            raise KeyProblem((*path, body, "radius"), shown(ball.radius), allowed)
+            raise KeyProblem((*path, body, "radius"), format_value(ball.radius), allowed)
 
 
-def _check_friction(path: Path, friction: Friction) -> None:
+def _check_friction(path: KeyPath, friction: Friction) -> None:
     """Check that the friction has the keys of its law. Raise `KeyProblem`."""
     for law, keys in KEYS_OF_FRICTION.items():
         for key in keys:
             value = getattr(friction, key)
             if law == friction.law and value is None and key != "damping":
-                raise KeyProblem((*path, key), "nothing", f"{allowed_at(Friction, key)} ({law} needs it)")
+                raise KeyProblem(
+                    (*path, key), "nothing", f"{describe_allowed_at(Friction, key)} ({law} needs it)"
+                )
             if law != friction.law and value is not None:
-                raise KeyProblem((*path, key), shown(value), f"nothing ({friction.law} does not use it)")
+                raise KeyProblem(
+                    (*path, key), format_value(value), f"nothing ({friction.law} does not use it)"
+                )
 
 
 def _file_values(shape: Shape) -> dict[str, Any]:

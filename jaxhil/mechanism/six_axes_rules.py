@@ -12,28 +12,30 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, Path
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import KeyPath, KeyProblem
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.rules import FIXED, KEYS_OF_MODELS, check_model, check_texts
+from jaxhil.mechanism.rules import FIXED_KEYS, KEYS_OF_MODELS, check_simulator_model, check_texts
 from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start, numeric_keys_of
 from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
-from jaxhil.mechanism.six_axes_rig import AXES, Inertia, Rig, Simulator
+from jaxhil.mechanism.six_axes_rig import PER_AXIS_KEYS, Inertia, Rig, Simulator
 from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 
-__all__ = ["check_legs", "check_named", "check_six_axes", "inertia_matrix"]
+__all__ = ["check_contact_names", "check_leg_values", "check_six_axes", "inertia_matrix"]
 
-LARGEST_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
-MOMENTS = 1e-9  # relative tolerance of the rule that no moment of inertia exceeds the sum of the others
-SLIMMEST = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia
-UNIT = 1e-6  # tolerance of a quaternion's norm, which is 1
+MAX_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
+INERTIA_TOLERANCE = (
+    1e-9  # relative tolerance of the rule that no moment of inertia exceeds the sum of the others
+)
+MIN_INERTIA_RATIO = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia
+QUATERNION_TOLERANCE = 1e-6  # tolerance of a quaternion's norm, which is 1
 # Required and optional keys of each kind of axes of the motion simulator.
 KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "task": ((), ()),
     "stewart": (("base", "platform", "height"), ("stroke",)),
     "two_robots": (("target_robot",), ()),
 }
-NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
+NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 
 def check_six_axes(mechanism: SixAxisMechanism) -> None:
@@ -44,13 +46,13 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     _check_start(mechanism)
     for table, names in (("contact", mechanism.contact), ("latch", mechanism.latch)):
         for name in names:
-            if not NAME.fullmatch(name):
+            if not NAME_PATTERN.fullmatch(name):
                 raise KeyProblem((table, name), "this name", "at most 60 letters, digits, - and _")
     for name, contact in mechanism.contact.items():
         check_contact(mechanism, name, contact)
     for name, latch in mechanism.latch.items():
         check_latch(mechanism, name, latch)
-    check_model(mechanism.rig.simulator)
+    check_simulator_model(mechanism.rig.simulator)
     _check_space(mechanism.rig.simulator)
     _check_hold(mechanism)
     _check_sensor(mechanism.rig)
@@ -59,7 +61,7 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     check_correlation(mechanism)
 
 
-def check_named(raw: Mapping[str, Any]) -> None:
+def check_contact_names(raw: Mapping[str, Any]) -> None:
     """Check that the contacts and latches of a raw table have names. Raise `KeyProblem`."""
     for key, kind in (("contact", Contact), ("latch", Latch)):
         table = raw.get(key)
@@ -71,13 +73,13 @@ def check_named(raw: Mapping[str, Any]) -> None:
             raise KeyProblem((key,), found, f"[{key}.NAME], each with a name of its own")
 
 
-def check_legs(raw: Mapping[str, Any]) -> None:
+def check_leg_values(raw: Mapping[str, Any]) -> None:
     """Check that a hexapod's values are given per leg, not for translation and rotation.
 
     Raise `KeyProblem`.
     """
     simulator = raw["rig"]["simulator"]
-    for key in AXES:
+    for key in PER_AXIS_KEYS:
         if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
             found = "a table of translation and rotation"
             raise KeyProblem(("rig", "simulator", key), found, "one number, or a list of six, one each leg")
@@ -98,14 +100,14 @@ def _check_body(name: str, body: RigidBody) -> None:
         raise KeyProblem((name, "interface_rotation"), found, "a rotation vector shorter than pi")
 
 
-def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> None:
+def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -> None:
     """Check that a rigid body can have the inertia, or that all entries are 0 if it may be `massless`.
 
     Raise `KeyProblem` unless the matrix is symmetric and positive definite, and no principal moment exceeds
     the sum of the others.
     """
     if len({isinstance(entry, list) for entry in inertia}) > 1:
-        raise KeyProblem(path, shown(inertia), "three moments, or three rows of three entries")
+        raise KeyProblem(path, format_value(inertia), "three moments, or three rows of three entries")
     matrix = inertia_matrix(inertia)
     size = np.max(np.abs(matrix))
     if size == 0:
@@ -121,10 +123,10 @@ def _check_inertia(path: Path, inertia: Inertia, *, massless: bool = False) -> N
     first, second, third = map(float, np.linalg.eigvalsh(matrix / size) * size)
     if not first > 0:
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
-    if first < SLIMMEST * third:
+    if first < MIN_INERTIA_RATIO * third:
         found = f"principal moments from {first:g} to {third:g} kg m^2"
-        raise KeyProblem(path, found, f"those of a body: none less than {SLIMMEST:g} of the largest")
-    if third > (first + second) * (1 + MOMENTS):
+        raise KeyProblem(path, found, f"those of a body: none less than {MIN_INERTIA_RATIO:g} of the largest")
+    if third > (first + second) * (1 + INERTIA_TOLERANCE):
         found = f"principal moments {first:.6g}, {second:.6g} and {third:.6g} kg m^2"
         allowed = "those of a body: none more than the sum of the other two"
         raise KeyProblem(path, found, allowed)
@@ -146,12 +148,12 @@ def _check_start(mechanism: SixAxisMechanism) -> None:
     if not mechanism.contact:
         raise KeyProblem(("contact",), "nothing", "[contact.NAME]: an approach ends in a touch")
     angle = float(np.linalg.norm(approach.attitude))
-    if angle > LARGEST_ATTITUDE:
-        allowed = f"a rotation vector of at most {LARGEST_ATTITUDE:g} rad"
+    if angle > MAX_ATTITUDE:
+        allowed = f"a rotation vector of at most {MAX_ATTITUDE:g} rad"
         raise KeyProblem(("approach", "attitude"), f"a rotation by {angle:.4g} rad", allowed)
     if not approach.velocity[2] < 0:
         allowed = "a number < 0 m/s: the z axis of T points to the chaser, which comes along -z"
-        raise KeyProblem(("approach", "velocity", 2), shown(approach.velocity[2]), allowed)
+        raise KeyProblem(("approach", "velocity", 2), format_value(approach.velocity[2]), allowed)
     _check_sides(mechanism)
 
 
@@ -159,15 +161,15 @@ def _check_states(start: Start) -> None:
     """Check that the attitudes at the start are unit quaternions. Raise `KeyProblem`."""
     for name, state in (("target", start.target), ("chaser", start.chaser)):
         norm = float(np.linalg.norm(state.attitude))
-        if not abs(norm - 1) <= UNIT:
-            allowed = f"a quaternion (w, x, y, z) of norm 1, to {UNIT:g}"
+        if not abs(norm - 1) <= QUATERNION_TOLERANCE:
+            allowed = f"a quaternion (w, x, y, z) of norm 1, to {QUATERNION_TOLERANCE:g}"
             raise KeyProblem(("start", name, "attitude"), f"one of norm {norm:.8g}", allowed)
 
 
 def _check_sides(mechanism: SixAxisMechanism) -> None:
     """Check that each body is on its side of the interface, since a z axis is easily reversed by mistake."""
     for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
-        axis = _turned(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
+        axis = _rotate(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
         along = float(axis @ np.asarray(body.interface))
         if along * side < 0:
             where = "behind T, at negative z" if side > 0 else "beyond C, at positive z"
@@ -175,7 +177,7 @@ def _check_sides(mechanism: SixAxisMechanism) -> None:
             raise KeyProblem((name, "interface"), found, f"one {where}: z points from target to chaser")
 
 
-def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
+def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
     """Rotate a vector by a rotation vector [rad] (Rodrigues' formula)."""
     turn = np.asarray(rotation, float)
     angle = float(np.linalg.norm(turn))
@@ -188,24 +190,24 @@ def _turned(rotation: list[float], vector: np.ndarray) -> np.ndarray:
 
 def _check_space(simulator: Simulator) -> None:
     """Check that the motion simulator has the keys of its kind of axes and model. Raise `KeyProblem`."""
-    path: Path = ("rig", "simulator")
+    path: KeyPath = ("rig", "simulator")
     required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
         value = getattr(simulator, key)
         if key in required and value is None:
             raise KeyProblem((*path, key), "nothing", f'what space = "{simulator.space}" needs')
         if key not in (*required, *optional) and value is not None:
-            found = "a table" if key == "target_robot" else shown(value)
+            found = "a table" if key == "target_robot" else format_value(value)
             raise KeyProblem((*path, key), found, f'nothing (space = "{simulator.space}" does not use it)')
     if simulator.stroke is not None and not simulator.stroke[0] < simulator.stroke[1]:
         allowed = "a longest leg longer than the shortest"
-        raise KeyProblem((*path, "stroke"), shown(simulator.stroke), allowed)
+        raise KeyProblem((*path, "stroke"), format_value(simulator.stroke), allowed)
     robot = simulator.target_robot
-    for key in AXES if robot else ():
+    for key in PER_AXIS_KEYS if robot else ():
         unused = key != "delay" and key not in KEYS_OF_MODELS[simulator.model]
         if unused and getattr(robot, key) is not None:
             allowed = f"nothing (model {simulator.model} does not use it)"
-            raise KeyProblem((*path, "target_robot", key), shown(getattr(robot, key)), allowed)
+            raise KeyProblem((*path, "target_robot", key), format_value(getattr(robot, key)), allowed)
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
@@ -216,7 +218,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
                      for contact in mechanism.contact.values())  # fmt: skip
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
         allowed = '"linear" for an ideal simulator with contact damping or friction (or another model)'
-        raise KeyProblem(("rig", "command_hold"), shown(rig.command_hold), allowed)
+        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), allowed)
 
 
 def _check_sensor(rig: Rig) -> None:
@@ -229,12 +231,14 @@ def _check_sensor(rig: Rig) -> None:
     if sensor.side == "fixed":
         for key, entry in (("tool", sensor.tool), ("gravity", any(sensor.gravity) or None)):
             if entry is not None:
-                value = "a table" if key == "tool" else shown(sensor.gravity)
+                value = "a table" if key == "tool" else format_value(sensor.gravity)
                 allowed = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
                 raise KeyProblem((*path, key), value, allowed)
         if rig.position_sensor.delay:
             allowed = '0 (a fixed force sensor is not turned back by the pose), or side = "moving"'
-            raise KeyProblem(("rig", "position_sensor", "delay"), shown(rig.position_sensor.delay), allowed)
+            raise KeyProblem(
+                ("rig", "position_sensor", "delay"), format_value(rig.position_sensor.delay), allowed
+            )
         return
     if sensor.tool is None:
         raise KeyProblem((*path, "tool"), "nothing", 'a table with mass and com (side = "moving" needs it)')
@@ -246,7 +250,7 @@ def _check_sensor(rig: Rig) -> None:
 
 def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
     """Check that all draws of an uncertain key are valid. Raise `KeyProblem`."""
-    low, high = check_uncertainty(mechanism, path, numeric_keys_of(mechanism), FIXED)
+    low, high = check_uncertainty(mechanism, path, numeric_keys_of(mechanism), FIXED_KEYS)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
         allowed = "false, or three moments: rows drawn apart are not symmetric"

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta, Struct, defstruct, field
 
-from jaxhil.contact.keys import says
-from jaxhil.contact.laws import KEYS, LAWS, laws_with
+from jaxhil.contact.keys import key_metadata
+from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, laws_with_key
 
 __all__ = [
-    "MAGNITUDES",
+    "MAGNITUDE_LIMITS",
     "MAX_CONTACTS",
     "SCHEMA",
     "Approach",
@@ -37,51 +37,54 @@ __all__ = [
     "Simulator",
     "Uncertainty",
     "is_computable",
+    "mechanism_type",
     "numeric_keys",
     "range_of",
     "ranges_of",
-    "schema_type",
     "value_at",
 ]
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-MAGNITUDES = 1e-100, 1e100  # limits of nonzero numbers; a product of three neither overflows nor underflows
-PLAIN: Mapping[str, Any] = {}  # metadata of a type without any
+MAGNITUDE_LIMITS = (
+    1e-100,
+    1e100,
+)  # limits of nonzero numbers; a product of three neither overflows nor underflows
+NO_METADATA: Mapping[str, Any] = {}  # metadata of a type without any
 
 # The type refers to the registry itself, because `jaxhil.register` adds laws later.
-Law = Annotated[str, Meta(description="contact law", extra={"one_of": LAWS})]
+ContactLawName = Annotated[str, Meta(description="contact law", extra={"one_of": CONTACT_LAWS})]
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
 Distribution = Literal["uniform", "loguniform", "normal"]
 
 # Types of the entries of lists. A number must be finite unless its metadata contains `infinite`.
-Stiffness = Annotated[float, says("slope of the force", "N/m", gt=0.0)]
+Stiffness = Annotated[float, key_metadata("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
-Damping = Annotated[float, says("damping of the contact", "N s/m", ge=0.0)]
+Damping = Annotated[float, key_metadata("damping of the contact", "N s/m", ge=0.0)]
 # Parts of the descriptions of stiffness and damping, for laws with other units.
 STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
-    law.name for law in LAWS.values() if law.stiffness_unit == "N/m^n"
+    law.name for law in CONTACT_LAWS.values() if law.stiffness_unit == "N/m^n"
 )
 DAMPING_UNITS = "in s/m for {}, none for {}".format(
-    " and ".join(law.name for law in LAWS.values() if law.damping_unit == "s/m"),
-    " and ".join(law.name for law in LAWS.values() if law.dissipates_by),
+    " and ".join(law.name for law in CONTACT_LAWS.values() if law.damping_unit == "s/m"),
+    " and ".join(law.name for law in CONTACT_LAWS.values() if law.dissipates_by),
 )
-Factor = Annotated[float, says("factor on the nominal value", "1", gt=0.0)]
-Coefficient = Annotated[float, says("coefficient of the n-th power of s", "s^n", gt=0.0)]
+Factor = Annotated[float, key_metadata("factor on the nominal value", "1", gt=0.0)]
+Coefficient = Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n", gt=0.0)]
 Polynomial = Annotated[
-    list[Annotated[float, says("coefficient of the n-th power of s", "s^n")]],
+    list[Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n")]],
     Meta(min_length=1, max_length=21),
 ]
 UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
 CorrelationRow = Annotated[
-    list[Annotated[float, says("correlation of two keys' normal numbers", "1", ge=-1.0, le=1.0)]],
+    list[Annotated[float, key_metadata("correlation of two keys' normal numbers", "1", ge=-1.0, le=1.0)]],
     Meta(min_length=1, max_length=100),
 ]
 
 
-def _only(value: float) -> Callable[[], list[float]]:
+def _single_entry(value: float) -> Callable[[], list[float]]:
     """Return a function that returns a list of one value."""
     return lambda: [value]
 
@@ -89,9 +92,9 @@ def _only(value: float) -> Callable[[], list[float]]:
 class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Masses of the two free bodies: their equivalent mass, or both masses."""
 
-    equivalent_mass: Annotated[float, says("mass of the relative motion", "kg", gt=0.0)] | None = None
-    chaser_mass: Annotated[float, says("mass of the chaser", "kg", gt=0.0)] | None = None
-    target_mass: Annotated[float, says("mass of the target", "kg", gt=0.0)] | None = None
+    equivalent_mass: Annotated[float, key_metadata("mass of the relative motion", "kg", gt=0.0)] | None = None
+    chaser_mass: Annotated[float, key_metadata("mass of the chaser", "kg", gt=0.0)] | None = None
+    target_mass: Annotated[float, key_metadata("mass of the target", "kg", gt=0.0)] | None = None
 
     @property
     def mass(self) -> float:
@@ -106,17 +109,19 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Approach of the two bodies."""
 
-    velocity: Annotated[float, says("speed of the first approach", "m/s", gt=0.0)]
-    contacts: Annotated[int, says("number of successive contacts in a run", "1", ge=1, le=MAX_CONTACTS)] = 1
+    velocity: Annotated[float, key_metadata("speed of the first approach", "m/s", gt=0.0)]
+    contacts: Annotated[
+        int, key_metadata("number of successive contacts in a run", "1", ge=1, le=MAX_CONTACTS)
+    ] = 1
     phase: Annotated[
-        float, says("phase of the first contact within a control period", "1", ge=0.0, le=1.0)
+        float, key_metadata("phase of the first contact within a control period", "1", ge=0.0, le=1.0)
     ] = 1.0 / 3.0
 
 
 class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Keys of a contact that all contact laws have."""
 
-    law: Law
+    law: ContactLawName
     stiffness: Annotated[
         list[Stiffness | Slopes],
         Meta(
@@ -132,13 +137,13 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             max_length=MAX_CONTACTS,
             description=f"damping of each contact; {DAMPING_UNITS}",
         ),
-    ] = field(default_factory=_only(0.0))
+    ] = field(default_factory=_single_entry(0.0))
     clearance: Annotated[
-        float, says("gap between two surfaces; infinite for one surface", "m", gt=0.0, infinite=True)
+        float, key_metadata("gap between two surfaces; infinite for one surface", "m", gt=0.0, infinite=True)
     ] = math.inf
 
 
-CONTACT = """Contact law and its parameters, with one entry per successive contact; the last entry repeats.
+CONTACT_DESCRIPTION = """Contact law and its parameters, with one entry per contact; the last entry repeats.
 
 For piecewise_linear, `stiffness` has one list of slopes per contact, with one slope more than depths.
 """
@@ -153,10 +158,10 @@ if TYPE_CHECKING:
 else:
     Contact = defstruct(
         "Contact",
-        [key.struct_field(" and ".join(laws_with(key))) for key in KEYS.values()],
+        [key.struct_field(" and ".join(laws_with_key(key))) for key in CONTACT_KEYS.values()],
         bases=(ContactOfAnyLaw,),
         module=__name__,
-        namespace={"__doc__": CONTACT},
+        namespace={"__doc__": CONTACT_DESCRIPTION},
         frozen=True,
         forbid_unknown_fields=True,
         kw_only=True,
@@ -166,10 +171,12 @@ else:
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Motion simulator G(s) exp(-s delay) from commanded to actual position, and its limits."""
 
-    model: Annotated[SimulatorModel, says("form of G(s)")]
-    natural_frequency: Annotated[float, says("natural frequency of second_order", "Hz", gt=0.0)] | None = None
-    damping_ratio: Annotated[float, says("damping ratio of second_order", "1", gt=0.0)] | None = None
-    time_constant: Annotated[float, says("time constant of first_order", "s", ge=0.0)] | None = None
+    model: Annotated[SimulatorModel, key_metadata("form of G(s)")]
+    natural_frequency: (
+        Annotated[float, key_metadata("natural frequency of second_order", "Hz", gt=0.0)] | None
+    ) = None
+    damping_ratio: Annotated[float, key_metadata("damping ratio of second_order", "1", gt=0.0)] | None = None
+    time_constant: Annotated[float, key_metadata("time constant of first_order", "s", ge=0.0)] | None = None
     coefficients: (
         Annotated[
             list[Coefficient],
@@ -183,58 +190,64 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     denominator: (
         Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")] | None
     ) = None
-    delay: Annotated[float, says("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
+    delay: Annotated[float, key_metadata("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
     velocity_limit: Annotated[
-        float, says("velocity limit of the position command", "m/s", gt=0.0, infinite=True)
+        float, key_metadata("velocity limit of the position command", "m/s", gt=0.0, infinite=True)
     ] = math.inf
     acceleration_limit: Annotated[
-        float, says("acceleration limit of the position command", "m/s^2", gt=0.0, infinite=True)
+        float, key_metadata("acceleration limit of the position command", "m/s^2", gt=0.0, infinite=True)
     ] = math.inf
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Force sensor: delay and lag, then noise and bias, quantum, dead zone and range."""
 
-    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-    time_constant: Annotated[float, says("time constant of the reading's first-order lag", "s", ge=0.0)] = 0.0
-    noise_std: Annotated[float, says("standard deviation of white noise", "N", ge=0.0)] = 0.0
-    quantum: Annotated[float, says("step to whose multiples a reading is rounded", "N", ge=0.0)] = 0.0
-    dead_zone: Annotated[float, says("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
-    bias: Annotated[float, says("bias added to every reading", "N")] = 0.0
-    range: Annotated[float, says("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)] = (
-        math.inf
-    )
+    delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    time_constant: Annotated[
+        float, key_metadata("time constant of the reading's first-order lag", "s", ge=0.0)
+    ] = 0.0
+    noise_std: Annotated[float, key_metadata("standard deviation of white noise", "N", ge=0.0)] = 0.0
+    quantum: Annotated[float, key_metadata("step to whose multiples a reading is rounded", "N", ge=0.0)] = 0.0
+    dead_zone: Annotated[float, key_metadata("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
+    bias: Annotated[float, key_metadata("bias added to every reading", "N")] = 0.0
+    range: Annotated[
+        float, key_metadata("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)
+    ] = math.inf
 
 
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Position sensor of the motion simulator."""
 
-    delay: Annotated[float, says("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-    noise_std: Annotated[float, says("standard deviation of white noise", "m", ge=0.0)] = 0.0
-    quantum: Annotated[float, says("step to whose multiples a reading is rounded", "m", ge=0.0)] = 0.0
+    delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    noise_std: Annotated[float, key_metadata("standard deviation of white noise", "m", ge=0.0)] = 0.0
+    quantum: Annotated[float, key_metadata("step to whose multiples a reading is rounded", "m", ge=0.0)] = 0.0
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Rig: controller, motion simulator and sensors."""
 
-    control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)]
-    integrator: Annotated[Integrator, says("integrator of the numerical model")] = "semi_implicit_euler"
-    command_latency: Annotated[int, says("periods until a command reaches the drives", "1", ge=0, le=1)] = 0
-    command_hold: Annotated[CommandHold, says("hold of the command within a period")] = "linear"
+    control_period: Annotated[float, key_metadata("time from tick to tick", "s", gt=0.0, le=0.1)]
+    integrator: Annotated[Integrator, key_metadata("integrator of the numerical model")] = (
+        "semi_implicit_euler"
+    )
+    command_latency: Annotated[
+        int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=1)
+    ] = 0
+    command_hold: Annotated[CommandHold, key_metadata("hold of the command within a period")] = "linear"
     contact_plane: Annotated[
-        float, says("position of the hardware's surface; the controller assumes 0", "m")
+        float, key_metadata("position of the hardware's surface; the controller assumes 0", "m")
     ] = 0.0
-    simulator: Annotated[Simulator, says("the motion simulator")]
-    force_sensor: Annotated[ForceSensor, says("the force sensor")] = ForceSensor()
-    position_sensor: Annotated[PositionSensor, says("the position sensor")] = PositionSensor()
+    simulator: Annotated[Simulator, key_metadata("the motion simulator")]
+    force_sensor: Annotated[ForceSensor, key_metadata("the force sensor")] = ForceSensor()
+    position_sensor: Annotated[PositionSensor, key_metadata("the position sensor")] = PositionSensor()
 
 
 class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Distribution of an uncertain number (`jaxhil.mechanism.uncertainty`)."""
 
-    distribution: Annotated[Distribution, says("kind of distribution")]
-    low: Annotated[float, says("least value, in the key's unit", "")] | None = None
-    high: Annotated[float, says("greatest value, in the key's unit", "")] | None = None
+    distribution: Annotated[Distribution, key_metadata("kind of distribution")]
+    low: Annotated[float, key_metadata("least value, in the key's unit", "")] | None = None
+    high: Annotated[float, key_metadata("greatest value, in the key's unit", "")] | None = None
     factor: (
         Annotated[
             list[Factor],
@@ -242,8 +255,8 @@ class Uncertainty(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         ]
         | None
     ) = None
-    std: Annotated[float, says("standard deviation, in the key's unit", "", gt=0.0)] | None = None
-    independent: Annotated[bool, says("whether each entry of a list has a draw of its own")] = False
+    std: Annotated[float, key_metadata("standard deviation, in the key's unit", "", gt=0.0)] | None = None
+    independent: Annotated[bool, key_metadata("whether each entry of a list has a draw of its own")] = False
 
 
 class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -261,17 +274,17 @@ class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Docking mechanism on a rig."""
 
-    schema: Annotated[Literal["jaxhil/mechanism/1"], says("kind of file")]
-    name: Annotated[str, says("name of the mechanism", min_length=1, max_length=100)]
-    source: Annotated[str, says("source of the numbers", max_length=10_000)] = "assumed"
-    bodies: Annotated[Bodies, says("the two bodies")]
-    approach: Annotated[Approach, says("approach of the bodies")]
-    contact: Annotated[Contact, says("the contact")]
-    rig: Annotated[Rig, says("the rig")]
-    uncertainty: Annotated[dict[str, Uncertainty], says("uncertainty of the numbers, by dotted path")] = (
-        field(default_factory=dict)
-    )
-    correlation: Annotated[Correlation, says("correlation of the uncertain numbers")] | None = None
+    schema: Annotated[Literal["jaxhil/mechanism/1"], key_metadata("kind of file")]
+    name: Annotated[str, key_metadata("name of the mechanism", min_length=1, max_length=100)]
+    source: Annotated[str, key_metadata("source of the numbers", max_length=10_000)] = "assumed"
+    bodies: Annotated[Bodies, key_metadata("the two bodies")]
+    approach: Annotated[Approach, key_metadata("approach of the bodies")]
+    contact: Annotated[Contact, key_metadata("the contact")]
+    rig: Annotated[Rig, key_metadata("the rig")]
+    uncertainty: Annotated[
+        dict[str, Uncertainty], key_metadata("uncertainty of the numbers, by dotted path")
+    ] = field(default_factory=dict)
+    correlation: Annotated[Correlation, key_metadata("correlation of the uncertain numbers")] | None = None
 
 
 class Range(NamedTuple):
@@ -302,12 +315,12 @@ class Range(NamedTuple):
 
 
 def is_computable(value: float) -> bool:
-    """Return whether a number is 0, infinite, or of a magnitude within `MAGNITUDES`."""
-    return value == 0.0 or math.isinf(value) or MAGNITUDES[0] <= abs(value) <= MAGNITUDES[1]
+    """Return whether a number is 0, infinite, or of a magnitude within `MAGNITUDE_LIMITS`."""
+    return value == 0.0 or math.isinf(value) or MAGNITUDE_LIMITS[0] <= abs(value) <= MAGNITUDE_LIMITS[1]
 
 
 def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: Mapping[str, Any]) -> Range:
-    """Return the allowed values of a numeric field from its type and from the metadata `extra` of `says`."""
+    """Return the allowed values of a numeric field from its type and from `extra` of `key_metadata`."""
     low = kind.gt if kind.gt is not None else kind.ge
     high = kind.lt if kind.lt is not None else kind.le
     return Range(
@@ -320,7 +333,7 @@ def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: M
 
 
 @functools.cache
-def schema_type() -> msgspec.inspect.StructType:
+def mechanism_type() -> msgspec.inspect.StructType:
     """Return msgspec's description of the type `Mechanism`."""
     info = msgspec.inspect.type_info(Mechanism)
     assert isinstance(info, msgspec.inspect.StructType)
@@ -330,7 +343,7 @@ def schema_type() -> msgspec.inspect.StructType:
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
     """Return the allowed values of every real-valued key (or of its list's entries), by dotted path."""
-    return ranges_of(schema_type(), PLAIN)
+    return ranges_of(mechanism_type(), NO_METADATA)
 
 
 def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:
@@ -340,14 +353,14 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
     """
     keys: dict[str, Range] = {}
 
-    def visit(kind: msgspec.inspect.Type, path: str, extra: Mapping[str, Any] = PLAIN) -> None:
+    def visit(kind: msgspec.inspect.Type, path: str, extra: Mapping[str, Any] = NO_METADATA) -> None:
         match kind:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
                     if entry.name != "correlation":  # its numbers describe other keys
                         visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
-                visit(inner, path, kind.extra or PLAIN)
+                visit(inner, path, kind.extra or NO_METADATA)
             case msgspec.inspect.UnionType(types=members):
                 for member in members:
                     visit(member, path, extra)

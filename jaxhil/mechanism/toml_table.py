@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, to_one_line
 from jaxhil.files import open_input
 
 __all__ = ["parse_toml", "read_bytes"]
@@ -36,36 +36,36 @@ def read_bytes(path: Path, label: str, what: str) -> bytes:
     except FileNotFoundError:
         raise
     except IsADirectoryError:
-        raise InputError(f"{label}: found a directory, allowed {what} file") from None
+        raise InputError(f"{label}: found a directory, expected {what} file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{label}: cannot be read: {one_line(str(reason), 100)}") from None
+        raise InputError(f"{label}: cannot be read: {to_one_line(str(reason), 100)}") from None
     if len(data) > MAX_BYTES:
-        raise InputError(f"{label}: found more than {MAX_BYTES} bytes, allowed a file of at most 1 MiB")
+        raise InputError(f"{label}: found more than {MAX_BYTES} bytes, expected a file of at most 1 MiB")
     return data
 
 
 def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
     """Return the table of a file's bytes; `what` names its content in messages. Raise `InputError`."""
     if not data.strip():
-        raise InputError(f"{label}: found an empty file, allowed {what} in TOML")
+        raise InputError(f"{label}: found an empty file, expected {what} in TOML")
     try:
         # Some editors write a byte-order mark at the start.
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{label}: found bytes that are not UTF-8 at byte {error.start}, allowed {what} in TOML"
+            f"{label}: found bytes that are not UTF-8 at byte {error.start}, expected {what} in TOML"
         ) from None
     if _longest_key(text) > MAX_KEY_PARTS:
         # The parser's memory grows with the square of a dotted key's length.
-        raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, allowed TOML keys")
+        raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, expected TOML keys")
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise InputError(f"{label}: found values nested too deeply, allowed plain TOML") from None
+        raise InputError(f"{label}: found values nested too deeply, expected plain TOML") from None
     except ValueError as error:
         # An integer of thousands of digits raises a ValueError that is no TOMLDecodeError.
-        reason = one_line(str(error).split(";")[0], 120)
+        reason = to_one_line(str(error).split(";")[0], 120)
         raise InputError(f"{label}: not valid TOML: {reason}") from None
 
 

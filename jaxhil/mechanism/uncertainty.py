@@ -28,19 +28,27 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.mechanism.correlation import correlated
+from jaxhil.mechanism.correlation import correlate
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, numeric_keys, value_at
 
-__all__ = ["PHASE", "at_points", "dimensions", "draw", "extremes", "quantiles", "quasi_random"]
+__all__ = [
+    "PHASE_KEY",
+    "compute_quantiles",
+    "count_dimensions",
+    "draw",
+    "draw_at_points",
+    "draw_extremes",
+    "draw_quasi_random",
+]
 
 AnyMechanism = Mechanism | SixAxisMechanism
 
-PHASE = "approach.phase"
-BLOCK = 1024  # number of draws from one generator
+PHASE_KEY = "approach.phase"
+DRAWS_PER_GENERATOR = 1024  # number of draws from one generator
 
-_TINY = 2.0**-54  # replaces a uniform number of 0
-_LARGEST = 1.0 - 2.0**-53  # largest uniform number of a generator
+_MIN_UNIFORM = 2.0**-54  # replaces a uniform number of 0
+_MAX_UNIFORM = 1.0 - 2.0**-53  # largest uniform number of a generator
 _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
@@ -53,13 +61,13 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
     them. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
-        raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, allowed >= 0")
-    columns = dimensions(mechanism)
-    uniform = {path: _uniform(path, count, number, seed, first) for path, count in columns.items()}
-    return _values(mechanism, correlated(mechanism, uniform))
+        raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected >= 0")
+    columns = count_dimensions(mechanism)
+    uniform = {path: _draw_uniform(path, count, number, seed, first) for path, count in columns.items()}
+    return _compute_values(mechanism, correlate(mechanism, uniform))
 
 
-def quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
+def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
     """Return draws as `draw` does, from a scrambled Sobol sequence with one point per draw.
 
     The points fill the unit box of all uncertain numbers more evenly than random ones, best if `number` is a
@@ -70,87 +78,87 @@ def quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, n
     from scipy.stats import qmc
 
     if number < 0 or seed < 0:
-        raise ValueError(f"number, seed: found {number}, {seed}, allowed integers >= 0")
-    columns = dimensions(mechanism)
+        raise ValueError(f"number, seed: found {number}, {seed}, expected integers >= 0")
+    columns = count_dimensions(mechanism)
     sequence = qmc.Sobol(sum(columns.values()), scramble=True, rng=np.random.default_rng(seed))
     points = sequence.random_base2(max(0, math.ceil(math.log2(max(number, 1)))))[:number]
-    return at_points(mechanism, points)
+    return draw_at_points(mechanism, points)
 
 
-def at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the draws for points of the unit box, (number, sum of `dimensions`), as `draw` does.
+def draw_at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the draws for points of the unit box, (number, sum of `count_dimensions`), as `draw` does.
 
     The coordinates are correlated as the mechanism states, then converted by the quantile function of each
     key; 0 gives the least draw.
     """
-    return _values(mechanism, correlated(mechanism, _by_key(mechanism, points)))
+    return _compute_values(mechanism, correlate(mechanism, _split_by_key(mechanism, points)))
 
 
-def quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return each key's quantiles at points of the unit box, as `at_points` but without correlation."""
-    return _values(mechanism, _by_key(mechanism, points))
+def compute_quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Return each key's quantiles at points of the unit box, as `draw_at_points` but without correlation."""
+    return _compute_values(mechanism, _split_by_key(mechanism, points))
 
 
-def extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
+def draw_extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
     """Return every uncertain number at both ends of its distribution, without correlation: (2, ...)."""
-    ends = np.array([[0.0], [_LARGEST]])
-    return quantiles(mechanism, np.repeat(ends, sum(dimensions(mechanism).values()), axis=1))
+    ends = np.array([[0.0], [_MAX_UNIFORM]])
+    return compute_quantiles(mechanism, np.repeat(ends, sum(count_dimensions(mechanism).values()), axis=1))
 
 
-def dimensions(mechanism: AnyMechanism) -> dict[str, int]:
+def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
     """Return the number of uniform numbers for each key, sorted by path with the phases last."""
     columns = {}
-    for path in sorted(set(mechanism.uncertainty) - {PHASE}):
+    for path in sorted(set(mechanism.uncertainty) - {PHASE_KEY}):
         independent = mechanism.uncertainty[path].independent
         columns[path] = np.size(value_at(mechanism, path)) if independent else 1
     if isinstance(mechanism, Mechanism):
-        columns[PHASE] = mechanism.approach.contacts
+        columns[PHASE_KEY] = mechanism.approach.contacts
     elif mechanism.approach is not None:
-        columns[PHASE] = 1
+        columns[PHASE_KEY] = 1
     return columns
 
 
-def _by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
+def _split_by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     """Split points of the unit box into the columns of each key."""
-    columns = dimensions(mechanism)
+    columns = count_dimensions(mechanism)
     edges = np.cumsum(list(columns.values()))[:-1]
     return dict(zip(columns, np.split(points, edges, axis=1), strict=True))
 
 
-def _uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:
+def _draw_uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:
     """Return uniform numbers (number, count): the rows from `first` on of an infinite table for this path."""
-    start = first // BLOCK
+    start = first // DRAWS_PER_GENERATOR
     blocks = [np.empty((0, count))]
     philox = np.random.Philox(key=0)
     fresh: Any = philox.state
-    for block in range(start, math.ceil((first + number) / BLOCK)):
+    for block in range(start, math.ceil((first + number) / DRAWS_PER_GENERATOR)):
         digest = hashlib.sha256(f"{seed} {block} {path}".encode()).digest()
         # Setting the key of one generator is faster than a new one, which asks the system for a seed.
         fresh["state"]["key"] = np.frombuffer(digest[:16], "<u8")
         philox.state = fresh
         # Numbers fill column by column, so that the first columns do not depend on `count`.
-        blocks.append(np.random.Generator(philox).random((count, BLOCK)).T)
-    skipped = first - start * BLOCK
+        blocks.append(np.random.Generator(philox).random((count, DRAWS_PER_GENERATOR)).T)
+    skipped = first - start * DRAWS_PER_GENERATOR
     return np.concatenate(blocks)[skipped : skipped + number]
 
 
-def _values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _compute_values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values of every key from its uniform numbers."""
     has_one_axis = isinstance(mechanism, Mechanism)
     ranges = numeric_keys() if has_one_axis else numeric_keys_of(mechanism)
     return {
-        path: _key_values(
+        path: _compute_key_values(
             np.asarray(value_at(mechanism, path), dtype=float),
             mechanism.uncertainty.get(path, _UNIFORM_PHASE),
             ranges[path],
             numbers,
-            has_one_axis and path == PHASE,
+            has_one_axis and path == PHASE_KEY,
         )
         for path, numbers in uniform.items()
     }
 
 
-def _key_values(
+def _compute_key_values(
     nominal: np.ndarray,
     uncertainty: Uncertainty,
     allowed: Range,
@@ -160,25 +168,25 @@ def _key_values(
     """Return the values of one key from its uniform numbers (number, columns)."""
     number = uniform.shape[0]
     # The quantile at 0 would be outside an open range.
-    uniform = np.maximum(uniform, _TINY)
+    uniform = np.maximum(uniform, _MIN_UNIFORM)
     if per_contact:
-        return _quantile(uncertainty, nominal, allowed)(uniform)
+        return _build_quantile_function(uncertainty, nominal, allowed)(uniform)
     if uncertainty.independent:
-        values = _quantile(uncertainty, nominal.ravel(), allowed)(uniform)
+        values = _build_quantile_function(uncertainty, nominal.ravel(), allowed)(uniform)
         return values.reshape(number, *nominal.shape)
     if nominal.ndim == 0:
-        return _quantile(uncertainty, nominal, allowed)(uniform[:, 0])
+        return _build_quantile_function(uncertainty, nominal, allowed)(uniform[:, 0])
     first = nominal.flat[0]
     column = uniform.reshape(number, *[1] * nominal.ndim)
     if uncertainty.factor is not None:
-        return nominal * _quantile(uncertainty, np.ones(()), allowed)(column)
-    value = _quantile(uncertainty, np.asarray(first), allowed)(column)
+        return nominal * _build_quantile_function(uncertainty, np.ones(()), allowed)(column)
+    value = _build_quantile_function(uncertainty, np.asarray(first), allowed)(column)
     if np.all(nominal == first):
         return np.broadcast_to(value, (number, *nominal.shape)).copy()
     return nominal * (value / first)
 
 
-def _quantile(
+def _build_quantile_function(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return the quantile function, for uniform numbers that broadcast against `nominal`."""
@@ -213,7 +221,7 @@ def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[
     greatest = min(greatest, float(np.finfo(float).max))
 
     def quantile(uniform: np.ndarray) -> np.ndarray:
-        probability = np.clip(below + uniform * (above - below), _TINY, 1.0 - 2.0 * _TINY)
+        probability = np.clip(below + uniform * (above - below), _MIN_UNIFORM, 1.0 - 2.0 * _MIN_UNIFORM)
         with np.errstate(over="ignore"):
             return np.clip(mean + std * special.ndtri(probability), least, greatest)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.errors import shown
-from jaxhil.mechanism.conversion import KeyProblem, close_match, computable
+from jaxhil.errors import format_value
+from jaxhil.mechanism.conversion import KeyProblem, add_magnitude_limits, suggest_names
 from jaxhil.mechanism.structs import Range, Uncertainty, is_computable, value_at
 
 __all__ = ["Span", "check_uncertainty"]
@@ -27,16 +27,16 @@ def check_uncertainty(mechanism: Any, path: str, ranges: Mapping[str, Range], fi
     where = ("uncertainty", path)
     key_ranges = {key: allowed for key, allowed in ranges.items() if key not in fixed}
     if path not in key_ranges:
-        allowed = f"the dotted path of a numeric key{close_match(path, key_ranges)}"
+        allowed = f"the dotted path of a numeric key{suggest_names(path, key_ranges)}"
         if path in fixed:
             allowed += " other than a polynomial, which fixes G(0) = 1"
         raise KeyProblem(where, "no such uncertain key", allowed)
     value = value_at(mechanism, path)
     if value is None or value == [] or np.all(np.isinf(value)):
         allowed = f"a key with a value: set {path}, or unset its uncertainty"
-        raise KeyProblem(where, f"{shown(value)} as its value", allowed)
+        raise KeyProblem(where, f"{format_value(value)} as its value", allowed)
     nominal = np.asarray(value, dtype=float)
-    low, high = _span(where, path, uncertainty, nominal, key_ranges[path])
+    low, high = _compute_span(where, path, uncertainty, nominal, key_ranges[path])
     ends = [float(end) for end in np.concatenate((low.ravel(), high.ravel()))]
     if uncertainty.distribution != "normal":
         outside = [end for end in ends if not (key_ranges[path].allows(end) and math.isfinite(end))]
@@ -44,11 +44,11 @@ def check_uncertainty(mechanism: Any, path: str, ranges: Mapping[str, Range], fi
             raise KeyProblem(where, f"values as far as {outside[0]:g}", str(key_ranges[path]))
         beyond = [end for end in ends if not is_computable(end)]
         if beyond:
-            raise KeyProblem(where, f"values as far as {beyond[0]:g}", computable(key_ranges[path]))
+            raise KeyProblem(where, f"values as far as {beyond[0]:g}", add_magnitude_limits(key_ranges[path]))
     return low, high
 
 
-def _span(
+def _compute_span(
     where: tuple[str, str], path: str, uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Span:
     """Return the least and greatest draw of each entry. Raise `KeyProblem` for a wrong distribution."""
@@ -67,9 +67,9 @@ def _span(
     bounds = uncertainty.factor or [uncertainty.low or 0.0, uncertainty.high or 0.0]
     key = "factor" if uncertainty.factor else "low"
     if not bounds[0] < bounds[1]:
-        raise KeyProblem((*where, key), shown(bounds), "low < high")
+        raise KeyProblem((*where, key), format_value(bounds), "low < high")
     if kind == "loguniform" and not bounds[0] > 0.0:
-        raise KeyProblem((*where, key), shown(bounds[0]), "a number > 0 for loguniform")
+        raise KeyProblem((*where, key), format_value(bounds[0]), "a number > 0 for loguniform")
     # An end that overflows is infinite, and the caller rejects it.
     with np.errstate(over="ignore"):
         if uncertainty.factor:

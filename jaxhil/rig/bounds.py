@@ -34,6 +34,6 @@ FORCE_SLEWS = 0.0, 1e12  # [N/s]
 DECELERATIONS = 1e-6, 1e7  # [m/s^2]
 
 
-def span(lowest: float, highest: float) -> str:
+def format_range(lowest: float, highest: float) -> str:
     """Return the range as text for an error message."""
     return f"{lowest!r} to {highest!r}"

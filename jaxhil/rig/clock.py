@@ -5,10 +5,10 @@ from math import inf, isfinite
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
 from jaxhil.rig.types import Limits, NonNegative, Positive
 
-MOST_MISSED = 1_000_000  # periods; one gap counts no more, however wrong the clock is
-LONGEST_GAP = 1.5  # periods; after a longer gap a tick is missing
-DRIFT_KEPT = 0.99  # share of the clock's drift that remains after a tick: it decays over 100 ticks
-MOST_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches it, jitter does not
+MAX_MISSED = 1_000_000  # periods; one gap counts no more, however wrong the clock is
+MAX_GAP = 1.5  # periods; after a longer gap a tick is missing
+DRIFT_DECAY_FACTOR = 0.99  # share of the clock's drift that remains after a tick: it decays over 100 ticks
+MAX_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches it, jitter does not
 
 
 class Clock:
@@ -28,7 +28,7 @@ class Clock:
 
     def __init__(self, limits: Limits, period: Positive) -> None:
         self._period = period
-        self._missing = LONGEST_GAP * period
+        self._missing = MAX_GAP * period
         self._late_gap = (1.0 + limits["late_fraction"]) * period
         self._early_gap = (1.0 - limits["late_fraction"]) * period
         self._tolerated = limits["missed_in_a_row"]
@@ -66,7 +66,7 @@ class Clock:
         if gap > self._missing:
             return self._miss(periods)
         self._in_a_row = 0
-        drift = DRIFT_KEPT * self._drift + (periods - 1.0)
+        drift = DRIFT_DECAY_FACTOR * self._drift + (periods - 1.0)
         fault = 0
         if gap < self._early_gap:
             fault = EARLY_TICK
@@ -83,11 +83,11 @@ class Clock:
 
     def _miss(self, periods: NonNegative) -> int:
         """Count the ticks missed in a gap of `periods` control periods; return the fault."""
-        left_out = MOST_MISSED - 1
+        left_out = MAX_MISSED - 1
         drift = 0.0
-        if periods <= MOST_MISSED:
+        if periods <= MAX_MISSED:
             left_out = int(periods + 0.5) - 1
-            drift = DRIFT_KEPT * self._drift + (periods - 1.0 - left_out)
+            drift = DRIFT_DECAY_FACTOR * self._drift + (periods - 1.0 - left_out)
         self.missed += left_out
         self._awaited = left_out
         self._in_a_row += left_out
@@ -97,7 +97,7 @@ class Clock:
     def _part(self, drift: float, fault: int) -> int:
         """Store the drift [periods]; return the tick's fault, or `CLOCK` if the drift is too large."""
         self._drift = drift
-        if abs(drift) > MOST_DRIFT:
+        if abs(drift) > MAX_DRIFT:
             self.fatal = True
             return CLOCK
         return fault

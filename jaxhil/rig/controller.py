@@ -12,7 +12,7 @@ from math import isfinite, nan
 from typing import Any
 
 from jaxhil.rig.clock import Clock
-from jaxhil.rig.errors import refusal, shown
+from jaxhil.rig.errors import format_value, make_gain_file_error
 from jaxhil.rig.faults import (
     CLOCK,
     EMERGENCY_STOP,
@@ -23,7 +23,7 @@ from jaxhil.rig.faults import (
     RESTITUTION,
     TARE,
     UNUSABLE,
-    names,
+    fault_names,
 )
 from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_document
 from jaxhil.rig.inputs import InputGuard, Tare
@@ -60,11 +60,13 @@ class Controller:
         try:
             self._law = law(gain_file.gains, period, clearance)
         except ValueError as error:
-            raise refusal(source, "gains", str(error), "gains that fit the control period") from None
+            raise make_gain_file_error(
+                source, "gains", str(error), "gains that fit the control period"
+            ) from None
         try:
             self._guard(gain_file.limits, period, clearance)
         except ValueError as error:
-            raise refusal(source, "limits.alignment", str(error), "a delay that fits") from None
+            raise make_gain_file_error(source, "limits.alignment", str(error), "a delay that fits") from None
 
     def _guard(self, limits: Limits, period: Positive, clearance: float) -> None:
         """Create the guards of inputs, contacts and outputs, and reset the controller."""
@@ -131,7 +133,9 @@ class Controller:
         """Return `ok`, or `tripped: ` and the cause."""
         if not self.cause:
             return "ok"
-        return f"tripped: {', '.join(names(self.cause))}" + (f" ({self._detail})" if self._detail else "")
+        return f"tripped: {', '.join(fault_names(self.cause))}" + (
+            f" ({self._detail})" if self._detail else ""
+        )
 
     @property
     def at_rest(self) -> bool:
@@ -385,17 +389,19 @@ def _float(value: Any) -> float:
         return nan
 
 
-READINGS = "time", "force_measured", "position_desired", "velocity_desired", "position_measured"
+READING_NAMES = "time", "force_measured", "position_desired", "velocity_desired", "position_measured"
 
 
 def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
-    """Describe a cause by the watchdog's audit or by the values of `READINGS` that are not finite."""
+    """Describe a cause by the watchdog's audit or by the values of `READING_NAMES` that are not finite."""
     if fatal & RESTITUTION:
         return watchdog.detail()
     if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):
         items = (
-            item for item in zip(READINGS, values, strict=True) if item[1] is not None or item[0] != "time"
+            item
+            for item in zip(READING_NAMES, values, strict=True)
+            if item[1] is not None or item[0] != "time"
         )
         bad = (item for item in items if not isfinite(_float(item[1])))
-        return ", ".join(f"{name} is {shown(value)}" for name, value in bad)
+        return ", ".join(f"{name} is {format_value(value)}" for name, value in bad)
     return ""

@@ -13,7 +13,7 @@ def printable(text: str) -> str:
     )
 
 
-def shown(value: object, longest: int = 60) -> str:
+def format_value(value: object, longest: int = 60) -> str:
     """Return a value as short ASCII text on one line, for an error message."""
     if isinstance(value, dict):
         return "an object"
@@ -29,7 +29,7 @@ def shown(value: object, longest: int = 60) -> str:
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
-def refusal(source: str, key: str, found: str, allowed: str) -> GainFileError:
+def make_gain_file_error(source: str, key: str, found: str, allowed: str) -> GainFileError:
     """Return the error for `key` of the file `source`; an empty key stands for the whole file."""
     location = f"{source}: {key}" if key else source
-    return GainFileError(printable(f"{location}: found {found}, allowed {allowed}"))
+    return GainFileError(printable(f"{location}: found {found}, expected {allowed}"))

@@ -171,6 +171,6 @@ FAULTS = (
 )
 
 
-def names(bits: int) -> list[str]:
+def fault_names(bits: int) -> list[str]:
     """Return the names of the faults whose bits are set."""
     return [fault.name for fault in FAULTS if bits & fault.bit]

@@ -93,7 +93,7 @@ class DelayLine:
     def __init__(self, delay: float, period: Positive) -> None:
         ratio = delay / period
         if not 0.0 <= ratio <= self.LONGEST:
-            raise ValueError(f"a delay of {ratio!r} periods, allowed 0 to {self.LONGEST}")
+            raise ValueError(f"a delay of {ratio!r} periods, expected 0 to {self.LONGEST}")
         # The margin keeps a whole number of periods whole if the ratio is rounded down.
         self._whole = floor(ratio + 1e-9)
         self._fraction = ratio - self._whole

@@ -15,17 +15,17 @@ from collections.abc import Mapping
 from math import inf, isfinite
 from typing import Any, NamedTuple
 
-from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, span
-from jaxhil.rig.errors import GainFileError, printable, refusal, shown
-from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, format_range
+from jaxhil.rig.errors import GainFileError, format_value, make_gain_file_error, printable
+from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete_limits
 from jaxhil.rig.registry import COMPENSATORS, GainSpecification
 
 SCHEMA = "jaxhil/gains/1"
-LARGEST = 4 * 1024 * 1024  # bytes of a file
-DEEPEST = 32  # levels of nesting
-UNSIGNED = ("created", "timings", "sha256")  # keys without influence on the digest
-RETIRED = ("retrospective_reference", "retrospective_delay_bank")  # replaced by `impulse_ledger`
-NO_OTHERS: Mapping[str, Mapping[str, GainSpecification]] = {}
+MAX_FILE_BYTES = 4 * 1024 * 1024  # bytes of a file
+MAX_NESTING = 32  # levels of nesting
+KEYS_OUTSIDE_DIGEST = ("created", "timings", "sha256")  # keys without influence on the digest
+RETIRED_COMPENSATORS = ("retrospective_reference", "retrospective_delay_bank")  # replaced by `impulse_ledger`
+NO_FURTHER_GAINS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
@@ -53,7 +53,7 @@ def digest(document: Mapping[str, Any]) -> str:
         >>> digest({"schema": "jaxhil/gains/1"}) == digest({"schema": "jaxhil/gains/1", "created": "now"})
         True
     """
-    content = {key: value for key, value in document.items() if key not in UNSIGNED}
+    content = {key: value for key, value in document.items() if key not in KEYS_OUTSIDE_DIGEST}
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
 
@@ -67,31 +67,33 @@ def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
             # Reading a pipe waits for its writer, and a device may never end.
             raise OSError(errno.EINVAL, "found a pipe or a device, expected a plain file")
         with open(source, "rb") as file:
-            content = file.read(LARGEST + 1)
+            content = file.read(MAX_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise GainFileError(printable(f"{source}: cannot be read: {reason}")) from None
-    if len(content) > LARGEST:
-        raise refusal(source, "", "a larger file", f"at most {LARGEST} bytes")
+    if len(content) > MAX_FILE_BYTES:
+        raise make_gain_file_error(source, "", "a larger file", f"at most {MAX_FILE_BYTES} bytes")
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise refusal(source, "", f"bytes that are not UTF-8 at {error.start}", "UTF-8") from None
+        raise make_gain_file_error(
+            source, "", f"bytes that are not UTF-8 at {error.start}", "UTF-8"
+        ) from None
     try:
         document = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique_keys)
     except RecursionError:
-        raise refusal(source, "", "deeper nesting", f"at most {DEEPEST} levels") from None
+        raise make_gain_file_error(source, "", "deeper nesting", f"at most {MAX_NESTING} levels") from None
     except ValueError as error:
-        raise refusal(source, "", f"not JSON ({error})", f"a JSON object, {SCHEMA}") from None
+        raise make_gain_file_error(source, "", f"not JSON ({error})", f"a JSON object, {SCHEMA}") from None
     if not isinstance(document, dict):
-        raise refusal(source, "", shown(document), f"a JSON object, {SCHEMA}")
+        raise make_gain_file_error(source, "", format_value(document), f"a JSON object, {SCHEMA}")
     return document
 
 
 def check_gain_document(
     document: Mapping[str, Any],
     source: str = "gain document",
-    others: Mapping[str, Mapping[str, GainSpecification]] = NO_OTHERS,
+    others: Mapping[str, Mapping[str, GainSpecification]] = NO_FURTHER_GAINS,
     axes: tuple[int, ...] = (1,),
 ) -> GainFile:
     """Check a gain document and return what the controller needs of it.
@@ -109,14 +111,16 @@ def check_gain_document(
     number = document.get("axes", 1)
     if number not in axes:
         allowed = f"{' or '.join(map(str, axes))}: gains of six axes are simulated only so far"
-        raise refusal(source, "axes", shown(number), allowed)
+        raise make_gain_file_error(source, "axes", format_value(number), allowed)
     name = _entry(document, "compensator", source, "")
-    if name in RETIRED:
-        message = f"compensator: found {shown(name)}, expected 'impulse_ledger', which replaces it"
+    if name in RETIRED_COMPENSATORS:
+        message = f"compensator: found {format_value(name)}, expected 'impulse_ledger', which replaces it"
         raise GainFileError(printable(f"{source}: {message}"))
     specifications = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
     if not isinstance(name, str) or name not in specifications:
-        raise refusal(source, "compensator", shown(name), f"one of {', '.join(specifications)}")
+        raise make_gain_file_error(
+            source, "compensator", format_value(name), f"one of {', '.join(specifications)}"
+        )
     gains = _gains(document, name, specifications[name], source)
     period = _number(_entry(document, "control_period", source, ""), "control_period", source)
     _check_within(period, *CONTROL_PERIODS, "control_period", source)
@@ -125,7 +129,7 @@ def check_gain_document(
     key = "mechanism.rig.control_period"
     if _number(_entry(rig, "control_period", source, "mechanism.rig."), key, source) != period:
         allowed = f"{rig['control_period']!r}, as {key} says"
-        raise refusal(source, "control_period", shown(period), allowed)
+        raise make_gain_file_error(source, "control_period", format_value(period), allowed)
     contact = _object(mechanism, "contact", source, "mechanism.") if number == 1 else {}
     clearance = inf
     if "clearance" in contact:
@@ -136,20 +140,20 @@ def check_gain_document(
 
 def _check_form(document: Mapping[str, Any], source: str) -> None:
     if not isinstance(document, Mapping):
-        raise refusal(source, "", shown(document), f"a JSON object, {SCHEMA}")
+        raise make_gain_file_error(source, "", format_value(document), f"a JSON object, {SCHEMA}")
     schema = _entry(document, "schema", source, "")
     if schema != SCHEMA:
-        raise refusal(source, "schema", shown(schema), f"'{SCHEMA}'")
+        raise make_gain_file_error(source, "schema", format_value(schema), f"'{SCHEMA}'")
     if not _is_shallow(document):
-        raise refusal(source, "", "deeper nesting", f"at most {DEEPEST} levels")
+        raise make_gain_file_error(source, "", "deeper nesting", f"at most {MAX_NESTING} levels")
     stated = _entry(document, "sha256", source, "")
     try:
         actual = digest(document)
     except (TypeError, ValueError, RecursionError) as error:
-        raise refusal(source, "", f"what JSON cannot express ({error})", "JSON values") from None
+        raise make_gain_file_error(source, "", f"what JSON cannot express ({error})", "JSON values") from None
     if stated != actual:
         allowed = f"'{actual}', the digest of its content (was it edited?)"
-        raise refusal(source, "sha256", shown(stated, 80), allowed)
+        raise make_gain_file_error(source, "sha256", format_value(stated, 80), allowed)
 
 
 def _gains(
@@ -159,17 +163,17 @@ def _gains(
     for name in entries:
         if name not in specifications:
             allowed = ", ".join(specifications) or "no gains"
-            raise refusal(source, "gains", f"an extra gain {shown(name)}", allowed)
+            raise make_gain_file_error(source, "gains", f"an extra gain {format_value(name)}", allowed)
     gains = {}
     for name, specification in specifications.items():
         if name not in entries:
             allowed = f"all gains of {law} (is it of an earlier version? `jaxhil tune` makes a new file)"
-            raise refusal(source, f"gains.{name}", "nothing", allowed)
+            raise make_gain_file_error(source, f"gains.{name}", "nothing", allowed)
         entry = _object(entries, name, source, "gains.")
         prefix = f"gains.{name}."
         unit = _entry(entry, "unit", source, prefix)
         if unit != specification.unit:
-            raise refusal(source, f"{prefix}unit", shown(unit), f"'{specification.unit}'")
+            raise make_gain_file_error(source, f"{prefix}unit", format_value(unit), f"'{specification.unit}'")
         value, lower, upper = (
             _number(_entry(entry, key, source, prefix), prefix + key, source)
             for key in ("value", "lower", "upper")
@@ -186,35 +190,37 @@ def _limits(document: Mapping[str, Any], source: str) -> dict[str, float]:
     limits = {}
     for name, entry in _object(document, "limits", source, "").items():
         if name not in LIMITS:
-            raise refusal(source, "limits", f"an unknown limit {shown(name)}", ", ".join(LIMITS))
+            raise make_gain_file_error(
+                source, "limits", f"an unknown limit {format_value(name)}", ", ".join(LIMITS)
+            )
         specification = LIMITS[name]
         prefix = f"limits.{name}."
         if not isinstance(entry, Mapping):
-            raise refusal(source, prefix[:-1], shown(entry), "an object")
+            raise make_gain_file_error(source, prefix[:-1], format_value(entry), "an object")
         unit = _entry(entry, "unit", source, prefix)
         if unit != specification.unit:
-            raise refusal(source, f"{prefix}unit", shown(unit), f"'{specification.unit}'")
+            raise make_gain_file_error(source, f"{prefix}unit", format_value(unit), f"'{specification.unit}'")
         value = _entry(entry, "value", source, prefix)
         if value is None:
             continue
         limits[name] = _number(value, f"{prefix}value", source)
         _check_within(limits[name], specification.lowest, specification.highest, f"{prefix}value", source)
     try:
-        return complete(limits)
+        return complete_limits(limits)
     except ValueError as error:
-        raise refusal(source, "limits", str(error), "limits that fit one another") from None
+        raise make_gain_file_error(source, "limits", str(error), "limits that fit one another") from None
 
 
 def _entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:
     if key not in mapping:
-        raise refusal(source, prefix + key, "nothing", "this key is required")
+        raise make_gain_file_error(source, prefix + key, "nothing", "this key is required")
     return mapping[key]
 
 
 def _object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Mapping[str, Any]:
     value = _entry(mapping, key, source, prefix)
     if not isinstance(value, Mapping):
-        raise refusal(source, prefix + key, shown(value), "an object")
+        raise make_gain_file_error(source, prefix + key, format_value(value), "an object")
     return value
 
 
@@ -227,17 +233,17 @@ def _number(value: object, key: str, source: str) -> float:
             number = inf
         if isfinite(number):
             return number
-    raise refusal(source, key, shown(value), "a finite number")
+    raise make_gain_file_error(source, key, format_value(value), "a finite number")
 
 
 def _check_within(value: float, lowest: float, highest: float, key: str, source: str) -> None:
     if not lowest <= value <= highest:
-        raise refusal(source, key, shown(value), span(lowest, highest))
+        raise make_gain_file_error(source, key, format_value(value), format_range(lowest, highest))
 
 
 def _is_shallow(document: Mapping[str, Any]) -> bool:
     level: list[Any] = [document]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_NESTING):
         deeper: list[Any] = []
         for value in level:
             if isinstance(value, Mapping):

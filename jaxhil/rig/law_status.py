@@ -6,8 +6,8 @@ and exports. Over a contact the statuses are counted. The first condition that h
     not_reached    no force was measured
     unsure         the compensator did not act at all
     unsure, too_short or noisy
-                   their ticks are more than `DOUBTFUL` of the ticks on which the compensator acted: the most
-                   frequent of the three
+                   their ticks are more than `MAX_DOUBTFUL_SHARE` of the ticks on which the compensator acted:
+                   the most frequent of the three
     unexplained or saturated
                    it was the status of the last tick on which the compensator acted
     identified     otherwise
@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from jaxhil.rig.types import SmallInt
 
-DOUBTFUL = 0.4  # share of the ticks on which the compensator acts
+MAX_DOUBTFUL_SHARE = 0.4  # share of the ticks on which the compensator acts
 
 
 class Status(NamedTuple):
@@ -134,7 +134,7 @@ class StatusCount:
             status = NOT_REACHED
         elif ticks == 0:
             status = UNSURE
-        elif unsure + too_short + noisy > DOUBTFUL * ticks:
+        elif unsure + too_short + noisy > MAX_DOUBTFUL_SHARE * ticks:
             status = UNSURE
             most = unsure
             if too_short > most:

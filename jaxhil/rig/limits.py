@@ -21,8 +21,8 @@ from jaxhil.rig.bounds import (
     TIMES,
 )
 
-BRIDGED = 0.0, 1000.0  # ticks in a row
-COUNTED = 0.0, 1e6  # ticks; more than the longest gap that the clock counts
+HELD_READINGS = 0.0, 1000.0  # ticks in a row
+TICK_COUNTS = 0.0, 1e6  # ticks; more than the longest gap that the clock counts
 RATIOS = (
     0.0,
     1e300,
@@ -49,7 +49,7 @@ LIMITS: dict[str, Limit] = {
     "force_range": Limit("N", FORCES[1], *FORCES, "a force reading of this size is out of range"),
     "measured_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position that the sensor may read"),
     "measured_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position that the sensor may read"),
-    "held_readings": Limit("1", 0.0, *BRIDGED, "largest number of bad readings in a row"),
+    "held_readings": Limit("1", 0.0, *HELD_READINGS, "largest number of bad readings in a row"),
     "force_stuck_travel": Limit("m", DISTANCES[1], *DISTANCES, "travel in contact under one force reading"),
     "position_stuck_travel": Limit(
         "m", DISTANCES[1], *DISTANCES, "the model's travel under one position reading"
@@ -60,15 +60,15 @@ LIMITS: dict[str, Limit] = {
     "late_fraction": Limit(
         "1", 0.25, 0.0, 1.0, "lateness or earliness of a tick, in periods, that is flagged; late: below 0.5"
     ),
-    "missed_in_a_row": Limit("1", COUNTED[1], *COUNTED, "largest number of missed ticks in a row"),
-    "tare_ticks": Limit("1", 0.0, *COUNTED, "readings that a tare averages"),
+    "missed_in_a_row": Limit("1", TICK_COUNTS[1], *TICK_COUNTS, "largest number of missed ticks in a row"),
+    "tare_ticks": Limit("1", 0.0, *TICK_COUNTS, "readings that a tare averages"),
     "tare_spread": Limit("N", FORCES[1], *FORCES, "largest difference between readings of a tare"),
     "bias_limit": Limit("N", FORCES[1], *FORCES, "largest bias that a tare may find"),
     "force_limit": Limit("N", FORCES[1], *FORCES, "largest force on the numerical model"),
     "force_slew": Limit(
         "N/s", FORCE_SLEWS[1], *FORCE_SLEWS, "fastest change of the force on the numerical model"
     ),
-    "limited_in_a_row": Limit("1", 0.0, *BRIDGED, "largest number of ticks in a row with a cut change"),
+    "limited_in_a_row": Limit("1", 0.0, *HELD_READINGS, "largest number of ticks in a row with a cut change"),
     "command_lowest": Limit("m", POSITIONS[0], *POSITIONS, "least position command"),
     "command_highest": Limit("m", POSITIONS[1], *POSITIONS, "largest position command"),
     "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest change of the position command"),
@@ -101,7 +101,7 @@ LIMITS: dict[str, Limit] = {
 }
 
 
-def complete(limits: Mapping[str, float]) -> dict[str, float]:
+def complete_limits(limits: Mapping[str, float]) -> dict[str, float]:
     """Return all limits, defaults included. Raise ValueError if two of them contradict each other."""
     values = {name: limits.get(name, limit.default) for name, limit in LIMITS.items()}
     for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
@@ -115,4 +115,4 @@ def complete(limits: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
-NO_LIMITS: Mapping[str, float] = MappingProxyType(complete({}))
+NO_LIMITS: Mapping[str, float] = MappingProxyType(complete_limits({}))

@@ -2,9 +2,9 @@
 
 A contact begins on the tick on which the model's or the measured position is beyond a specified surface, or
 the compensator acts (it may detect a nearer surface). It is audited once none of this has been so for
-`settling`, the model moves away and the force has decayed; the audit waits for that at most `PATIENCE`. No
-threshold depends on the noise, because a noisy force that happens to be small may still have impulse to give.
-At the latest, the audit takes place in the middle of the gap or when the next contact is announced.
+`settling`, the model moves away and the force has decayed; the audit waits for that at most `MAX_DECAY_WAIT`.
+No threshold depends on the noise, because a noisy force that happens to be small may still have impulse to
+give. At the latest, the audit takes place in the middle of the gap or when the next contact is announced.
 With v_in the model's velocity on the tick before the contact and v now, the audit asks:
 
 - Is the energy consistent? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the
@@ -41,8 +41,8 @@ from jaxhil.rig.law_status import (
 from jaxhil.rig.surfaces import deflection
 from jaxhil.rig.types import Limits, Positive
 
-FADED = 1e-6  # share of the peak force, or of the approach's momentum: the force has decayed
-PATIENCE = 0.1  # s; longest wait for the force to decay
+FORCE_DECAY_RATIO = 1e-6  # share of the peak force, or of the approach's momentum: the force has decayed
+MAX_DECAY_WAIT = 0.1  # s; longest wait for the force to decay
 
 
 class Watchdog:
@@ -81,7 +81,7 @@ class Watchdog:
         self._period = period
         self._mass = limits["equivalent_mass"]
         self._quiet_ticks = limits["settling"] / period
-        self._faded = (limits["settling"] + PATIENCE) / period
+        self._faded = (limits["settling"] + MAX_DECAY_WAIT) / period
         self._longest = limits["longest_contact"] / period if self._mass > 0.0 else inf
         self._fading = limits["fading"]
         self._margin = limits["restitution_margin"]
@@ -156,7 +156,9 @@ class Watchdog:
             if size > self._peak:
                 self._peak = size
             self._regress(force, aligned)
-            faded = size <= FADED * self._peak or size <= self._unfelt or self._quiet >= self._faded
+            faded = (
+                size <= FORCE_DECAY_RATIO * self._peak or size <= self._unfelt or self._quiet >= self._faded
+            )
             outside = not in_contact and self._quiet >= self._quiet_ticks
             leaving = outside and self._side * velocity < 0.0 and faded
             if leaving or side != self._side:
@@ -193,7 +195,7 @@ class Watchdog:
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
         self._entry = entry
-        self._unfelt = FADED * self._mass * abs(entry) / PATIENCE
+        self._unfelt = FORCE_DECAY_RATIO * self._mass * abs(entry) / MAX_DECAY_WAIT
         self._side = side
         self._quiet = 0
         self._ticks = 0

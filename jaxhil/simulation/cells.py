@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxhil.simulation.motion_simulator import State, exponential, generator_rows
+from jaxhil.simulation.motion_simulator import SimulatorState, generator_rows, matrix_exponential
 
-FASTEST_POLE = 64.0  # rad per control period; up to it the motion simulator's matrix exponential is exact
+MAX_POLE = 64.0  # rad per control period; up to it the motion simulator's matrix exponential is exact
 # Degree of the series by the longest cell [rad of the fastest pole]; the error is below 1e-13.
-DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
-SLACK = 1e-3  # relative excess of a cell over its greatest length
-WINDOW = 40.0  # time constants; exp(-40) is below rounding
-INSTANT = 1e-12  # control periods; a shorter lag counts as no lag
+SERIES_DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
+CELL_LENGTH_TOLERANCE = 1e-3  # relative excess of a cell over its greatest length
+LAG_WINDOW = 40.0  # time constants; exp(-40) is below rounding
+MIN_LAG = 1e-12  # control periods; a shorter lag counts as no lag
 
 
 class CellCounts(NamedTuple):
@@ -55,10 +55,10 @@ class Cells(NamedTuple):
     series: Float[Array, "powers columns *batch"]
 
 
-class Course(NamedTuple):
+class IntervalInputs(NamedTuple):
     """Inputs that determine the motion within a sampling interval."""
 
-    state: State  # of the motion simulator at the interval's start
+    state: SimulatorState  # of the motion simulator at the interval's start
     start: Float[Array, "*batch"]  # command at the interval's start [m]
     end: Float[Array, "*batch"]  # command at its end [m]
     surface: Float[Array, "*batch"]  # position of the mechanism's surface [m]
@@ -76,18 +76,18 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
     if np.any(lags > 0):
         shortest = float(np.min(lags))
         # The window may be the whole part.
-        if shortest * WINDOW >= 1:
+        if shortest * LAG_WINDOW >= 1:
             plain, window = 0, max(plain, _power_of_two(1 / shortest))
         else:
-            longest = min(1.0, WINDOW * float(np.max(lags)))
-            window = max(_power_of_two(WINDOW), _power_of_two(fastest * longest))
+            longest = min(1.0, LAG_WINDOW * float(np.max(lags)))
+            window = max(_power_of_two(LAG_WINDOW), _power_of_two(fastest * longest))
     longest = fastest / (plain or window)
     return CellCounts(
-        plain, window, next(degree for most, degree in DEGREES.items() if longest <= 1.001 * most)
+        plain, window, next(degree for most, degree in SERIES_DEGREES.items() if longest <= 1.001 * most)
     )
 
 
-def join_counts(counts: Sequence[CellCounts]) -> CellCounts:
+def merge_cell_counts(counts: Sequence[CellCounts]) -> CellCounts:
     """Return the number of cells that suffices for all mechanisms with these counts."""
     used = [count for count in counts if count.part]
     if not used:
@@ -96,7 +96,7 @@ def join_counts(counts: Sequence[CellCounts]) -> CellCounts:
     if window and any(count.plain or not count.window for count in counts):
         # Lanes whose window was the whole part now have plain cells too; the others keep their window.
         plain = max(count.plain or count.window for count in used)
-        window = max(window, _power_of_two(WINDOW))
+        window = max(window, _power_of_two(LAG_WINDOW))
     return CellCounts(plain, window, degree)
 
 
@@ -132,7 +132,7 @@ def build_cells(
     time_constant: Float[Array, "*batch"],
 ) -> Cells:
     """Compute the tables of all cells; the force is sampled at `fraction` [periods] of the interval."""
-    lag = not_instant(time_constant, control_period) / control_period
+    lag = bound_time_constant(time_constant, control_period) / control_period
     first, second = _edges(counts, fraction, lag), _edges(counts, 1 - fraction, lag)
     begin = jnp.concatenate([fraction - first.before[:-1], 1 - second.before[:-1]])
     length = jnp.concatenate([first.length, second.length])
@@ -145,7 +145,7 @@ def build_cells(
         lines += [jnp.zeros_like(lines[0])] * (counts.degree - 1)
         return Cells(begin, length, rest, states, jnp.stack(lines))
     generator, output = generator_rows(numerator, denominator, control_period)
-    rows = exponential(generator[:, :, None] * begin[None, None], begin)
+    rows = matrix_exponential(generator[:, :, None] * begin[None, None], begin)
     rows = rows.at[:, order].add(-rows[:, order + 1])
     return Cells(
         begin, length, rest, jnp.moveaxis(rows[:order], 2, 1), _series(generator, output, counts.degree)
@@ -153,7 +153,7 @@ def build_cells(
 
 
 @jax.numpy_rank_promotion("allow")
-def power_series(cells: Cells, course: Course) -> Float[Array, "powers cells *batch"]:
+def power_series(cells: Cells, course: IntervalInputs) -> Float[Array, "powers cells *batch"]:
     """Return the coefficients of the position [m], relative to the surface.
 
     They belong to powers of the time since a cell's start [periods].
@@ -173,9 +173,9 @@ def power_series(cells: Cells, course: Course) -> Float[Array, "powers cells *ba
     return position.at[0].add(-course.surface)
 
 
-def not_instant(time_constant: Array, control_period: Array) -> Array:
-    """Return a time constant [s], or `INSTANT` control periods if it is shorter."""
-    least = INSTANT * control_period
+def bound_time_constant(time_constant: Array, control_period: Array) -> Array:
+    """Return a time constant [s], or `MIN_LAG` control periods if it is shorter."""
+    least = MIN_LAG * control_period
     return jnp.where(time_constant > least, time_constant, least)
 
 
@@ -188,7 +188,7 @@ class _Edges(NamedTuple):
 
 def _edges(counts, whole, lag):
     """Return the edges of the cells of a part that is `whole` periods long."""
-    window = jnp.minimum(whole, WINDOW * lag) if counts.plain else whole
+    window = jnp.minimum(whole, LAG_WINDOW * lag) if counts.plain else whole
     window = window if counts.window else jnp.zeros_like(whole)
     left = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
     inside = [window * (i / max(counts.window, 1)) for i in range(counts.window, -1, -1)]
@@ -217,5 +217,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """Return the least power of two that is not below a number, up to a relative excess of `SLACK`."""
-    return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + SLACK))))
+    """Return the least power of two not below a number, within the relative `CELL_LENGTH_TOLERANCE`."""
+    return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + CELL_LENGTH_TOLERANCE))))

@@ -12,15 +12,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from jaxhil.files import read_sealed, remove_stale, write_sealed
+from jaxhil.files import read_checksummed, remove_stale, write_checksummed
 
-ENDING = ".executable"  # suffix of the file names
+EXECUTABLE_SUFFIX = ".executable"  # suffix of the file names
 
 _folders: set[str] = set()
 _this_thread = threading.local()  # its `key` is that of the program last read from or written to a folder
 
 
-def keep_sealed(folder: str | os.PathLike[str]) -> bool:
+def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
     """Make JAX use checksummed files in the folder from now on; return False if this JAX cannot."""
     try:
         from jax._src import compilation_cache
@@ -40,7 +40,7 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
 
         def get(self, key: str) -> bytes | None:
             """Return the program with this key, or None if it is missing or damaged."""
-            content = read_sealed(self._path / f"{key}{ENDING}")
+            content = read_checksummed(self._path / f"{key}{EXECUTABLE_SUFFIX}")
             if content is not None:
                 _this_thread.key = key
             return content
@@ -49,7 +49,7 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
             """Write a program; errors of the file system are ignored."""
             # With a full or read-only folder only the next call takes longer.
             with suppress(OSError):
-                write_sealed(self._path / f"{key}{ENDING}", value, lasting=False)
+                write_checksummed(self._path / f"{key}{EXECUTABLE_SUFFIX}", value, lasting=False)
                 _this_thread.key = key
 
     def get_file_cache(path: str):
@@ -62,7 +62,7 @@ def keep_sealed(folder: str | os.PathLike[str]) -> bool:
     return True
 
 
-def compiled(lowered: Any) -> tuple[Any, str | None]:
+def compile_with_key(lowered: Any) -> tuple[Any, str | None]:
     """Compile a lowered program; return it with its key in our folder, or None if it is not cached there."""
     _this_thread.key = None
     return lowered.compile(), _this_thread.key

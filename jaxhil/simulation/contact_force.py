@@ -14,16 +14,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxhil.contact.laws import ContactLaw, ContactParameters, deflection, two_sided
-from jaxhil.simulation.cells import Course
-from jaxhil.simulation.sensors import lag, lag_decay
+from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided_force, deflection
+from jaxhil.simulation.cells import IntervalInputs
+from jaxhil.simulation.sensors import apply_lag, lag_decay
 
-ROOT_STEPS = 3  # steps of Newton's method, which starts at the root of the chord
-ARCS = 2  # parabolas that approximate the force along one section, for the sensor's lag
-GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # node, weight
+NEWTON_STEPS = 3  # steps of Newton's method, which starts at the root of the chord
+PARABOLAS_PER_SECTION = 2  # parabolas that approximate the force along one section, for the sensor's lag
+GAUSS_LEGENDRE = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # node, weight
 
 
-class Motion(NamedTuple):
+class MotionSample(NamedTuple):
     """Position [m] and velocity [m/s] at an instant of a sampling interval."""
 
     position: Float[Array, "*batch"]
@@ -33,10 +33,12 @@ class Motion(NamedTuple):
 class SamplingInterval(NamedTuple):
     """Motion of the real mechanism from one tick to the next."""
 
-    sample: Motion  # where the force is sampled
+    sample: MotionSample  # where the force is sampled
     start: Any  # right limit at the interval's start; None for loops that use the samples alone
     end: Any  # left limit at its end; None likewise
-    course: Course | None  # input of the exact motion in between; None for loops that do not use it
+    interval_inputs: (
+        IntervalInputs | None
+    )  # input of the exact motion in between; None for loops that do not use it
 
 
 class PlantSignals(NamedTuple):
@@ -51,7 +53,7 @@ class PlantSignals(NamedTuple):
     touched: Float[Array, "*batch"] | None
 
 
-class Contact(NamedTuple):
+class IntervalContact(NamedTuple):
     """Result of the contact in a sampling interval."""
 
     plant_signals: PlantSignals  # contact without the effects of the sensors
@@ -72,13 +74,13 @@ class Surfaces(NamedTuple):
     state: tuple[Any, ...]  # its state
     clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
-    def force(self, motion: Motion) -> tuple[Array, tuple[Any, ...]]:
+    def force(self, motion: MotionSample) -> tuple[Array, tuple[Any, ...]]:
         """Return the signed force [N] and the law's next state."""
-        return two_sided(
+        return compute_two_sided_force(
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
 
-    def after(self, start: Motion, end: Motion, duration: Array, s: Any = 1) -> "Surfaces":
+    def after(self, start: MotionSample, end: MotionSample, duration: Array, s: Any = 1) -> "Surfaces":
         """Return the surfaces with the law's state at the fraction `s` of a smooth section of motion.
 
         `self` has the state at the section's start; the section takes `duration` [s].
@@ -86,14 +88,17 @@ class Surfaces(NamedTuple):
         if not self.law.remembers:
             return self
         side, surface = self.side(start, end)
-        turn = jnp.minimum(_turn(start, end, duration, side), s)
+        turn = jnp.minimum(_find_turning_point(start, end, duration, side), s)
         state = self.state
-        for motion in (along(start, end, duration, turn), along(start, end, duration, s)):
+        for motion in (
+            interpolate_motion(start, end, duration, turn),
+            interpolate_motion(start, end, duration, s),
+        ):
             depth = side * (motion.position - surface)
             _, state = self.law.step(self.parameters, state, depth, side * motion.velocity)
         return self._replace(state=state)
 
-    def side(self, start: Motion, end: Motion) -> tuple[Array, Array]:
+    def side(self, start: MotionSample, end: MotionSample) -> tuple[Array, Array]:
         """Return side (1, -1, or 0 for none) and position [m] of the surface that a section touches."""
         signed = deflection(start.position, self.clearance)
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
@@ -101,7 +106,7 @@ class Surfaces(NamedTuple):
             side < 0, -self.clearance, 0
         )
 
-    def sample(self, motion: Motion, force: Array) -> "ContactSample":
+    def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
         """Return a sample of the contact, with known force [N]."""
         if self.clearance is None:
             edge = self.law.edge(self.parameters, motion.velocity)
@@ -136,7 +141,7 @@ def no_contact(like: Array) -> ContactSample:
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
 
-def works_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
+def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
     """Return the work [J] done on the mechanism and returned by it between two samples.
 
     It is exact if the force is linear in the penetration.
@@ -150,21 +155,23 @@ def works_between(before: ContactSample, now: ContactSample) -> tuple[Array, Arr
     return jnp.where(work > 0, work, 0), jnp.where(work > 0, 0, -work)
 
 
-def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> tuple[Array, Array]:
+def compute_work_along(
+    surfaces: Surfaces, start: MotionSample, end: MotionSample, duration: Array
+) -> tuple[Array, Array]:
     """Return the work [J] done on the mechanism and returned by it along a smooth section of motion.
 
     Work of a pulling force while the penetration decreases is subtracted from the work returned.
     """
-    contact = _touching(surfaces, start, end, duration)
+    contact = _find_section_contact(surfaces, start, end, duration)
 
     def inward(s):
-        return contact.side * along(start, end, duration, s).velocity
+        return contact.side * interpolate_motion(start, end, duration, s).velocity
 
-    since, until = _crossing(inward, duration)
+    since, until = _find_positive_interval(inward, duration)
     turn = jnp.clip(jnp.where(until < 1, until, since), contact.first, contact.last)
     done = returned = jnp.zeros_like(duration)
     for a, b in ((contact.first, turn), (turn, contact.last)):
-        for node, weight in GAUSS:
+        for node, weight in GAUSS_LEGENDRE:
             motion, force = _force_along(surfaces, start, end, duration, a + (b - a) * node)
             work = force * motion.velocity * (weight * (b - a) * duration)
             deeper = contact.side * motion.velocity > 0
@@ -173,7 +180,9 @@ def works_along(surfaces: Surfaces, start: Motion, end: Motion, duration: Array)
     return done, returned
 
 
-def largest_force(surfaces: Surfaces, start: Motion, end: Motion, duration: Array) -> Float[Array, "*batch"]:
+def largest_force(
+    surfaces: Surfaces, start: MotionSample, end: MotionSample, duration: Array
+) -> Float[Array, "*batch"]:
     """Return the largest |force| [N] within a sampling interval.
 
     It is the force at an end, or near the vertex of the parabola through both ends and the middle.
@@ -183,15 +192,15 @@ def largest_force(surfaces: Surfaces, start: Motion, end: Motion, duration: Arra
         return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
 
     first, last = magnitude(start, 0), magnitude(end, 1)
-    half = magnitude(along(start, end, duration, 0.5), 0.5)
+    half = magnitude(interpolate_motion(start, end, duration, 0.5), 0.5)
     slope, bend = last - first, first + last - 2 * half
     vertex = jnp.clip(0.5 - slope / (4 * jnp.where(bend < 0, bend, -1)), 0, 1)
-    top = magnitude(along(start, end, duration, vertex), vertex)
+    top = magnitude(interpolate_motion(start, end, duration, vertex), vertex)
     highest = jnp.where(first > last, first, last)
     return jnp.where((bend < 0) & (top > highest), top, highest)
 
 
-def sensed_lag(
+def apply_sensor_lag(
     surfaces: Surfaces,
     reading: Float[Array, "*batch"],
     interval: SamplingInterval,
@@ -211,10 +220,10 @@ def sensed_lag(
     """
 
     def follow(reading, interval):
-        sample = _lag_along(surfaces, reading, interval.start, interval.sample, until, time_constant)
+        sample = _apply_lag_along(surfaces, reading, interval.start, interval.sample, until, time_constant)
         rest = duration - until
         loaded = surfaces.after(interval.start, interval.sample, until)
-        return sample, _lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
+        return sample, _apply_lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
 
     def fade(reading, interval):
         # The same operations as in `follow`: a lane's bits must not depend on the contacts of other lanes.
@@ -227,7 +236,7 @@ def sensed_lag(
     return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, interval)
 
 
-def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
+def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, s: Any) -> MotionSample:
     """Return position and velocity at the fraction `s` of a section, from its cubic (Hermite)."""
     v_0, v_1 = start.velocity * duration, end.velocity * duration
     moved = end.position - start.position
@@ -235,10 +244,10 @@ def along(start: Motion, end: Motion, duration: Array, s: Any) -> Motion:
     position = start.position + s * (v_0 + s * (bend + s * twist))
     velocity = v_0 + s * (2 * bend + s * 3 * twist)
     safe = jnp.where(duration > 0, duration, 1)
-    return Motion(position, jnp.where(duration > 0, velocity / safe, start.velocity))
+    return MotionSample(position, jnp.where(duration > 0, velocity / safe, start.velocity))
 
 
-def _turn(start, end, duration, side):
+def _find_turning_point(start, end, duration, side):
     """Return the fraction of a section at which an inward motion reverses; 1 if it does not."""
     first, last = side * start.velocity, side * end.velocity
     turns = (first > 0) & (last < 0)
@@ -252,12 +261,12 @@ def _turn(start, end, duration, side):
 
 def _force_along(surfaces, start, end, duration, s):
     """Return motion and force [N] at the fraction `s` of a section, at whose start `surfaces` hold."""
-    motion = along(start, end, duration, s)
+    motion = interpolate_motion(start, end, duration, s)
     force, _ = surfaces.after(start, end, duration, s).force(motion)
     return motion, force
 
 
-class _Touching(NamedTuple):
+class _SectionContact(NamedTuple):
     """Contact during a section of motion."""
 
     touches: Array  # whether there is contact
@@ -267,7 +276,7 @@ class _Touching(NamedTuple):
     at_surface: tuple[Array, Array]  # whether it begins, and whether it ends, at the surface
 
 
-def _touching(surfaces, start, end, duration):
+def _find_section_contact(surfaces, start, end, duration):
     """Return the contact during a section.
 
     Both of its instants are roots on the section's cubic: of the penetration, or of the law's `hold`, which
@@ -276,21 +285,21 @@ def _touching(surfaces, start, end, duration):
     side, surface = surfaces.side(start, end)
 
     def depth(s):
-        return side * (along(start, end, duration, s).position - surface)
+        return side * (interpolate_motion(start, end, duration, s).position - surface)
 
     def hold(s):
-        motion = along(start, end, duration, s)
+        motion = interpolate_motion(start, end, duration, s)
         state = surfaces.after(start, end, duration, s).state
         return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
 
-    enters, leaves = _crossing(depth, duration)
-    catches, lets_go = _crossing(hold, duration)
+    enters, leaves = _find_positive_interval(depth, duration)
+    catches, lets_go = _find_positive_interval(hold, duration)
     first = jnp.where(enters >= catches, enters, catches)
     last = jnp.where(leaves <= lets_go, leaves, lets_go)
     touches = (side != 0) & (first < last)
     begins_at_surface = (enters > 0) & (enters >= catches)
     ends_at_surface = (leaves < 1) & (leaves <= lets_go)
-    return _Touching(
+    return _SectionContact(
         touches,
         side,
         jnp.where(touches, first, 0),
@@ -299,14 +308,14 @@ def _touching(surfaces, start, end, duration):
     )
 
 
-def _crossing(function, like):
+def _find_positive_interval(function, like):
     """Return the bounds in [0, 1] between which a function is positive, if it changes sign at most once."""
     zeros, ones = jnp.zeros_like(like), jnp.ones_like(like)
     at_0, at_1 = function(zeros), function(ones)
     rises, falls = (at_0 <= 0) & (at_1 > 0), (at_0 > 0) & (at_1 <= 0)
     chord = jnp.where(rises | falls, at_1 - at_0, 1)
     root = jnp.where(rises | falls, -at_0 / chord, 0)
-    for _ in range(ROOT_STEPS):
+    for _ in range(NEWTON_STEPS):
         value, slope = jax.jvp(function, (root,), (ones,))
         # A slope of the wrong sign would lead away from the root.
         slope = jnp.where(slope * chord > 0, slope, chord)
@@ -315,21 +324,21 @@ def _crossing(function, like):
     return jnp.where(rises, root, jnp.where(never, 1, 0)), jnp.where(falls, root, jnp.where(never, 0, 1))
 
 
-def _lag_along(surfaces, reading, start, end, duration, time_constant):
+def _apply_lag_along(surfaces, reading, start, end, duration, time_constant):
     """Return the lagging reading [N] after a smooth section of motion.
 
     Between the begin and the end of contact, the force is approximated by parabolas, whose lag is exact.
     """
-    contact = _touching(surfaces, start, end, duration)
+    contact = _find_section_contact(surfaces, start, end, duration)
     span = contact.last - contact.first
     forces = []
-    for i in range(2 * ARCS + 1):
-        s = contact.first + span * (i / (2 * ARCS))
+    for i in range(2 * PARABOLAS_PER_SECTION + 1):
+        s = contact.first + span * (i / (2 * PARABOLAS_PER_SECTION))
         motion, force = _force_along(surfaces, start, end, duration, s)
-        if i in (0, 2 * ARCS):
+        if i in (0, 2 * PARABOLAS_PER_SECTION):
             # At the surface, the force is its limit from inside.
             edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)
             force = jnp.where(contact.at_surface[i > 0], contact.side * edge, force)
         forces.append(jnp.where(contact.touches, force, 0))
     idle, touching, free = (part * duration for part in (contact.first, span, 1 - contact.last))
-    return lag(reading, idle, touching, free, forces, time_constant)
+    return apply_lag(reading, idle, touching, free, forces, time_constant)

@@ -15,21 +15,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxhil.contact.laws import ContactLaw, ContactParameters, two_sided
-from jaxhil.simulation.cells import Cells, not_instant
-from jaxhil.simulation.pieces import (
-    SHORT,
-    cut_at_turns,
+from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided_force
+from jaxhil.simulation.cells import Cells, bound_time_constant
+from jaxhil.simulation.monotone_pieces import (
+    SHORT_CELL_DEGREE,
+    build_cell_motion,
     horner,
-    path_of,
-    pieces_between,
     position_at,
-    rate_at,
+    split_at,
+    split_at_reversals,
+    velocity_at,
 )
-from jaxhil.simulation.roots import crossing, positive_part
+from jaxhil.simulation.roots import find_positive_part, find_sign_change
 
 
-class Rule(NamedTuple):
+class QuadratureRule(NamedTuple):
     """Gauss-Legendre quadrature on (0, 1)."""
 
     nodes: np.ndarray
@@ -44,17 +44,17 @@ class Rule(NamedTuple):
         return np.concatenate([[inside], self.nodes, [1 - inside]]).astype(dtype)
 
 
-def _rule(number: int) -> Rule:
+def _build_quadrature(number: int) -> QuadratureRule:
     """Return a rule of `number` nodes for integrands with a power of the penetration at an end."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
     # The substitution p -> 3 p^2 - 2 p^3 is flat at both ends, so that powers of the penetration are smooth.
-    return Rule(unit**2 * (3 - 2 * unit), weights * 3 * unit * (1 - unit))
+    return QuadratureRule(unit**2 * (3 - 2 * unit), weights * 3 * unit * (1 - unit))
 
 
-RULES = {True: _rule(12), False: _rule(16)}  # True: for short cells
-_NUMBERS = 7  # number of results of a contact, see `_in_one`
-_ALL = (0, 1, 2, 3)  # axes: nodes, levels, pieces, cells
+QUADRATURE_RULES = {True: _build_quadrature(12), False: _build_quadrature(16)}  # True: for short cells
+_RESULT_COUNT = 7  # number of results of a contact, see `_sum_surfaces`
+_SUMMED_AXES = (0, 1, 2, 3)  # axes: nodes, levels, pieces, cells
 
 
 class CellContact(NamedTuple):
@@ -69,7 +69,7 @@ class CellContact(NamedTuple):
     at_end: tuple[Any, ...]  # state of the contact law at the interval's end
 
 
-class Touch(NamedTuple):
+class ContactSurfaces(NamedTuple):
     """Contact law at one surface or two."""
 
     law: ContactLaw
@@ -80,7 +80,7 @@ class Touch(NamedTuple):
 # Arrays per lane are broadcast against those per cell, node and span.
 @jax.numpy_rank_promotion("allow")
 def contact_in_cells(
-    touch: Touch,
+    touch: ContactSurfaces,
     state: tuple[Any, ...],
     cells: Cells,
     series: Float[Array, "powers cells *batch"],
@@ -104,40 +104,45 @@ def contact_in_cells(
     # Each branch returns distinct arrays: without optimisation, the compiler confuses results that share one.
     def touches(state):
         """Return the contact's results and the law's states at the sample and at the end."""
-        pieces = cut_at_turns(path_of(series, cells.length))
-        states, at_sample, at_end = _memory(touch, state, pieces, period)
-        parts = [_along_side(touch, states, pieces, side, period, rates) for side in _sides(touch)]
-        return _in_one(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
+        pieces = split_at_reversals(build_cell_motion(series, cells.length))
+        states, at_sample, at_end = _compute_law_states(touch, state, pieces, period)
+        parts = [_compute_side_contact(touch, states, pieces, side, period, rates) for side in _sides(touch)]
+        return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
         """Return the same without contact."""
         fresh = touch.law.init(jnp.zeros_like(lagged))
-        numbers = jnp.zeros((_NUMBERS, *lagged.shape), lagged.dtype)
+        numbers = jnp.zeros((_RESULT_COUNT, *lagged.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
 
     # In most intervals no lane touches.
     numbers, states = lax.cond(_may_touch(touch, cells, series), touches, free, state)
     *readings, done, returned, before, after, peak = numbers
-    sample, end = _fade(lagged, rates, readings)
+    sample, end = _decay_reading(lagged, rates, readings)
     at_sample, at_end = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in (0, 1))
     return CellContact(sample, end, (done, returned), peak, (before, after), at_sample, at_end)
 
 
 @jax.numpy_rank_promotion("allow")
-def work_of_jump(
-    touch: Touch, state: tuple[Any, ...], before: Float[Array, "*batch"], now: Float[Array, "*batch"]
+def compute_jump_work(
+    touch: ContactSurfaces,
+    state: tuple[Any, ...],
+    before: Float[Array, "*batch"],
+    now: Float[Array, "*batch"],
 ) -> tuple[Array, Array]:
     """Return the work [J] done on the mechanism and returned by it in a jump between two positions."""
     ones = jnp.ones_like(before)
-    path = path_of(jnp.stack([before, now - before])[:, None], ones[None])
-    pieces = pieces_between(path, jnp.stack([0 * ones, ones])[:, None])
+    path = build_cell_motion(jnp.stack([before, now - before])[:, None], ones[None])
+    pieces = split_at(path, jnp.stack([0 * ones, ones])[:, None])
     states = jax.tree.map(lambda leaf: leaf[None, None], state)
-    parts = [_along_side(touch, states, pieces, side, ones, None, still=True) for side in _sides(touch)]
+    parts = [
+        _compute_side_contact(touch, states, pieces, side, ones, None, still=True) for side in _sides(touch)
+    ]
     done, returned = (sum((part.works[i] for part in parts), 0 * ones) for i in (0, 1))
     return done, returned
 
 
-class _Part(NamedTuple):
+class _SurfaceContribution(NamedTuple):
     """Contribution of the contact at one surface; all but the readings are summed over the cells."""
 
     readings: tuple[Array, Array]  # contribution to a lagging reading at the end of either part [N]
@@ -146,7 +151,7 @@ class _Part(NamedTuple):
     touched: tuple[Array, Array]  # [periods]
 
 
-def _in_one(parts: list[_Part]) -> Array:
+def _sum_surfaces(parts: list[_SurfaceContribution]) -> Array:
     """Return the contact's results over all surfaces, (numbers, *batch); the peak force is the last."""
     sums = [jnp.stack([*part.readings, *part.works, *part.touched]) for part in parts]
     peak = functools.reduce(jnp.maximum, [part.peak for part in parts])
@@ -158,7 +163,7 @@ def _sides(touch):
     return (1,) if touch.clearance is None else (1, -1)
 
 
-def _memory(touch, state, pieces, period):
+def _compute_law_states(touch, state, pieces, period):
     """Return the law's state at the start of each piece, at the sample and at the end.
 
     States at the pieces' starts are (pieces of a cell, cells, *batch).
@@ -167,13 +172,15 @@ def _memory(touch, state, pieces, period):
     if not touch.law.remembers:
         return state, state, state
     position = position_at(pieces.path, pieces.high)
-    speed = rate_at(pieces.path, pieces.high) / period
+    speed = velocity_at(pieces.path, pieces.high) / period
 
     def through(state, motion):
         before = []
         for position, speed in zip(*motion, strict=True):
             before.append(state)
-            _, state = two_sided(touch.law, touch.parameters, state, position, speed, touch.clearance)
+            _, state = compute_two_sided_force(
+                touch.law, touch.parameters, state, position, speed, touch.clearance
+            )
         return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *before)
 
     at_end, states = lax.scan(through, state, (jnp.moveaxis(position, 1, 0), jnp.moveaxis(speed, 1, 0)))
@@ -181,7 +188,7 @@ def _memory(touch, state, pieces, period):
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), states), at_sample, at_end
 
 
-class _Rates(NamedTuple):
+class _SensorRates(NamedTuple):
     """Lagging sensor in a lane's cells."""
 
     fades: tuple[Array, Array]  # duration of either part [time constants]
@@ -189,18 +196,18 @@ class _Rates(NamedTuple):
     rest: Array  # time from a cell's end to the end of its part [periods]
 
 
-def _sensor_rates(cells, period, time_constant) -> _Rates | None:
+def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
     """Return the lagging sensor in the cells, or None without lag."""
     if time_constant is None:
         return None
-    rate = period / not_instant(time_constant, period)
+    rate = period / bound_time_constant(time_constant, period)
     half = cells.length.shape[0] // 2
     first = cells.rest[0] + cells.length[0]
     second = cells.rest[half] + cells.length[half]
-    return _Rates((first * rate, second * rate), rate, cells.rest)
+    return _SensorRates((first * rate, second * rate), rate, cells.rest)
 
 
-def _fade(lagged, rates, readings):
+def _decay_reading(lagged, rates, readings):
     """Return the lagging reading at the sample and at the interval's end [N]."""
     if rates is None:
         return lagged, lagged
@@ -217,7 +224,7 @@ def _may_touch(touch, cells, series):
     return jnp.any(may | ~jnp.isfinite(reach))
 
 
-def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Part:
+def _compute_side_contact(touch, states, pieces, side, period, rates, still=False) -> _SurfaceContribution:
     """Return the contact at one side's surface; a `still` motion has zero velocity for the law."""
     law, parameters, path = touch.law, touch.parameters, pieces.path
     inward = side * pieces.way
@@ -229,7 +236,7 @@ def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Par
     def rate(path, s):
         if still:
             return jnp.zeros_like(s)
-        speed = side * rate_at(path, s) / period
+        speed = side * velocity_at(path, s) / period
         if not law.jumps:
             return speed
         # The law depends on the sign of the velocity, which is uncertain by rounding at a reversal.
@@ -249,49 +256,49 @@ def _along_side(touch, states, pieces, side, period, rates, still=False) -> _Par
     levels = jnp.sort(jnp.stack([jnp.zeros_like(pieces.low), *corners]), axis=0)
     low, high = (jnp.broadcast_to(edge, levels.shape) for edge in (pieces.low, pieces.high))
     inner, outer = jnp.where(inward > 0, low, high), jnp.where(inward > 0, high, low)
-    at_level = crossing(height, (path, levels), low, high, inner, outer)
+    at_level = find_sign_change(height, (path, levels), low, high, inner, outer)
     beyond = jnp.concatenate([at_level[1:], outer[:1]])
     spans = jnp.minimum(at_level, beyond), jnp.maximum(at_level, beyond)
-    begin, end = positive_part(hold, (path, parameters, states), *spans)
+    begin, end = find_positive_part(hold, (path, parameters, states), *spans)
     width = end - begin
 
     shape = (-1, *[1] * width.ndim)
-    rule = RULES[len(path.position) <= SHORT + 1]
+    rule = QUADRATURE_RULES[len(path.position) <= SHORT_CELL_DEGREE + 1]
     ends_and_nodes = rule.places(width.dtype)
     places = begin + width * ends_and_nodes.reshape(shape)
     forces = force(places)
     inside, nodes = forces[1:-1], places[1:-1]
     impulses = inside * rule.weights.reshape(shape).astype(width.dtype) * (width * path.length)
-    work = side * impulses * rate_at(path, nodes)
-    peak = jnp.where(width > 0, _largest(force, ends_and_nodes, begin, width, jnp.abs(forces)), 0)
-    return _Part(
-        readings=_lag_of(rates, path, side * impulses, nodes),
+    work = side * impulses * velocity_at(path, nodes)
+    peak = jnp.where(width > 0, _find_largest_force(force, ends_and_nodes, begin, width, jnp.abs(forces)), 0)
+    return _SurfaceContribution(
+        readings=_lag_contributions(rates, path, side * impulses, nodes),
         works=(
-            jnp.sum(jnp.where(inward > 0, work, 0), axis=_ALL),
-            -jnp.sum(jnp.where(inward > 0, 0, work), axis=_ALL),
+            jnp.sum(jnp.where(inward > 0, work, 0), axis=_SUMMED_AXES),
+            -jnp.sum(jnp.where(inward > 0, 0, work), axis=_SUMMED_AXES),
         ),
-        peak=jnp.max(peak, axis=_ALL[:-1]),
-        touched=_by_part(jnp.sum(width * path.length, axis=(0, 1))),
+        peak=jnp.max(peak, axis=_SUMMED_AXES[:-1]),
+        touched=_sum_by_part(jnp.sum(width * path.length, axis=(0, 1))),
     )
 
 
-def _lag_of(rates, path, impulses, places):
+def _lag_contributions(rates, path, impulses, places):
     """Return the contributions [N] of impulses [N periods] to a lagging reading at the end of either part."""
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
         return zeros, zeros
     ago = rates.rest + (1 - places) * path.length
     left = jnp.sum(impulses * jnp.exp(-ago * rates.rate) * rates.rate, axis=(0, 1, 2))
-    return _by_part(left)
+    return _sum_by_part(left)
 
 
-def _by_part(values):
+def _sum_by_part(values):
     """Return the sums over the cells of either part."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 
 
-def _largest(force, places, begin, width, magnitudes):
+def _find_largest_force(force, places, begin, width, magnitudes):
     """Return the largest |force| [N] of a span: at a node, or at the vertex through three nodes."""
     middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(places) - 2)[None]
 

@@ -18,49 +18,56 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxhil.errors import one_line
-from jaxhil.files import write_whole
-from jaxhil.simulation.motion import Curve, Piece
+from jaxhil.errors import to_one_line
+from jaxhil.files import write_atomically
+from jaxhil.simulation.motion_curves import Curve, RunMotion
 
 # Colours of Okabe and Ito, distinct for colour-blind readers; line styles distinguish curves in print.
-BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
-STYLES = {
+BLACK, ORANGE, SKY_BLUE, GREEN, BLUE, VERMILION = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+)
+CURVE_STYLES = {
     "in space": (BLACK, "-", 3.0),
     "before": (VERMILION, "--", 1.5),
     "literature": (ORANGE, "-.", 1.5),
     "tuned": (BLUE, "-", 1.5),
     "rig": (BLUE, "-", 1.5),
 }
-LABELS = {
+CURVE_LABELS = {
     "in space": "in space (reference)",
     "before": "before: no compensation",
     "literature": "literature's rule",
     "tuned": "tuned",
     "rig": "on the rig",
 }
-MOST_PANELS = 4  # greatest number of contacts side by side
+MAX_PANELS = 4  # greatest number of contacts side by side
 
 
 @matplotlib.style.context("default")
-def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None) -> Figure:
+def plot_contacts(pieces: Sequence[RunMotion], title: str, sensors: str | None = None) -> Figure:
     """Draw force and position over time for each contact, beside the ideal contact.
 
     `sensors` is the name of the curve whose measured force and position are drawn too.
     """
-    shown = list(pieces[:MOST_PANELS])
+    shown = list(pieces[:MAX_PANELS])
     if len(pieces) > len(shown):
         title += f" (the first {len(shown)} of {len(pieces)} contacts)"
     # There are two lines of title above the axes, and the legend below them.
     width = max(7.0, 3.6 * len(shown) + 1)
-    figure = new_figure((width, 6.4), title, above=1.0, below=0.95)
+    figure = create_figure((width, 6.4), title, above=1.0, below=0.95)
     figure.subplots_adjust(left=1.1 / width)  # The label of the position takes two lines.
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
     for column, piece in enumerate(shown):
         force, position = grid[0, column], grid[1, column]
         end = 0.0
         for name, curve in piece.curves.items():
-            colour, line, width = STYLES[name]
-            style = {"color": colour, "linestyle": line, "linewidth": width, "label": LABELS[name]}
+            colour, line, width = CURVE_STYLES[name]
+            style = {"color": colour, "linestyle": line, "linewidth": width, "label": CURVE_LABELS[name]}
             if name == "in space":
                 style.update(color="0.65")
             force.plot(1e3 * curve.time, curve.force, **style)
@@ -69,15 +76,15 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
                 extra = {"color": VERMILION, "linestyle": ":", "linewidth": 1.3}
                 force.plot(1e3 * curve.time, curve.force_measured, label="measured", **extra)
                 position.plot(1e3 * curve.time, 1e3 * curve.position_measured, label="measured", **extra)
-            end = max(end, _end(curve))
-        force.set_title(_entered(piece), fontsize=10)
+            end = max(end, _last_force_time(curve))
+        force.set_title(_panel_title(piece), fontsize=10)
         force.set_xlim(-20, 1e3 * end + 20)
         position.set_xlabel("time since first touch [ms]")
         for surface in piece.surfaces:
             position.axhline(1e3 * surface, color=BLACK, linewidth=0.6)
         _limit_position(position, piece, end)
         for axes in (force, position):
-            finish(axes, None)
+            finish_axes(axes, None)
     grid[0, 0].set_ylabel("force on the model [N]")
     grid[1, 0].set_ylabel("position of the model [mm]\n(thin line: a surface)")
     figure.align_ylabels(grid[:, 0])
@@ -85,7 +92,7 @@ def contact_plot(pieces: Sequence[Piece], title: str, sensors: str | None = None
     return figure
 
 
-def new_figure(
+def create_figure(
     size: tuple[float | int, float | int], title: str, above: float = 0.55, below: float = 0.6
 ) -> Figure:
     """Create a figure with margins [inches] above and below its axes.
@@ -99,11 +106,11 @@ def new_figure(
         wspace=0.24, hspace=0.12,
     )  # fmt: skip
     # The title is not a formula.
-    figure.suptitle(one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
+    figure.suptitle(to_one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
     return figure
 
 
-def finish(axes: Axes, legend: Any) -> None:
+def finish_axes(axes: Axes, legend: Any) -> None:
     """Set grid, spines and legend of drawn axes; `legend` is the legend's location, or None for no legend."""
     axes.grid(True, color="0.88", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -123,7 +130,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int | None = None) -> None
 
 
 @matplotlib.style.context("default")
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure atomically and create the parent folders.
 
     Raise OSError if this is impossible or if the path exists and is not a regular file.
@@ -139,10 +146,10 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
         # Letters of the title that the font lacks are drawn as boxes.
         warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)
         figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
-    write_whole(target, content.getvalue())
+    write_atomically(target, content.getvalue())
 
 
-def _entered(piece: Piece) -> str:
+def _panel_title(piece: RunMotion) -> str:
     """Return the contact's name and approach speed, with those curves' speeds that differ."""
     speed = piece.curves["in space"].velocity
     text = f"{piece.name}, entered at {1e3 * speed:.3g} mm/s"
@@ -152,13 +159,13 @@ def _entered(piece: Piece) -> str:
     return text
 
 
-def _end(curve: Curve) -> float:
+def _last_force_time(curve: Curve) -> float:
     """Return the time [s] at which the last force ends."""
     pushed = np.flatnonzero(np.abs(curve.force) > 1e-3 * np.max(np.abs(curve.force), initial=0.0))
     return float(curve.time[pushed[-1]]) if len(pushed) else float(curve.time[-1])
 
 
-def _limit_position(axes: Axes, piece: Piece, end: float) -> None:
+def _limit_position(axes: Axes, piece: RunMotion, end: float) -> None:
     """Set the position axis to the values within the displayed time."""
     values = []
     for curve in piece.curves.values():

@@ -17,21 +17,21 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.simulation import kept_programs
-from jaxhil.simulation.environment import ROLLOUT
+from jaxhil.simulation import cached_programs
+from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS
 from jaxhil.simulation.outcome import Outcome
 
-TILE = 64  # lanes run together on a device; more do not fit into its first-level cache
-SMALLEST_TILE = 16
-OWN = PartitionSpec("device")  # leading axis: the device that has the tiles
-TILES_OF_A_DELAY = 8  # least number for sorting by delay; with fewer, tiles have more uneven durations
+TILE_SIZE = 64  # lanes run together on a device; more do not fit into its first-level cache
+MIN_TILE_SIZE = 16
+DEVICE_AXIS = PartitionSpec("device")  # leading axis: the device that has the tiles
+MIN_TILES_PER_DELAY = 8  # least number for sorting by delay; with fewer, tiles have more uneven durations
 
 
 class Batch(NamedTuple):
     """Scenarios on the devices, as `RigModel.place_batch` distributes them."""
 
     scenarios: Any  # distributed to the devices
-    dealt: "_Dealt"  # assignment of lanes to tiles
+    assignment: "_TileAssignment"  # assignment of lanes to tiles
     places: np.ndarray  # index of each lane in the flattened assignment
 
 
@@ -46,7 +46,7 @@ class RigModel(abc.ABC):
     run_name: ClassVar[str]  # what a run consists of: a contact or an episode
     # names of the errors of a run; an outcome has the rows of the first error, then those of the next
     errors: ClassVar[tuple[str, ...]]
-    compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT  # for batches
+    compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # for batches
 
     @abc.abstractmethod
     def scenarios(
@@ -139,11 +139,11 @@ class RigModel(abc.ABC):
 
     def place_batch(self, scenarios: Any, at_least: int = 1) -> Batch:
         """Distribute scenarios to the devices; the arguments are those of `evaluate`."""
-        dealt = self._deal(scenarios, at_least)
-        places = np.empty_like(dealt.lane, shape=lanes_of(scenarios))
+        dealt = self._assign_tiles(scenarios, at_least)
+        places = np.empty_like(dealt.lane, shape=count_lanes(scenarios))
         places[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
         # Every leaf is placed explicitly, since JAX compiles another program for another placement.
-        return Batch(_placed(self._fold(dealt, scenarios), OWN), dealt, places)
+        return Batch(_place_leaves(self._arrange_scenarios(dealt, scenarios), DEVICE_AXIS), dealt, places)
 
     def begin_batch(
         self,
@@ -153,8 +153,8 @@ class RigModel(abc.ABC):
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
         """Start the evaluation of placed scenarios; see `begin_evaluation`."""
-        common, per_lane = _fold_gains(batch.dealt, batch.scenarios, gains)
-        placed = _placed(common, PartitionSpec()), _placed(per_lane, OWN)
+        common, per_lane = _arrange_gains(batch.assignment, batch.scenarios, gains)
+        placed = _place_leaves(common, PartitionSpec()), _place_leaves(per_lane, DEVICE_AXIS)
         running = wanted(self.run_tiles(loop, *placed, batch.scenarios))
 
         def unfold(leaf):
@@ -174,21 +174,21 @@ class RigModel(abc.ABC):
 
         Leaves are (devices, tiles, ..., lanes of a tile), padded with idle lanes.
         """
-        dealt = self._deal(scenarios, at_least)
-        return *_fold_gains(dealt, scenarios, gains), self._fold(dealt, scenarios)
+        dealt = self._assign_tiles(scenarios, at_least)
+        return *_arrange_gains(dealt, scenarios, gains), self._arrange_scenarios(dealt, scenarios)
 
     def run_tiles(self, loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-        """Run the result of `shard` after `place`; leaves are (devices, tiles, ..., lanes of a tile)."""
+        """Run the result of `shard` after `place_on_devices`; leaves are (devices, tiles, ..., lanes)."""
         static, options = (self, loop), self.compiler_options
-        return kept_programs.run(run_tiles, static, common, per_lane, scenarios, options=options)
+        return cached_programs.run_cached(run_tiles, static, common, per_lane, scenarios, options=options)
 
-    def _deal(self, scenarios: Any, at_least: int) -> "_Dealt":
+    def _assign_tiles(self, scenarios: Any, at_least: int) -> "_TileAssignment":
         """Assign lanes to tiles of the devices; fill up with idle lanes."""
-        number = lanes_of(scenarios)
+        number = count_lanes(scenarios)
         capacity = max(number, at_least)
         devices = jax.device_count()
-        tile = TILE
-        while tile > SMALLEST_TILE and tile * devices >= 2 * capacity:
+        tile = TILE_SIZE
+        while tile > MIN_TILE_SIZE and tile * devices >= 2 * capacity:
             tile //= 2
         # Powers of two up to 16 tiles per device, then multiples of 16, give few programs and little padding.
         tiles = -(-capacity // (tile * devices))
@@ -199,34 +199,40 @@ class RigModel(abc.ABC):
             # Tiles of similar duration go to different devices.
             return order.reshape(tiles, devices, tile).swapaxes(0, 1)
 
-        return _Dealt(fold(np.resize(self._in_turn(scenarios), lanes)), fold(np.arange(lanes) >= number))
+        return _TileAssignment(
+            fold(np.resize(self._sort_lanes(scenarios), lanes)), fold(np.arange(lanes) >= number)
+        )
 
-    def _in_turn(self, scenarios: Any) -> np.ndarray:
+    def _sort_lanes(self, scenarios: Any) -> np.ndarray:
         """Return the order of lanes: by delay, if there are enough lanes per delay, then by duration."""
         duration, delays = self.expected_duration(scenarios), self.whole_delays(scenarios)
-        if TILES_OF_A_DELAY * TILE * len(np.unique(delays)) > len(delays):
+        if MIN_TILES_PER_DELAY * TILE_SIZE * len(np.unique(delays)) > len(delays):
             delays = np.zeros_like(delays)
         order = np.argsort(-duration)
         return order[np.argsort(delays[order], kind="stable")]
 
-    def _fold(self, dealt: "_Dealt", scenarios: Any) -> Any:
+    def _arrange_scenarios(self, dealt: "_TileAssignment", scenarios: Any) -> Any:
         """Return scenarios in the order of the assignment."""
 
         def fold(leaf):
             if leaf.strides[-1] == 0:
                 value = leaf[..., 0]
-                return _in_every_lane(value.tobytes(), value.dtype, value.shape, dealt.lane.shape)
-            return _by_lane(dealt, leaf)
+                return _broadcast_to_lanes(value.tobytes(), value.dtype, value.shape, dealt.lane.shape)
+            return _arrange_leaf(dealt, leaf)
 
         return self.at_rest(jax.tree.map(fold, scenarios), dealt.idle)
 
 
-def place(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
+def place_on_devices(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
     """Place the result of `RigModel.shard` on its devices, for several runs."""
-    return _placed(common, PartitionSpec()), _placed(per_lane, OWN), _placed(scenarios, OWN)
+    return (
+        _place_leaves(common, PartitionSpec()),
+        _place_leaves(per_lane, DEVICE_AXIS),
+        _place_leaves(scenarios, DEVICE_AXIS),
+    )
 
 
-def lanes_of(scenarios: Any) -> int:
+def count_lanes(scenarios: Any) -> int:
     """Return the number of scenarios."""
     return np.shape(scenarios.control_period)[-1]
 
@@ -244,45 +250,48 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
         return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, tiles))
 
     # Devices exchange no data and do not wait for each other.
-    specs = PartitionSpec(), OWN
-    return jax.shard_map(one_device, mesh=_mesh(), in_specs=specs, out_specs=OWN, check_vma=False)(
-        common, (per_lane, scenarios)
-    )
+    specs = PartitionSpec(), DEVICE_AXIS
+    return jax.shard_map(
+        one_device, mesh=_build_device_mesh(), in_specs=specs, out_specs=DEVICE_AXIS, check_vma=False
+    )(common, (per_lane, scenarios))
 
 
-class _Dealt(NamedTuple):
+class _TileAssignment(NamedTuple):
     """Assignment of lanes to tiles, (devices, tiles, lanes of a tile)."""
 
     lane: np.ndarray  # index of the lane
     idle: np.ndarray  # whether the lane only fills the tile
 
 
-def _placed(tree: Any, spec: PartitionSpec) -> Any:
+def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:
     """Place the leaves of a tree on the devices."""
-    return jax.device_put(tree, NamedSharding(_mesh(), spec))
+    return jax.device_put(tree, NamedSharding(_build_device_mesh(), spec))
 
 
-def _fold_gains(dealt: _Dealt, scenarios: Any, gains: Mapping[str, Any]) -> tuple[Any, Any]:
+def _arrange_gains(dealt: _TileAssignment, scenarios: Any, gains: Mapping[str, Any]) -> tuple[Any, Any]:
     """Return gains common to all lanes, and gains per lane in the order of the assignment."""
     # The program computes in the scenarios' precision.
     values = {name: np.asarray(value, scenarios.control_period.dtype) for name, value in gains.items()}
     common = {name: value for name, value in values.items() if not value.ndim}
-    return common, {name: _by_lane(dealt, value) for name, value in values.items() if value.ndim}
+    return common, {name: _arrange_leaf(dealt, value) for name, value in values.items() if value.ndim}
 
 
-def _by_lane(dealt: _Dealt, leaf: np.ndarray) -> np.ndarray:
+def _arrange_leaf(dealt: _TileAssignment, leaf: np.ndarray) -> np.ndarray:
     """Return a leaf in the order of the assignment, (devices, tiles, ..., lanes of a tile)."""
     return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
 
 
 @lru_cache(maxsize=128)  # leaves; enough for a few batches of similar scenarios
-def _in_every_lane(content, dtype, slots, lanes):
+def _broadcast_to_lanes(content, dtype, slots, lanes):
     """Place a value common to all lanes on the devices; it is sent once for all batches."""
     devices, tiles, tile = lanes
     value = np.frombuffer(content, dtype).reshape(1, 1, *slots, 1)
-    return jax.device_put(np.broadcast_to(value, (devices, tiles, *slots, tile)), NamedSharding(_mesh(), OWN))
+    return jax.device_put(
+        np.broadcast_to(value, (devices, tiles, *slots, tile)),
+        NamedSharding(_build_device_mesh(), DEVICE_AXIS),
+    )
 
 
-def _mesh():
+def _build_device_mesh():
     """Return the mesh of all devices."""
     return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))

@@ -9,14 +9,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.simulation.loop import Loop, RigConstants, enter
+from jaxhil.simulation.loop import Loop, RigConstants, start_uniform_motion
 from jaxhil.simulation.loop_state import LoopState
-from jaxhil.simulation.motion_simulator import read, steady_state
+from jaxhil.simulation.motion_simulator import apply_row, steady_state
 from jaxhil.simulation.watch import Watch
 
-APPROACH = 0.02  # s; free approach before a contact, in addition to its phase
-SETTLED = 1e-6  # of the distance per period; deviation of the motion simulator from its steady state
-STILL = 1e-12  # of the speed; change per period below which the numerical model counts as free
+APPROACH_TIME = 0.02  # s; free approach before a contact, in addition to its phase
+SETTLING_TOLERANCE = (
+    1e-6  # of the distance per period; deviation of the motion simulator from its steady state
+)
+FREE_FLIGHT_TOLERANCE = (
+    1e-12  # of the speed; change per period below which the numerical model counts as free
+)
 
 
 def begin_approach(
@@ -35,8 +39,8 @@ def begin_approach(
     starts two periods before the hardware touches.
     """
     nearer = jnp.minimum(rig.scenario.contact_plane, 0)
-    position = nearer - velocity * (APPROACH + phase * rig.constants.control_period)
-    entered = enter(loop, rig, gains, state, position, velocity, tick)
+    position = nearer - velocity * (APPROACH_TIME + phase * rig.constants.control_period)
+    entered = start_uniform_motion(loop, rig, gains, state, position, velocity, tick)
     if not (skip_flight and loop.is_idle_in_flight):
         return entered, jnp.zeros(velocity.shape, jnp.int32)
     stride = rig.constants.control_period * velocity
@@ -44,11 +48,11 @@ def begin_approach(
     moves = stride > 0
     periods = jnp.floor(jnp.where(moves, left, 0) / jnp.where(moves, stride, 1)) - 2
     skipped = lax.stop_gradient(jnp.maximum(periods, 0))
-    state = enter(loop, rig, gains, state, position + skipped * stride, velocity, tick)
+    state = start_uniform_motion(loop, rig, gains, state, position + skipped * stride, velocity, tick)
     return state, skipped.astype(jnp.int32)
 
 
-def arrival(
+def advance_to_surface(
     loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, command: Array, tick: Array
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
     """Return the state shortly before the other of two surfaces, and the lanes that fly freely until then.
@@ -60,19 +64,19 @@ def arrival(
     velocity, position = state.velocity, state.position
     stride = period * velocity
     left = jnp.where(velocity > 0, -position, position + scenario.clearance)
-    spare = left - APPROACH * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
+    spare = left - APPROACH_TIME * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
     strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
-    arrived = enter(loop, rig, gains, state, position + periods * stride, velocity, tick)
-    uniform = enter(loop, rig, gains, state, position, velocity, tick)
+    arrived = start_uniform_motion(loop, rig, gains, state, position + periods * stride, velocity, tick)
+    uniform = start_uniform_motion(loop, rig, gains, state, position, velocity, tick)
     follows = (watch.elapsed == 0) & (watch.quiet > loop.first_tick)
     for component, steady in zip(state.plant.state, uniform.plant.state, strict=True):
         # Time is in periods, so the components of the state are of similar size.
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)
-        follows = follows & (jnp.abs(component - steady) <= SETTLED * scale)
+        follows = follows & (jnp.abs(component - steady) <= SETTLING_TOLERANCE * scale)
     # Flight is not uniform while a force, such as noise, moves the model.
     push = command * period / scenario.equivalent_mass
-    still = push <= STILL * jnp.abs(velocity)
+    still = push <= FREE_FLIGHT_TOLERANCE * jnp.abs(velocity)
     return arrived, follows & still & (periods >= 1)
 
 
@@ -81,4 +85,4 @@ def _newest_sample(loop, rig, entered, stride):
     drive = entered.plant.commands[-1]
     start = drive - stride if loop.hold == "linear" else drive
     before = steady_state(rig.propagation, start, stride)
-    return read(rig.propagation.position, before, start, drive)
+    return apply_row(rig.propagation.position, before, start, drive)

@@ -5,13 +5,13 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.laws.simulation_base import Compensator
-from jaxhil.mechanism.conversion import close_match
+from jaxhil.mechanism.conversion import suggest_names
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.gain_file import LoadedGains, bounds_of, load_gain_file, look_up
+from jaxhil.simulation.gain_file import LoadedGains, find_compensator, load_gain_file, resolve_gain_bounds
 
 
 def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) -> tuple[str, dict[str, float]]:
@@ -25,19 +25,19 @@ def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) ->
     Raise `InputError` for an unknown compensator, setting or gain, for a value outside its bounds, and for a
     gain file that is invalid or does not fit the compensator, the control period or the bounds.
     """
-    law = look_up(compensator, "")
+    law = find_compensator(compensator, "")
     if gains is None:
         return law.name, literature_gains(mechanism, law.name)
     if isinstance(gains, Mapping):
-        return law.name, _partial(mechanism, law, gains)
+        return law.name, _complete_gains(mechanism, law, gains)
     if isinstance(gains, str) and gains in law.settings:
         return law.name, literature_gains(mechanism, law.name, gains)
     if isinstance(gains, os.PathLike) or (isinstance(gains, str) and _is_path(gains)):
-        return _from_file(mechanism, law, gains)
+        return _read_gains(mechanism, law, gains)
     settings = ", ".join(map(repr, law.settings)) or f"no setting's name ({law.name} has none)"
-    hint = close_match(gains, law.settings) if isinstance(gains, str) else ""
+    hint = suggest_names(gains, law.settings) if isinstance(gains, str) else ""
     allowed = f"None, a dict of gains, a gain file's path or {settings}{hint}"
-    raise InputError(f"gains: found {shown(gains)}, allowed {allowed}")
+    raise InputError(f"gains: found {format_value(gains)}, expected {allowed}")
 
 
 def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
@@ -47,13 +47,15 @@ def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
     """
     period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
     if period != tuned:
-        raise InputError(f"{label}: control_period: found {tuned:g} s, allowed {period:g} s of the mechanism")
-    for gain in look_up(loaded.compensator, label).gains:
+        raise InputError(
+            f"{label}: control_period: found {tuned:g} s, expected {period:g} s of the mechanism"
+        )
+    for gain in find_compensator(loaded.compensator, label).gains:
         value = loaded.gains[gain.name]
-        lower, upper, margin = bounds_of(gain, mechanism)
+        lower, upper, margin = resolve_gain_bounds(gain, mechanism)
         if not lower - margin <= value <= upper + margin:
             raise InputError(
-                f"{label}: gains.{gain.name}: found {value:.6g}, allowed {lower:.6g} to {upper:.6g} "
+                f"{label}: gains.{gain.name}: found {value:.6g}, expected {lower:.6g} to {upper:.6g} "
                 f"{gain.unit} for this mechanism"
             )
 
@@ -68,25 +70,25 @@ def _is_path(text: str) -> bool:
         return True
 
 
-def _partial(mechanism: AnyMechanism, law: Compensator, choice: Mapping[Any, Any]) -> dict[str, float]:
+def _complete_gains(mechanism: AnyMechanism, law: Compensator, choice: Mapping[Any, Any]) -> dict[str, float]:
     """Return the gains of a dict, completed with those from the literature."""
     gains = literature_gains(mechanism, law.name)
     specifications = {gain.name: gain for gain in law.gains}
     for name, value in choice.items():
         if name not in specifications:
-            hint = close_match(name, specifications) if isinstance(name, str) else ""
+            hint = suggest_names(name, specifications) if isinstance(name, str) else ""
             allowed = (", ".join(specifications) or f"none: {law.name} has no gains") + hint
-            raise InputError(f"gains: found {shown(name)}, allowed {allowed}")
-        lower, upper, margin = bounds_of(specifications[name], mechanism)
-        number = _number(value)
+            raise InputError(f"gains: found {format_value(name)}, expected {allowed}")
+        lower, upper, margin = resolve_gain_bounds(specifications[name], mechanism)
+        number = _to_float(value)
         if not lower - margin <= number <= upper + margin:
             allowed = f"{lower:.6g} to {upper:.6g} {specifications[name].unit} for this mechanism"
-            raise InputError(f"gains.{name}: found {shown(value)}, allowed {allowed}")
+            raise InputError(f"gains.{name}: found {format_value(value)}, expected {allowed}")
         gains[name] = min(max(number, lower), upper)
     return gains
 
 
-def _number(value: Any) -> float:
+def _to_float(value: Any) -> float:
     """Return a number of Python, NumPy or JAX as a float; NaN for anything else."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -97,22 +99,22 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-def _from_file(
+def _read_gains(
     mechanism: AnyMechanism, law: Compensator, path: str | os.PathLike[str]
 ) -> tuple[str, dict[str, float]]:
     """Return the compensator and the gains of a file; raise `InputError` if they do not fit."""
-    label = one_line(os.fsdecode(path)) or "''"
+    label = to_one_line(os.fsdecode(path)) or "''"
     loaded = load_gain_file(os.fsdecode(path), any_axes=True)
     if isinstance(loaded.mechanism, Mechanism) != isinstance(mechanism, Mechanism):
-        found, allowed = f"gains of {_axes(loaded.mechanism)}", f"of {_axes(mechanism)}"
-        raise InputError(f"{label}: axes: found {found}, allowed {allowed}")
+        found, allowed = f"gains of {_describe_axes(loaded.mechanism)}", f"of {_describe_axes(mechanism)}"
+        raise InputError(f"{label}: axes: found {found}, expected {allowed}")
     if law.name not in ("none", loaded.compensator):
-        found = f"compensator: found {law.name}, allowed {loaded.compensator}"
+        found = f"compensator: found {law.name}, expected {loaded.compensator}"
         raise InputError(f"{found}, which {label} is for")
     check_fit(mechanism, loaded, label)
     return loaded.compensator, loaded.gains
 
 
-def _axes(mechanism: AnyMechanism) -> str:
+def _describe_axes(mechanism: AnyMechanism) -> str:
     """Return the mechanism's number of axes in words."""
     return "one axis" if isinstance(mechanism, Mechanism) else "six axes"

@@ -10,17 +10,17 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.laws.compensators import COMPENSATORS, SIX_AXES, compensator_of
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, get_compensator
 from jaxhil.laws.simulation_base import Compensator, Gain
-from jaxhil.mechanism.conversion import close_match
-from jaxhil.mechanism.file import AnyMechanism, any_from_builtins, from_builtins
+from jaxhil.mechanism.conversion import suggest_names
+from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, from_plain_data
 from jaxhil.rig import GainFileError
 from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
 
-ROUNDING = 1e-9  # relative tolerance of bounds computed on another machine
+BOUND_TOLERANCE = 1e-9  # relative tolerance of bounds computed on another machine
 
 
 class LoadedGains(NamedTuple):
@@ -37,7 +37,7 @@ def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> Load
 
     Raise `InputError` if anything is wrong.
     """
-    source = one_line(os.fspath(path))
+    source = to_one_line(os.fspath(path))
     try:
         document = read_gain_document(path)
     except GainFileError as error:
@@ -53,52 +53,54 @@ def check_document(
     Raise `InputError`, which calls the document `source`.
     """
     try:
-        on_the_rig = check_gain_document(document, source, _simulated_only(), (1, 6) if any_axes else (1,))
+        on_the_rig = check_gain_document(
+            document, source, _gains_without_runtime(), (1, 6) if any_axes else (1,)
+        )
     except GainFileError as error:
         raise InputError(str(error)) from None
-    for key, (fits, allowed) in _REQUIRED.items():
+    for key, (fits, allowed) in _REQUIRED_KEYS.items():
         if key not in document:
-            raise _refusal(source, key, "nothing", "this key is required")
+            raise _make_error(source, key, "nothing", "this key is required")
         if not fits(document[key]):
-            raise _refusal(source, key, shown(document[key]), allowed)
-    read = any_from_builtins if document.get("axes") == 6 else from_builtins
+            raise _make_error(source, key, format_value(document[key]), allowed)
+    read = any_from_plain_data if document.get("axes") == 6 else from_plain_data
     mechanism = read(document["mechanism"], f"{source}: mechanism")
-    law = look_up(on_the_rig.compensator, source).gains
-    check_names(on_the_rig.gains, law, f"{source}: gains")
+    law = find_compensator(on_the_rig.compensator, source).gains
+    check_gain_names(on_the_rig.gains, law, f"{source}: gains")
     for gain in law:
         _check_entry(gain, document["gains"][gain.name], mechanism, source)
     return LoadedGains(document, on_the_rig.compensator, dict(on_the_rig.gains), mechanism)
 
 
-def look_up(compensator: object, source: str) -> Compensator:
+def find_compensator(compensator: object, source: str) -> Compensator:
     """Return the compensator with that name, or raise `InputError` that begins with `source`."""
-    if not isinstance(compensator, str) or compensator not in {**COMPENSATORS, **SIX_AXES}:
-        hint = close_match(compensator, COMPENSATORS) if isinstance(compensator, str) else ""
+    if not isinstance(compensator, str) or compensator not in {**COMPENSATORS, **SIX_AXIS_COMPENSATORS}:
+        hint = suggest_names(compensator, COMPENSATORS) if isinstance(compensator, str) else ""
         allowed = f"one of {', '.join(COMPENSATORS)}{hint}"
-        raise _refusal(source, "compensator", shown(compensator), allowed)
-    return compensator_of(compensator)
+        raise _make_error(source, "compensator", format_value(compensator), allowed)
+    return get_compensator(compensator)
 
 
-def check_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
+def check_gain_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
     """Raise `InputError` unless `gains` are exactly the gains of the law."""
     names = [gain.name for gain in law]
     if set(gains) != set(names):
         wrong = sorted(set(gains) ^ set(names))[0]
         found = "an extra gain" if wrong in gains else "nothing"
-        raise _refusal(source, one_line(str(wrong), 60), found, ", ".join(names) or "no gains")
+        raise _make_error(source, to_one_line(str(wrong), 60), found, ", ".join(names) or "no gains")
 
 
-def bounds_of(gain: Gain, mechanism: Any) -> tuple[float, float, float]:
+def resolve_gain_bounds(gain: Gain, mechanism: Any) -> tuple[float, float, float]:
     """Return a gain's lower and upper bound for a mechanism, and their tolerance for rounding."""
     lower, upper = float(gain.lower(mechanism)), float(gain.upper(mechanism))
-    return lower, upper, ROUNDING * max(abs(lower), abs(upper))
+    return lower, upper, BOUND_TOLERANCE * max(abs(lower), abs(upper))
 
 
-def _simulated_only() -> dict[str, dict[str, GainSpecification]]:
+def _gains_without_runtime() -> dict[str, dict[str, GainSpecification]]:
     """Return the gains of compensators without a runtime class or for six axes alone, by compensator."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
-        for name, law in {**COMPENSATORS, **SIX_AXES}.items()
+        for name, law in {**COMPENSATORS, **SIX_AXIS_COMPENSATORS}.items()
         if name not in RUNTIME_COMPENSATORS
     }
 
@@ -107,18 +109,18 @@ def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, 
     """Raise `InputError` if a gain's unit or bounds in the file differ from the law's."""
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
-        raise _refusal(source, f"{key}.unit", shown(entry["unit"]), f"'{gain.unit}'")
-    lower, upper, margin = bounds_of(gain, mechanism)
+        raise _make_error(source, f"{key}.unit", format_value(entry["unit"]), f"'{gain.unit}'")
+    lower, upper, margin = resolve_gain_bounds(gain, mechanism)
     for bound in ("lower", "upper"):
         if not lower - margin <= entry[bound] <= upper + margin:
             allowed = f"{lower:.12g} to {upper:.12g} for this mechanism"
-            raise _refusal(source, f"{key}.{bound}", shown(entry[bound]), allowed)
+            raise _make_error(source, f"{key}.{bound}", format_value(entry[bound]), allowed)
 
 
-def _refusal(source: str, key: str, found: str, allowed: str) -> InputError:
+def _make_error(source: str, key: str, found: str, allowed: str) -> InputError:
     """Return the error for a key."""
     where = f"{source}: {key}" if source else key
-    return InputError(f"{where}: found {found}, allowed {allowed}")
+    return InputError(f"{where}: found {found}, expected {allowed}")
 
 
 def _is_date(value: object) -> bool:
@@ -147,7 +149,7 @@ def _is_table_of_texts(value: object) -> bool:
 
 
 # For each further key of a gain file: the check of its value, and a description of the allowed values.
-_REQUIRED: dict[str, tuple[Callable[[Any], bool], str]] = {
+_REQUIRED_KEYS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "mechanism_sha256": (
         lambda value: isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None,
         "64 hexadecimal digits",

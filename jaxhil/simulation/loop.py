@@ -12,19 +12,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import ContactLaw
-from jaxhil.laws.simulation_base import Compensator, Constants, Gains
+from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants
 from jaxhil.simulation.cells import CellCounts, Cells, build_cells
 from jaxhil.simulation.contact_force import no_contact
-from jaxhil.simulation.loop_state import LoopState, Plant
+from jaxhil.simulation.loop_state import LoopState, PlantState
 from jaxhil.simulation.motion_simulator import (
-    Delay,
     Propagation,
-    propagation,
-    read_measured,
+    SplitDelay,
+    discretise,
+    read_measured_position,
     split_delay,
     steady_state,
 )
-from jaxhil.simulation.probe import before_contact
+from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
 
 
@@ -45,7 +45,7 @@ class Loop(eqx.Module):
     # whether the motion simulator has limits of velocity or acceleration
     has_limits: bool = eqx.field(static=True)
     # order of the lowest derivative of the mechanism's position that jumps at the ticks; 3 if higher than 2
-    first_break: int = eqx.field(static=True)
+    discontinuity_order: int = eqx.field(static=True)
     cells: CellCounts = eqx.field(static=True)  # cells of a sampling interval; `NO_CELLS` if samples suffice
     is_two_sided: bool = eqx.field(static=True)  # whether there is a second surface
     ring: int = eqx.field(static=True)  # samples in the delay lines of the sensors
@@ -78,7 +78,7 @@ class Loop(eqx.Module):
     @property
     def has_corners(self) -> bool:
         """Return whether the real force may have its peak at a corner: at a tick or a reversal."""
-        return self.first_break in (1, 2) or (self.first_break > 0 and self.law.jumps)
+        return self.discontinuity_order in (1, 2) or (self.discontinuity_order > 0 and self.law.jumps)
 
     @property
     def follows_intervals(self) -> bool:
@@ -99,8 +99,8 @@ class Delays(NamedTuple):
     evaluated when the motion takes place, and the other delays count from there.
     """
 
-    force: Delay  # delay of the force reading
-    position: Delay  # delay of the position reading
+    force: SplitDelay  # delay of the force reading
+    position: SplitDelay  # delay of the position reading
     real: Int[Array, "*batch"]  # intervals to look back for the newest force that acts before a tick
     contact: Int[Array, "*batch"]  # intervals after which the contact law is evaluated
 
@@ -112,7 +112,7 @@ class RigConstants(NamedTuple):
     propagation: Propagation  # discretised motion simulator
     cells: Cells | None  # cells of a sampling interval; None for a loop without cells
     delays: Delays  # in sampling intervals
-    constants: Constants  # rig data that the controller knows
+    constants: KnownConstants  # rig data that the controller knows
     inverse_mass: Float[Array, "*batch"]  # inverse of the equivalent mass [1/kg]
 
 
@@ -136,7 +136,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
         )
     return RigConstants(
         scenario=scenario,
-        propagation=propagation(
+        propagation=discretise(
             simulator.numerator,
             simulator.denominator,
             period,
@@ -147,7 +147,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
         ),
         cells=cells,
         delays=delays,
-        constants=Constants(period, scenario.clearance),
+        constants=KnownConstants(period, scenario.clearance),
         inverse_mass=1 / scenario.equivalent_mass,
     )
 
@@ -165,7 +165,7 @@ def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
     return Delays(force, position, real, now)
 
 
-def enter(
+def start_uniform_motion(
     loop: Loop,
     rig: RigConstants,
     gains: Gains,
@@ -189,11 +189,13 @@ def enter(
     drive = commands[-1] if loop.hold == "linear" else commands[-1] + stride
     start = drive - stride
     end = drive if loop.hold == "linear" else start
-    first_position = read_measured(rig.propagation, steady_state(rig.propagation, start, stride), start, end)
+    first_position = read_measured_position(
+        rig.propagation, steady_state(rig.propagation, start, stride), start, end
+    )
     return state._replace(
         position=position,
         velocity=velocity,
-        plant=Plant(
+        plant=PlantState(
             commands,
             stride,
             steady_state(rig.propagation, drive, stride),
@@ -206,7 +208,7 @@ def enter(
             first_position=first_position,
         ),
         law=loop.law.init(position),
-        entry_velocity=velocity,
-        entry_tick=jnp.broadcast_to(tick, position.shape),
-        first_contact=before_contact(position) if loop.probed else None,
+        onset_velocity=velocity,
+        onset_tick=jnp.broadcast_to(tick, position.shape),
+        first_contact=initial_first_contact(position) if loop.probed else None,
     )

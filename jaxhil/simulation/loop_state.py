@@ -9,7 +9,7 @@ from jaxhil.simulation.contact_force import ContactSample, PlantSignals, Samplin
 from jaxhil.simulation.probe import FirstContact
 
 
-class Plant(NamedTuple):
+class PlantState(NamedTuple):
     """Drives and motion simulator."""
 
     commands: tuple[Array, ...]  # position commands sent to the drives, c(n), c(n-1), ... [m]
@@ -40,7 +40,7 @@ class Rings(NamedTuple):
     interval: SamplingInterval | None
 
 
-class Sensed(NamedTuple):
+class SensorState(NamedTuple):
     """Inputs of future sensor readings."""
 
     rings: Any  # delay lines (`Rings`; None if they are stored separately)
@@ -57,11 +57,11 @@ class LoopState(NamedTuple):
 
     position: Float[Array, "*batch"]  # position of the numerical model [m]
     velocity: Float[Array, "*batch"]  # velocity of the numerical model [m/s]
-    plant: Plant  # drives and motion simulator
-    sensed: Sensed  # inputs of future sensor readings
+    plant: PlantState  # drives and motion simulator
+    sensed: SensorState  # inputs of future sensor readings
     law: tuple[Array, ...]  # state of the contact law
     controller: Any  # state of the compensator
     parameters: ContactParameters  # contact law's parameters for the current contact
-    entry_velocity: Float[Array, "*batch"]  # velocity of the uniform motion in which the run began [m/s]
-    entry_tick: Int[Array, "*batch"]  # tick at which the run began
+    onset_velocity: Float[Array, "*batch"]  # velocity of the uniform motion in which the run began [m/s]
+    onset_tick: Int[Array, "*batch"]  # tick at which the run began
     first_contact: FirstContact | None  # first touch of the hardware; None without a probe

@@ -7,11 +7,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import root_mean_square
-from jaxhil.simulation.scenario import LONGEST_CONTACT, Scenario
-from jaxhil.simulation.watch import RUNAWAY, Watch
+from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, Scenario
+from jaxhil.simulation.watch import DIVERGENCE_SPEED_RATIO, Watch
 
 NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
-STATUS_NAMES = {
+CONTACT_STATUS_NAMES = {
     NOT_REACHED: "not reached",
     OK: "ok",
     TIMEOUT: "timeout",
@@ -19,12 +19,12 @@ STATUS_NAMES = {
     NON_FINITE: "non-finite",
 }
 # Explanations of the statuses other than `OK`.
-STATUS_REASONS = {
+CONTACT_STATUS_REASONS = {
     "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
     "the force sensor did not show it; or the contact before left faster than velocity_limit, and the drives "
     "cannot follow the next approach",
-    "timeout": f"a contact was not over within {LONGEST_CONTACT:g} s, the limit of a contact",
-    "diverged": f"the speed grew beyond {RUNAWAY:g} times that of the first approach",
+    "timeout": f"a contact was not over within {MAX_CONTACT_DURATION:g} s, the limit of a contact",
+    "diverged": f"the speed grew beyond {DIVERGENCE_SPEED_RATIO:g} times that of the first approach",
     "non-finite": "a number was no longer finite",
 }
 
@@ -58,7 +58,7 @@ class Metrics(NamedTuple):
     trajectory_error: Float[Array, "slots *batch"]
     # compensator's estimate of the force measurement's delay [s]; 0 unless it has one
     force_delay: Float[Array, "slots *batch"]
-    status: Int[Array, "slots *batch"]  # one of `STATUS_NAMES`
+    status: Int[Array, "slots *batch"]  # one of `CONTACT_STATUS_NAMES`
     ticks: Int[Array, "slots *batch"]  # ticks until then, including the skipped ticks of approaches
 
 
@@ -83,7 +83,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
     )
 
 
-def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
+def determine_status(scenario: Scenario, watch: Watch, age: Array) -> Array:
     """Return the status of the current contact, `age` ticks into its run.
 
     It is OK also while the contact continues.
@@ -100,12 +100,12 @@ def judge(scenario: Scenario, watch: Watch, age: Array) -> Array:
     ended = jnp.where(watch.measured, OK, NOT_REACHED)
     cut = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
     status = jnp.where(watch.over, ended, jnp.where(late, cut, OK))
-    status = jnp.where(watch.rebound > RUNAWAY * scenario.velocity, DIVERGED, status)
+    status = jnp.where(watch.rebound > DIVERGENCE_SPEED_RATIO * scenario.velocity, DIVERGED, status)
     finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
     return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
 
 
-def collect(
+def store_metrics(
     scenario: Scenario,
     metrics: Metrics,
     watch: Watch,

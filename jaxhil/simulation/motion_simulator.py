@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-SQUARINGS, TERMS = 6, 13  # of the matrix exponential
+EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 6, 13  # of the matrix exponential
 
 # One array of the batch shape per component: a stacked state would have to be split at every tick.
-State = tuple[Array, ...]
+SimulatorState = tuple[Array, ...]
 
 
-class Delay(NamedTuple):
+class SplitDelay(NamedTuple):
     """Delay of r control periods, as whole sampling intervals to look back and a position within one."""
 
     intervals: Int[Array, "*batch"]  # to look back from the newest one, which is interval n - 1 at tick n
@@ -45,14 +45,14 @@ class Propagation(NamedTuple):
     steady_velocity: Float[Array, "order *batch"]  # steady state per growth of the command in a period
 
 
-def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> Delay:
+def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> SplitDelay:
     """Return whole intervals and fraction of `delay` [s]; multiples of the period are recognised to 1e-9."""
     periods = delay / control_period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
-    return Delay(whole.astype(jnp.int32), 1 - (periods - whole))
+    return SplitDelay(whole.astype(jnp.int32), 1 - (periods - whole))
 
 
-def propagation(
+def discretise(
     numerator: Float[Array, "order *batch"],
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
@@ -69,7 +69,7 @@ def propagation(
     """
     order = denominator.shape[0] - 1
     if order == 0:
-        return _ideal(control_period, force_fraction, position_fraction, hold, ends)
+        return _ideal_propagation(control_period, force_fraction, position_fraction, hold, ends)
     system, output = _companion(numerator, denominator, control_period)
     zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
     generator, _ = generator_rows(numerator, denominator, control_period)
@@ -80,15 +80,18 @@ def propagation(
         instants.append(position_fraction)
     fractions = jnp.stack(instants)
     # The axes are row, column, instant in the interval, batch.
-    rows = exponential(generator[:, :, None] * fractions[None, None], fractions)
+    rows = matrix_exponential(generator[:, :, None] * fractions[None, None], fractions)
     # This changes columns for (z, u(0), u(1) - u(0)) into columns for (z, u(0), u(1)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
     state = rows[:order]
 
     def motion(instant):
         state_rows = rows[:, :, instant]
-        rates = [*state_rows[1:order], _combine(system[order - 1], state_rows[:order]) + state_rows[order]]
-        return _combine(output, state_rows[:order]), _combine(output, rates) / control_period[None]
+        rates = [
+            *state_rows[1:order],
+            _weighted_sum(system[order - 1], state_rows[:order]) + state_rows[order],
+        ]
+        return _weighted_sum(output, state_rows[:order]), _weighted_sum(output, rates) / control_period[None]
 
     position, velocity = motion(1)
     steady_command = jnp.stack([-1 / system[order - 1][0]] + [zeros] * (order - 1))
@@ -96,7 +99,7 @@ def propagation(
         transition=state[:, :, 0],
         position=position,
         velocity=velocity,
-        measured_position=None if position_fraction is None else _combine(output, state[:, :, -1]),
+        measured_position=None if position_fraction is None else _weighted_sum(output, state[:, :, -1]),
         start=motion(2) if ends else None,
         end=motion(0) if ends else None,
         steady_command=steady_command,
@@ -121,7 +124,7 @@ def generator_rows(
     return jnp.stack([jnp.stack(row) for row in generator]), output
 
 
-def exponential(
+def matrix_exponential(
     upper: Float[Array, "order order_plus_2 *batch"], ramp: Float[Array, "*batch"]
 ) -> Float[Array, "order_plus_1 order_plus_2 *batch"]:
     """Return the first order + 1 rows of the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]].
@@ -133,7 +136,7 @@ def exponential(
     """
     order, size = upper.shape[:2]
     units = jnp.eye(size, dtype=upper.dtype).reshape(size, size, *[1] * ramp.ndim)
-    scaled = upper / 2**SQUARINGS
+    scaled = upper / 2**EXPONENTIAL_SQUARINGS
 
     def ramp_row(ramp):
         """Return the row (0, 1, r)."""
@@ -141,31 +144,31 @@ def exponential(
 
     def product(left, right, ramp):
         """Return the upper rows of a product of two such matrices, or of their powers."""
-        total = _product(left[:, :order], right)
+        total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
 
     # The loops are not unrolled: the compiler would fuse the products and compute them repeatedly.
     def horner(step, carry):
-        terms = jnp.asarray(TERMS - step, ramp.dtype)
-        return units[:order] + product(scaled, *carry) / terms, ramp / 2**SQUARINGS / terms
+        terms = jnp.asarray(EXPONENTIAL_TERMS - step, ramp.dtype)
+        return units[:order] + product(scaled, *carry) / terms, ramp / 2**EXPONENTIAL_SQUARINGS / terms
 
     def square(_, carry):
         total, ramp = carry
         return product(total, total, ramp), 2 * ramp
 
     carry = jnp.broadcast_to(units[:order], upper.shape), jnp.zeros_like(ramp)
-    carry = jax.lax.fori_loop(0, TERMS, horner, carry)
-    total, ramp = jax.lax.fori_loop(0, SQUARINGS, square, carry)
+    carry = jax.lax.fori_loop(0, EXPONENTIAL_TERMS, horner, carry)
+    total, ramp = jax.lax.fori_loop(0, EXPONENTIAL_SQUARINGS, square, carry)
     return jnp.concatenate([total, ramp_row(ramp)[None]])
 
 
-def advance(transition: Array, state: State, start: Array, end: Array) -> State:
+def advance_state(transition: Array, state: SimulatorState, start: Array, end: Array) -> SimulatorState:
     """Return the state one period later."""
-    return tuple(read(transition[i], state, start, end) for i in range(len(state)))
+    return tuple(apply_row(transition[i], state, start, end) for i in range(len(state)))
 
 
-def read(row: Array, state: State, start: Array, end: Array) -> Array:
+def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Array:
     """Return a row times (state, command at the interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for i, component in enumerate(state):
@@ -173,9 +176,11 @@ def read(row: Array, state: State, start: Array, end: Array) -> Array:
     return total
 
 
-def read_measured(plant: Propagation, state: State, start: Array, end: Array) -> Array | None:
+def read_measured_position(
+    plant: Propagation, state: SimulatorState, start: Array, end: Array
+) -> Array | None:
     """Return the position [m] at its sensor's sampling instant; None if unused."""
-    return None if plant.measured_position is None else read(plant.measured_position, state, start, end)
+    return None if plant.measured_position is None else apply_row(plant.measured_position, state, start, end)
 
 
 def rate_row(
@@ -185,7 +190,7 @@ def rate_row(
 ) -> Float[Array, "columns *batch"]:
     """Return the row of the time derivative [1/s] of a row's result within the sampling interval.
 
-    It uses d/ds E(s) = E(s) G, where G is the generator of `propagation`.
+    It uses d/ds E(s) = E(s) G, where G is the generator of `discretise`.
     """
     *state, start, end = row
     zero = jnp.zeros_like(start)
@@ -199,13 +204,13 @@ def rate_row(
     return jnp.stack([*rates, driven - growth, growth]) / control_period[None]
 
 
-def steady_state(plant: Propagation, command: Array, step: Array) -> State:
+def steady_state(plant: Propagation, command: Array, step: Array) -> SimulatorState:
     """Return the state in uniform motion: drive input `command`, which grows by `step` per period."""
     order = plant.steady_command.shape[0]
     return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
 
 
-def _ideal(control_period, force_fraction, position_fraction, hold, ends):
+def _ideal_propagation(control_period, force_fraction, position_fraction, hold, ends):
     """Return the propagation of an ideal motion simulator, which follows its command exactly."""
 
     def position(fraction):
@@ -263,7 +268,7 @@ def _steady_velocity(system, transition, steady_command, hold):
     return -jnp.moveaxis(solved[..., 0], -1, 0)
 
 
-def _combine(weights, rows):
+def _weighted_sum(weights, rows):
     """Return sum_i weights_i rows_i; rows are (columns, *batch)."""
     total = weights[0][None] * rows[0]
     for weight, row in zip(weights[1:], rows[1:], strict=True):
@@ -271,7 +276,7 @@ def _combine(weights, rows):
     return total
 
 
-def _product(left, right):
+def _matrix_product(left, right):
     """Return the matrix product."""
     total = left[:, 0, None] * right[None, 0]
     for k in range(1, left.shape[0]):

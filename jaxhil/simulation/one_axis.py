@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
-from jaxhil.simulation.outcome import Outcome, compare_with_reference
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.outcome import Outcome, compare_with_ideal
 from jaxhil.simulation.rollout import rollout, run_contacts
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
@@ -34,7 +34,7 @@ class OneAxis(RigModel):
         return build_scenarios(mechanism, draws, seed, first)
 
     def loop(self, mechanism: Mechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Return the loop; `parts` are the options of `jaxhil.simulation.building.build_loop`."""
+        """Return the loop; `parts` are the options of `jaxhil.simulation.loop_construction.build_loop`."""
         return build_loop(mechanism, compensator, scenarios, **parts)
 
     def runs(self, mechanism: Mechanism) -> int:
@@ -43,7 +43,7 @@ class OneAxis(RigModel):
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         """Run the contacts of a batch and compare them with the ideal ones."""
-        return compare_with_reference(loop, scenario, rollout(loop, gains, scenario))
+        return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
         """Return scenarios in which the `idle` lanes have no contact."""
@@ -92,8 +92,8 @@ class OneAxis(RigModel):
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
         """Return the outcome of a result of `prepared`; differentiable with respect to the gains."""
         if loop.compensator.is_large:
-            rig = _apart(rig)
-        return compare_with_reference(loop, rig.scenario, run_contacts(loop, gains, rig))
+            rig = _separate_loops(rig)
+        return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))
 
     def noise_amplification(self, loop: Loop, gains: Gains, rig: RigConstants) -> Float[Array, "*batch"]:
         """Return the compensator's amplification of the force sensor's noise [1]."""
@@ -104,7 +104,7 @@ ONE_AXIS = OneAxis()
 evaluate = ONE_AXIS.evaluate
 
 
-def _apart(rig: RigConstants) -> RigConstants:
+def _separate_loops(rig: RigConstants) -> RigConstants:
     """Return an equal rig for which XLA compiles loops around the runs separately from them.
 
     XLA compiles the outermost loop without a sort, with all loops in it, as one function, and LLVM's time for

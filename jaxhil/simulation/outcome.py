@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.laws import ContactParameters
-from jaxhil.contact.reference import Reference
-from jaxhil.simulation.contact_bounds import unlike_ideal
+from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.metrics import OK, Metrics
 from jaxhil.simulation.scenario import Scenario
@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
         return self.metrics.duration / self.reference_duration
 
 
-def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
+def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
     """Compare a run with the ideal contacts, each with the approach velocity that it had on the rig."""
     slots = metrics.restitution.shape[0]
     number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
@@ -57,7 +57,7 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
     known_reference = scenario.reference
     if known_reference is not None:
         is_known = ~jnp.isnan(known_reference.restitution)
-        reference = Reference(
+        reference = IdealContact(
             *(jnp.where(is_known, a, b) for a, b in zip(known_reference, reference, strict=True))
         )
     return Outcome(
@@ -71,7 +71,7 @@ def compare_with_reference(loop: Loop, scenario: Scenario, metrics: Metrics) -> 
         wanted=wanted,
         good=good,
         unlike=good
-        & unlike_ideal(
+        & is_contact_out_of_bounds(
             metrics.peak_force,
             reference.peak_force,
             metrics.duration,

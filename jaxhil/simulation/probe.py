@@ -72,13 +72,13 @@ class Deviation(NamedTuple):
     count: Float[Array, "*batch"]  # number of these deviations
 
 
-def before_contact(like: Float[Array, "*batch"]) -> FirstContact:
+def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
     """Return the state before the first touch."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
 
-def follow_hardware(
+def update_first_contact(
     first_contact: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
 ) -> FirstContact:
     """Update the hardware's first touch with a sample.
@@ -89,18 +89,18 @@ def follow_hardware(
     first = ~first_contact.made & (depth > 0)
     return FirstContact(
         first_contact.made | first,
-        jnp.where(first, now - _since(depth, rate, period), first_contact.time),
+        jnp.where(first, now - _periods_since_touch(depth, rate, period), first_contact.time),
         jnp.where(first, side, first_contact.side),
     )
 
 
-def no_deviation(like: Float[Array, "*batch"]) -> Deviation:
+def initial_deviation(like: Float[Array, "*batch"]) -> Deviation:
     """Return the state before the numerical model touches."""
     zeros = jnp.zeros_like(like)
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 
 
-def follow_model(
+def update_deviation(
     deviation: Deviation,
     reference: Float[Array, "samples *batch"],
     span: Array,
@@ -116,7 +116,7 @@ def follow_model(
     """
     first = ~deviation.entered & (depth > 0)
     entered = deviation.entered | first
-    begin = jnp.where(first, now - _since(depth, rate, period), deviation.time)
+    begin = jnp.where(first, now - _periods_since_touch(depth, rate, period), deviation.time)
     since = jnp.where(entered, now - begin, 0) * period
     samples = len(reference)
     position = jnp.clip(since / span, 0, 1) * (samples - 1)
@@ -141,7 +141,7 @@ def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
     return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
 
 
-def _since(depth, rate, period):
+def _periods_since_touch(depth, rate, period):
     """Return the periods since a uniform motion reached the surface, at most one."""
     stride = rate * period
     inward = stride > 0

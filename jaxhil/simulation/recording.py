@@ -15,19 +15,19 @@ from jaxtyping import Array
 from jaxhil.laws.simulation_base import Gains, Signals
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation import kept_programs
-from jaxhil.simulation.building import build_loop
+from jaxhil.simulation import cached_programs
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.rollout import start, stretch, stretch_length, turn_over
+from jaxhil.simulation.rollout import begin_next_contacts, run_segment, segment_length, start_rollout
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tick import RunState, Tick
 
-CHUNK = 512  # ticks per call of the compiled program
+TICKS_PER_CALL = 512  # ticks per call of the compiled program
 
 
-class Lane(NamedTuple):
+class LaneRecord(NamedTuple):
     """Readings and commands of the controller in one lane, (ticks,), until the end of its last contact."""
 
     signals: Signals  # readings of the controller
@@ -51,7 +51,7 @@ def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
     return build_scenarios(mechanism, draws, seed=seed)
 
 
-def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[Lane]]:
+def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[LaneRecord]]:
     """Run the loop until every lane is done; return metrics (slots, lanes), and each lane's record.
 
     Free flight between two surfaces is not skipped, since the rig does not skip it either. A record ends
@@ -61,40 +61,40 @@ def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[La
     metrics, ticks = record_ticks(loop, loaded.gains, batch)
     zeroed = loop.has_force_noise or loop.has_force_bias
     return metrics, [
-        _lane(jax.tree.map(lambda leaf, index=index: leaf[:, index], ticks), zeroed)
+        _build_lane_record(jax.tree.map(lambda leaf, index=index: leaf[:, index], ticks), zeroed)
         for index in range(ticks.active.shape[1])
     ]
 
 
 def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple[Metrics, Tick]:
     """Run the loop until every lane is done; return metrics (slots, lanes) and all ticks (ticks, lanes)."""
-    arrays = as_arrays(gains)
-    rig, run = begin(loop, arrays, batch)
+    arrays = convert_gains(gains)
+    rig, run = start_batch(loop, arrays, batch)
     chunks = []
     while np.any(run.active):
-        run, ticks = kept_programs.run(_record_chunk, loop, rig, arrays, run)
+        run, ticks = cached_programs.run_cached(_record_segment, loop, rig, arrays, run)
         chunks.append(jax.device_get(ticks))
     return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
 
 
 def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
     """Compile the programs of `record_lanes` for these arguments."""
-    loop, gains = build_loop(loaded.mechanism, loaded.compensator, batch), as_arrays(loaded.gains)
-    rig, run = begin(loop, gains, batch)
-    kept_programs.prepare(_record_chunk, loop, rig, gains, run)
+    loop, gains = build_loop(loaded.mechanism, loaded.compensator, batch), convert_gains(loaded.gains)
+    rig, run = start_batch(loop, gains, batch)
+    cached_programs.compile_cached(_record_segment, loop, rig, gains, run)
 
 
-def begin(loop: Loop, gains: Gains, batch: Scenario) -> tuple[RigConstants, RunState]:
+def start_batch(loop: Loop, gains: Gains, batch: Scenario) -> tuple[RigConstants, RunState]:
     """Return the constants and the state of a batch of scenarios before the first tick."""
-    return kept_programs.run(_begin, loop, gains, batch)
+    return cached_programs.run_cached(_start_loop, loop, gains, batch)
 
 
-def as_arrays(gains: Mapping[str, Any]) -> Gains:
+def convert_gains(gains: Mapping[str, Any]) -> Gains:
     """Return gains as JAX arrays."""
     return {name: jnp.asarray(value) for name, value in gains.items()}
 
 
-def _lane(ticks: Tick, zeroed: bool) -> Lane:
+def _build_lane_record(ticks: Tick, zeroed: bool) -> LaneRecord:
     """Return the record of one lane."""
     # A pause between two contacts is part of the record; ticks after the last active one are not.
     end = int(np.max(np.nonzero(ticks.active)[0], initial=-1)) + 1
@@ -102,21 +102,21 @@ def _lane(ticks: Tick, zeroed: bool) -> Lane:
     finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
     end = end if np.all(finite) else int(np.argmin(finite))
     ticks = jax.tree.map(lambda leaf: leaf[:end], ticks)
-    return Lane(ticks.signals, ticks.command, ticks.identified, zeroed, ticks.sent, ticks.contact)
+    return LaneRecord(ticks.signals, ticks.command, ticks.identified, zeroed, ticks.sent, ticks.contact)
 
 
-def _begin(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
+def _start_loop(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
     """Return the constants and the state before the first tick."""
     rig = build_rig_constants(loop, scenario)
-    return rig, start(loop, rig, gains, skip_flight=False)
+    return rig, start_rollout(loop, rig, gains, skip_flight=False)
 
 
-def _record_chunk(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> tuple[RunState, Tick]:
-    """Run and record `CHUNK` ticks."""
+def _record_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> tuple[RunState, Tick]:
+    """Run and record `TICKS_PER_CALL` ticks."""
 
     def body(run, _):
-        run, ticks = stretch(loop, rig, gains, run, record=True)
-        return turn_over(loop, rig, gains, run, skip_flight=False), ticks
+        run, ticks = run_segment(loop, rig, gains, run, record=True)
+        return begin_next_contacts(loop, rig, gains, run, skip_flight=False), ticks
 
-    run, ticks = lax.scan(body, run, None, length=CHUNK // stretch_length(loop))
+    run, ticks = lax.scan(body, run, None, length=TICKS_PER_CALL // segment_length(loop))
     return run, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ticks)

@@ -11,15 +11,15 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from jaxhil.contact.laws import KEYS, LAWS, ContactLaw
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, ContactLaw
+from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator, Gain
-from jaxhil.mechanism.file import DEFAULT, load
+from jaxhil.mechanism.file import DEFAULT_MECHANISM, load
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,59}")
+_NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,59}")
 _RUNTIME_METHODS = ("step", "reset", "position_command", "next_contact")
 
 
@@ -46,10 +46,10 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
         'my_lead'
     """
     if not isinstance(law, (Compensator, ContactLaw)):
-        found = f"the class {law.__name__}" if isinstance(law, type) else shown(law)
+        found = f"the class {law.__name__}" if isinstance(law, type) else format_value(law)
         allowed = "an instance of jaxhil.Compensator or jaxhil.ContactLaw"
-        raise InputError(f"register: found {one_line(found, 60)}, allowed {allowed}")
-    table: dict[str, Any] = COMPENSATORS if isinstance(law, Compensator) else LAWS
+        raise InputError(f"register: found {to_one_line(found, 60)}, expected {allowed}")
+    table: dict[str, Any] = COMPENSATORS if isinstance(law, Compensator) else CONTACT_LAWS
     _check_name(law, table)
     _check_static(law)
     if isinstance(law, Compensator):
@@ -60,23 +60,25 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
         else:
             RUNTIME_COMPENSATORS.pop(law.name, None)
     elif runtime is not None:
-        raise _refusal(law, "runtime", shown(runtime), "none: a contact law runs in the simulation alone")
-    elif unknown := [key.name for key in law.keys or () if key not in KEYS.values()]:
-        raise _refusal(law, "keys", unknown[0], f"keys that files have: {', '.join(KEYS)}")
+        raise _make_error(
+            law, "runtime", format_value(runtime), "none: a contact law runs in the simulation alone"
+        )
+    elif unknown := [key.name for key in law.keys or () if key not in CONTACT_KEYS.values()]:
+        raise _make_error(law, "keys", unknown[0], f"keys that files have: {', '.join(CONTACT_KEYS)}")
     table[law.name] = law
 
 
 def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
     """Raise `InputError` if a law's name is invalid or belongs to another law."""
     name = getattr(law, "name", None)
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not isinstance(name, str) or not _NAME_PATTERN.fullmatch(name):
         where = f"register: {type(law).__name__}.name"
         allowed = "a word of letters, digits and underscores, as `name: ClassVar[str] = ...` gives it"
-        raise InputError(f"{where}: found {shown(name or None)}, allowed {allowed}")
+        raise InputError(f"{where}: found {format_value(name or None)}, expected {allowed}")
     if name in table:
         home, other_home = ((type(x).__module__, type(x).__qualname__) for x in (law, table[name]))
         if home != other_home or home[0].startswith("jaxhil."):
-            raise _refusal(law, "name", "the name of another law", f"none of {', '.join(table)}")
+            raise _make_error(law, "name", "the name of another law", f"none of {', '.join(table)}")
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
@@ -88,21 +90,29 @@ def _check_static(law: Compensator | ContactLaw) -> None:
         is_equal = False
     if not is_equal:
         allowed = "plain numbers, texts and tuples: a law holds no arrays"
-        raise _refusal(law, "fields", "what cannot be hashed", allowed)
+        raise _make_error(law, "fields", "what cannot be hashed", allowed)
 
 
 def _check_gains(law: Compensator) -> None:
     """Raise `InputError` if names, units or bounds of the gains are invalid."""
     gains = getattr(law, "gains", None)
     if not isinstance(gains, tuple) or not all(isinstance(gain, Gain) for gain in gains):
-        raise _refusal(law, "gains", shown(gains), "a tuple of jaxhil.Gain")
+        raise _make_error(law, "gains", format_value(gains), "a tuple of jaxhil.Gain")
     names = [gain.name for gain in gains]
     for gain in gains:
-        if not isinstance(gain.name, str) or not _NAME.fullmatch(gain.name) or names.count(gain.name) > 1:
-            raise _refusal(law, "gains", shown(gain.name), "a word of letters, digits and underscores, once")
+        if (
+            not isinstance(gain.name, str)
+            or not _NAME_PATTERN.fullmatch(gain.name)
+            or names.count(gain.name) > 1
+        ):
+            raise _make_error(
+                law, "gains", format_value(gain.name), "a word of letters, digits and underscores, once"
+            )
         if not isinstance(gain.unit, str) or not gain.unit:
-            raise _refusal(law, f"gains.{gain.name}.unit", shown(gain.unit), "a unit, '1' if there is none")
-        _check_bounds(law, gain, load(DEFAULT).mechanism)
+            raise _make_error(
+                law, f"gains.{gain.name}.unit", format_value(gain.unit), "a unit, '1' if there is none"
+            )
+        _check_bounds(law, gain, load(DEFAULT_MECHANISM).mechanism)
 
 
 def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
@@ -114,20 +124,24 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
         except Exception as error:
             found = f"{type(error).__name__}: {error}"
             allowed = f"a function of the mechanism that returns a number (tried on {mechanism.name})"
-            raise _refusal(law, f"gains.{gain.name}.{part}", one_line(found, 100), allowed) from None
+            raise _make_error(law, f"gains.{gain.name}.{part}", to_one_line(found, 100), allowed) from None
     lower, nominal, upper = values.values()
     if not (math.isfinite(lower) and math.isfinite(upper) and lower <= nominal <= upper):
         allowed = f"lower <= nominal <= upper, all finite (tried on {mechanism.name})"
-        raise _refusal(law, f"gains.{gain.name}", f"{lower:g}, {nominal:g}, {upper:g}", allowed)
+        raise _make_error(law, f"gains.{gain.name}", f"{lower:g}, {nominal:g}, {upper:g}", allowed)
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
     """Raise `InputError` if the runtime class lacks a method or has other gains than the law."""
     if not inspect.isclass(runtime):
-        raise _refusal(law, "runtime", shown(runtime), "a class, as of jaxhil.rig.registry.Compensator")
+        raise _make_error(
+            law, "runtime", format_value(runtime), "a class, as of jaxhil.rig.registry.Compensator"
+        )
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
-        raise _refusal(law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method")
+        raise _make_error(
+            law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method"
+        )
     gains = getattr(runtime, "gains", None)
     units = (
         {name: getattr(gain, "unit", None) for name, gain in gains.items()}
@@ -136,14 +150,16 @@ def _check_runtime(law: Compensator, runtime: object) -> None:
     )
     law_units = {gain.name: gain.unit for gain in law.gains}
     if units != law_units:
-        raise _refusal(law, "runtime.gains", _units(units), f"{_units(law_units)}, as the law has them")
+        raise _make_error(
+            law, "runtime.gains", _format_units(units), f"{_format_units(law_units)}, as the law has them"
+        )
 
 
-def _units(gains: dict[str, Any]) -> str:
+def _format_units(gains: dict[str, Any]) -> str:
     """Return names and units of gains as text."""
-    return one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
+    return to_one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
 
 
-def _refusal(law: Compensator | ContactLaw, what: str, found: str, allowed: str) -> InputError:
+def _make_error(law: Compensator | ContactLaw, what: str, found: str, allowed: str) -> InputError:
     """Return the error for a part of a law."""
-    return InputError(f"register {law.name}: {what}: found {found}, allowed {allowed}")
+    return InputError(f"register {law.name}: {what}: found {found}, expected {allowed}")

@@ -10,17 +10,17 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.simulation.cells import Course
-from jaxhil.simulation.contact_force import Motion, PlantSignals, SamplingInterval, no_contact
-from jaxhil.simulation.free_flight import arrival, begin_approach
+from jaxhil.simulation.cells import IntervalInputs
+from jaxhil.simulation.contact_force import MotionSample, PlantSignals, SamplingInterval, no_contact
+from jaxhil.simulation.free_flight import advance_to_surface, begin_approach
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
-from jaxhil.simulation.loop_state import LoopState, Plant, Rings, Sensed
-from jaxhil.simulation.metrics import OK, Metrics, collect, empty_metrics, judge
-from jaxhil.simulation.probe import before_contact
+from jaxhil.simulation.loop_state import LoopState, PlantState, Rings, SensorState
+from jaxhil.simulation.metrics import OK, Metrics, determine_status, empty_metrics, store_metrics
+from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.sensors import Noise, draw_noise
-from jaxhil.simulation.tick import Prepared, RunState, Tick, tick
-from jaxhil.simulation.watch import FADED, build_rules, fresh_watch
+from jaxhil.simulation.sensors import SensorNoise, draw_noise
+from jaxhil.simulation.tick import RunState, SegmentConstants, Tick, tick
+from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, build_end_conditions, fresh_watch
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -35,35 +35,38 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
     """Return the metrics as `rollout` does, with constants computed before, for many gains."""
-    return run_to_its_end(loop, gains, rig).metrics
+    return run_until_done(loop, gains, rig).metrics
 
 
-def run_to_its_end(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
+def run_until_done(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
     """Return the state after all lanes are done."""
 
     def body(run):
-        run, _ = stretch(loop, rig, gains, run, record=False)
+        run, _ = run_segment(loop, rig, gains, run, record=False)
         if loop.is_two_sided:
-            return turn_over(loop, rig, gains, run)
+            return begin_next_contacts(loop, rig, gains, run)
         # Most segments end no contact, since lanes of a tile end theirs at about the same time. The rings,
-        # which `turn_over` does not change, stay outside the branch and are not copied.
+        # which `begin_next_contacts` does not change, stay outside the branch and are not copied.
         rings = run.state.sensed.rings
         light = run._replace(state=run.state._replace(sensed=run.state.sensed._replace(rings=None)))
         light = lax.cond(
-            jnp.any(_pending(rig, run)), lambda run: turn_over(loop, rig, gains, run), lambda run: run, light
+            jnp.any(_finished_lanes(rig, run)),
+            lambda run: begin_next_contacts(loop, rig, gains, run),
+            lambda run: run,
+            light,
         )
         return light._replace(state=light.state._replace(sensed=light.state.sensed._replace(rings=rings)))
 
-    run = start(loop, rig, gains)
+    run = start_rollout(loop, rig, gains)
     return lax.while_loop(lambda run: jnp.any(run.active), body, run)
 
 
-def stretch_length(loop: Loop) -> int:
+def segment_length(loop: Loop) -> int:
     """Return the ticks per segment: 1 between two surfaces, where the next contact may begin at once."""
     return 1 if loop.is_two_sided else 16
 
 
-def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
+def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
     """Return all lanes on their first approach, or at its end if nothing happens on it."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
@@ -74,11 +77,11 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
     state = LoopState(
         position=zeros,
         velocity=zeros,
-        plant=Plant(
+        plant=PlantState(
             (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
         ),
-        sensed=Sensed(
-            rings=_rings(loop, ring, measured, order),
+        sensed=SensorState(
+            rings=_build_rings(loop, ring, measured, order),
             last=no_contact(like),
             touched=zeros if loop.has_cells else None,
             lagged=zeros,
@@ -86,14 +89,14 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
         ),
         law=loop.law.init(zeros),
         controller=loop.compensator.init(gains, rig.constants, loop.controller_ring),
-        parameters=_entry(scenario.contact, index),
-        entry_velocity=zeros,
-        entry_tick=index,
-        first_contact=before_contact(zeros) if loop.probed else None,
+        parameters=_select_entry(scenario.contact, index),
+        onset_velocity=zeros,
+        onset_tick=index,
+        first_contact=initial_first_contact(zeros) if loop.probed else None,
     )
     # Rings are read up to one ring back: with this first tick no index is negative.
     tick = jnp.array(loop.first_tick, jnp.int32)
-    phase = _entry(scenario.phase, _slot(rig, index))
+    phase = _select_entry(scenario.phase, _select_slot(rig, index))
     state, skipped = begin_approach(loop, rig, gains, state, phase, like, tick, skip_flight)
     slots = scenario.phase.shape[0]
     return RunState(
@@ -107,49 +110,51 @@ def start(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True)
     )
 
 
-def stretch(
+def run_segment(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, record: bool
 ) -> tuple[RunState, Tick | None]:
     """Run one segment of ticks; `record` returns the ticks too."""
-    prepared = prepare(loop, rig, gains, run)
+    prepared = prepare_segment(loop, rig, gains, run)
 
     def body(carry, noise):
-        now, seen = tick(loop, rig, prepared, _resumed(run, carry), noise)
-        return _evolving(now), seen if record else None
+        now, seen = tick(loop, rig, prepared, _replace_changing_parts(run, carry), noise)
+        return _changing_parts(now), seen if record else None
 
-    length = stretch_length(loop)
-    carry, seen = lax.scan(body, _evolving(run), noise_ahead(loop, rig, run, length), length=length)
-    return _resumed(run, carry), seen
+    length = segment_length(loop)
+    carry, seen = lax.scan(
+        body, _changing_parts(run), draw_segment_noise(loop, rig, run, length), length=length
+    )
+    return _replace_changing_parts(run, carry), seen
 
 
-def prepare(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> Prepared:
+def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> SegmentConstants:
     """Return the values that the ticks of a segment share."""
-    return Prepared(
+    return SegmentConstants(
         gains=gains,
-        rules=build_rules(rig.scenario),
+        rules=build_end_conditions(rig.scenario),
         controller=loop.compensator.prepare(gains, rig.constants),
-        probe=_entry(rig.scenario.probe, _slot(rig, run.index)) if loop.probed else None,
+        probe=_select_entry(rig.scenario.probe, _select_slot(rig, run.index)) if loop.probed else None,
     )
 
 
-def noise_ahead(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> Noise:
+def draw_segment_noise(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> SensorNoise:
     """Return the sensors' noise, (ticks, *batch), of the next ticks of a segment."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
-    age = run.tick + ahead - run.state.entry_tick[None]
+    age = run.tick + ahead - run.state.onset_tick[None]
     return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
 
 
-def turn_over(
+def begin_next_contacts(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
 ) -> RunState:
     """Write finished contacts to the metrics, begin the next ones, and skip free flight."""
     watch, state, scenario = run.watch, run.state, rig.scenario
-    status = judge(scenario, watch, run.tick - state.entry_tick)
-    over = _pending(rig, run)
+    status = determine_status(scenario, watch, run.tick - state.onset_tick)
+    over = _finished_lanes(rig, run)
     ticks = run.tick - loop.first_tick + run.skipped
     law = loop.compensator
     delay = law.force_delay(gains, state.controller) if law.estimates_delay else None
-    metrics = collect(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
+    metrics = store_metrics(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
     index = run.index + over.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:
@@ -157,9 +162,9 @@ def turn_over(
         ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
     active = run.active & ~(over & ends)
     blank = fresh_watch(loop, watch.approach)
-    entry = _entry(scenario.contact, _slot(rig, index))
+    entry = _select_entry(scenario.contact, _select_slot(rig, index))
     if watch.command is not None:
-        left = jnp.maximum(FADED * watch.peak_command, watch.command)
+        left = jnp.maximum(COMMAND_DECAY_RATIO * watch.peak_command, watch.command)
         # A force that acts already begins the next contact at once; it approaches at the rebound's speed.
         unchanged = {
             "approach": watch.rebound,
@@ -167,47 +172,47 @@ def turn_over(
             "recent": watch.recent,
             "command": watch.command,
         }
-        watch = _choose(over, blank._replace(left=left, **unchanged), watch)
+        watch = _select_lanes(over, blank._replace(left=left, **unchanged), watch)
         # A damped contact may end during penetration; its law's parameters apply until the mechanism is free.
         free = state.sensed.last.distance <= 0
-        state = state._replace(parameters=_choose(free, entry, state.parameters))
+        state = state._replace(parameters=_select_lanes(free, entry, state.parameters))
         if state.first_contact is not None:
             state = state._replace(
-                first_contact=_choose(over, before_contact(watch.approach), state.first_contact)
+                first_contact=_select_lanes(over, initial_first_contact(watch.approach), state.first_contact)
             )
         if skip_flight:
-            arrived, skipped = arrival(loop, rig, gains, state, watch, watch.command, run.tick)
+            arrived, skipped = advance_to_surface(loop, rig, gains, state, watch, watch.command, run.tick)
             state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:
-        state = state._replace(parameters=_choose(over, entry, state.parameters))
-        phase = _entry(scenario.phase, _slot(rig, index))
+        state = state._replace(parameters=_select_lanes(over, entry, state.parameters))
+        phase = _select_entry(scenario.phase, _select_slot(rig, index))
         entered, skipped = begin_approach(
             loop, rig, gains, state, phase, watch.rebound, run.tick, skip_flight
         )
         run = run._replace(skipped=run.skipped + jnp.where(over, skipped, 0))
         state = _restart(loop, gains, state, entered, over, over)
-        watch = _choose(over, blank, watch)
+        watch = _select_lanes(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
 
 
-def _evolving(run):
+def _changing_parts(run):
     """Return the parts of the state that change from tick to tick."""
     return run.state, run.watch, run.tick
 
 
-def _resumed(run, evolving):
+def _replace_changing_parts(run, evolving):
     """Return the state with these parts replaced."""
     state, watch, now = evolving
     return run._replace(state=state, watch=watch, tick=now)
 
 
-def _rings(loop, ring, measured, order):
+def _build_rings(loop, ring, measured, order):
     """Return empty delay lines of the signals that the loop has."""
     interval = None
     if loop.is_two_sided:
-        motion = Motion(ring, ring)
+        motion = MotionSample(ring, ring)
         ends = motion if loop.follows_intervals and not loop.has_cells else None
-        course = Course((ring,) * order, ring, ring, ring) if loop.has_cells else None
+        course = IntervalInputs((ring,) * order, ring, ring, ring) if loop.has_cells else None
         interval = SamplingInterval(motion, ends, ends, course)
     plant_signals = PlantSignals(
         force=ring,
@@ -219,9 +224,9 @@ def _rings(loop, ring, measured, order):
     return Rings(plant_signals, reading, ring if measured else None, interval)
 
 
-def _pending(rig, run):
+def _finished_lanes(rig, run):
     """Return the lanes whose contact is over or has failed."""
-    status = judge(rig.scenario, run.watch, run.tick - run.state.entry_tick)
+    status = determine_status(rig.scenario, run.watch, run.tick - run.state.onset_tick)
     return (run.watch.over | (status != OK)) & run.active
 
 
@@ -233,16 +238,16 @@ def _restart(loop, gains, state, entered, begins, fresh):
         lagged=entered.sensed.lagged,
         first_position=entered.sensed.first_position,
     )
-    chosen = _choose(
+    chosen = _select_lanes(
         begins,
         entered._replace(sensed=None, controller=None, parameters=None),
         state._replace(sensed=None, controller=None, parameters=None),
     )
     sensed = sensed_at_entry._replace(
-        last=_choose(begins, sensed_at_entry.last, state.sensed.last),
-        touched=_choose(begins, sensed_at_entry.touched, state.sensed.touched),
+        last=_select_lanes(begins, sensed_at_entry.last, state.sensed.last),
+        touched=_select_lanes(begins, sensed_at_entry.touched, state.sensed.touched),
         lagged=jnp.where(begins, sensed_at_entry.lagged, state.sensed.lagged),
-        first_position=_choose(begins, sensed_at_entry.first_position, state.sensed.first_position),
+        first_position=_select_lanes(begins, sensed_at_entry.first_position, state.sensed.first_position),
     )
     return chosen._replace(
         sensed=sensed,
@@ -251,12 +256,12 @@ def _restart(loop, gains, state, entered, begins, fresh):
     )
 
 
-def _slot(rig, index):
+def _select_slot(rig, index):
     """Return the slot of a contact; the last slot for contacts beyond the last one."""
     return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 
-def _entry(table, index):
+def _select_entry(table, index):
     """Return entry `index` (per lane) of the leading axis of every leaf."""
 
     def pick(leaf):
@@ -266,6 +271,6 @@ def _entry(table, index):
     return jax.tree.map(pick, table)
 
 
-def _choose(condition, when_true, when_false):
+def _select_lanes(condition, when_true, when_false):
     """Select leaf by leaf; the condition is of the batch shape."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

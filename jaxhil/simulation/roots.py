@@ -12,33 +12,33 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-MOST_STEPS = 60  # bisections that give rounding accuracy for any function
-ROUNDING = 1e-9  # tolerance of the argument, which is of order 1
+MAX_BISECTIONS = 60  # bisections that give rounding accuracy for any function
+ARGUMENT_TOLERANCE = 1e-9  # tolerance of the argument, which is of order 1
 
-Function = Callable[[Any, Array], Array]  # function of data and an argument
+RootFunction = Callable[[Any, Array], Array]  # function of data and an argument
 
 
-def positive_part(function: Function, data: Any, low: Array, high: Array) -> tuple[Array, Array]:
+def find_positive_part(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array]:
     """Return the part of [low, high] on which a function is positive, if it changes sign at most once."""
-    root, at_low, at_high = _root(function, data, low, high)
+    root, at_low, at_high = _find_root(function, data, low, high)
     begin = jnp.where(at_low > 0, low, jnp.where(at_high > 0, root, low))
     end = jnp.where(at_high > 0, high, jnp.where(at_low > 0, root, low))
     return begin, jnp.where(end > begin, end, begin)
 
 
-def crossing(
-    function: Function, data: Any, low: Array, high: Array, positive: Array, negative: Any = None
+def find_sign_change(
+    function: RootFunction, data: Any, low: Array, high: Array, positive: Array, negative: Any = None
 ) -> Array:
     """Return the argument in [low, high] at which a function changes sign.
 
     Without a change of sign, return `positive`, or `negative` if this is given and the function is negative.
     """
-    root, at_low, at_high = _root(function, data, low, high)
+    root, at_low, at_high = _find_root(function, data, low, high)
     none = positive if negative is None else jnp.where(at_low > 0, positive, negative)
     return jnp.where((at_low > 0) != (at_high > 0), root, none)
 
 
-def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array, Array, Array]:
+def _find_root(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array, Array]:
     """Return the root of a function in a bracket, and the function's values at both ends."""
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
@@ -51,7 +51,7 @@ def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array
 
     def is_under_way(carry):
         *_, sought, steps = carry
-        return jnp.any(sought) & (steps < MOST_STEPS)
+        return jnp.any(sought) & (steps < MAX_BISECTIONS)
 
     def improve(carry):
         low, high, guess, _, steps = carry
@@ -60,7 +60,7 @@ def _root(function: Function, data: Any, low: Array, high: Array) -> tuple[Array
         low, high = jnp.where(above, low, guess), jnp.where(above, guess, high)
         step = guess - value / jnp.where(slope != 0, slope, 1)
         # At the root, rounding may place the step outside the bracket.
-        inside = (slope != 0) & (step >= low - ROUNDING) & (step <= high + ROUNDING)
+        inside = (slope != 0) & (step >= low - ARGUMENT_TOLERANCE) & (step <= high + ARGUMENT_TOLERANCE)
         nearer = jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2)
         return low, high, nearer, crosses & (jnp.abs(nearer - guess) > short), steps + 1
 

@@ -8,21 +8,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.errors import InputError, shown
-from jaxhil.files import as_path, follow, write_csv, writing
+from jaxhil.errors import InputError, format_value
+from jaxhil.files import report_write_errors, resolve_output_path, to_path, write_csv
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator
 from jaxhil.mechanism.loading import as_mechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, duration_off, too_hard
-from jaxhil.simulation.environment import computing
+from jaxhil.simulation.contact_bounds import (
+    MAX_DURATION_RATIO,
+    MAX_PEAK_FORCE_RATIO,
+    MIN_DURATION_RATIO,
+    is_duration_out_of_bounds,
+    is_peak_force_excessive,
+)
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.metrics import NOT_REACHED, OK, STATUS_NAMES, STATUS_REASONS
+from jaxhil.simulation.jax_environment import jax_context
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.metrics import CONTACT_STATUS_NAMES, CONTACT_STATUS_REASONS, NOT_REACHED, OK
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.outcome import Outcome
-from jaxhil.simulation.plausibility import Meaning, check_run, meaning
+from jaxhil.simulation.plausibility import MechanismSummary, check_run, summarise_mechanism
 from jaxhil.simulation.recording import record_lanes
 from jaxhil.simulation.scenario import build_scenarios
 
@@ -77,9 +83,9 @@ class Run:
     status: str  # "ok", or the status of the first contact with another status
 
     @cached_property
-    def meaning(self) -> Meaning:
+    def meaning(self) -> MechanismSummary:
         """Summary of the mechanism: mass, ideal contacts, rates, and `warnings` of implausible numbers."""
-        return meaning(self.mechanism)
+        return summarise_mechanism(self.mechanism)
 
     def reasons(self, limit: float = 0.01) -> list[str]:
         """Return the reasons for which the run is bad, as sentences; an empty list if it is good.
@@ -87,14 +93,14 @@ class Run:
         A run is good if every contact ended, no restitution error exceeds `limit` [1], and the peak force and
         the duration of every real contact are within the bounds of `contact_bounds`.
         """
-        if self.status != STATUS_NAMES[OK]:
-            return [f"the run ended with status '{self.status}': {STATUS_REASONS[self.status]}"]
-        return [*_error_reasons(self.contacts, limit), *_unlike(self.contacts, self.mechanism)]
+        if self.status != CONTACT_STATUS_NAMES[OK]:
+            return [f"the run ended with status '{self.status}': {CONTACT_STATUS_REASONS[self.status]}"]
+        return [*_error_reasons(self.contacts, limit), *_bound_reasons(self.contacts, self.mechanism)]
 
     @cached_property
     def ticks(self) -> Ticks:
         """All ticks up to the end of the last contact, or to the first number that is not finite."""
-        with computing():
+        with jax_context():
             scenarios = build_scenarios(self.mechanism, seed=self.seed)
             loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
             _, [lane] = record_lanes(loaded, scenarios)
@@ -157,18 +163,20 @@ class Run:
         The file name ends in .png, .pdf or .svg; parent folders are created. Raise `InputError` if the file
         cannot be written.
         """
-        target = as_path(path)
+        target = to_path(path)
         if target.suffix.lower() not in PLOT_SUFFIXES:
             allowed = f"a name that ends in {', '.join(PLOT_SUFFIXES)}"
-            raise InputError(f"plot: found {shown(str(target))}, allowed {allowed}")
-        from jaxhil.simulation.contact_plot import contact_plot, save
-        from jaxhil.simulation.motion import nominal_motion
+            raise InputError(f"plot: found {format_value(str(target))}, expected {allowed}")
+        from jaxhil.simulation.contact_plot import plot_contacts, save_figure
+        from jaxhil.simulation.motion_curves import compute_nominal_motion
 
-        with computing():
-            motion = nominal_motion(self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed)
+        with jax_context():
+            motion = compute_nominal_motion(
+                self.mechanism, {"rig": (self.compensator, self.gains)}, self.seed
+            )
         title = f"{self.mechanism.name}, compensation: {self.compensator}"
-        with writing(target):
-            save(contact_plot(motion, title, sensors="rig"), follow(target))
+        with report_write_errors(target):
+            save_figure(plot_contacts(motion, title, sensors="rig"), resolve_output_path(target))
 
 
 def simulate(
@@ -187,12 +195,14 @@ def simulate(
     number = check_seed(seed)
     name, values = choose_gains(checked, compensator, gains)
     check_run(checked)
-    with computing():
+    with jax_context():
         scenarios = build_scenarios(checked, seed=number)
         outcome = evaluate(build_loop(checked, name, scenarios, exact=True), values, scenarios)
     law = COMPENSATORS[name]
-    contacts = tuple(_contact(outcome, slot, law) for slot in range(checked.approach.contacts))
-    status = next((contact.status for contact in contacts if contact.status != STATUS_NAMES[OK]), "ok")
+    contacts = tuple(_build_contact_result(outcome, slot, law) for slot in range(checked.approach.contacts))
+    status = next(
+        (contact.status for contact in contacts if contact.status != CONTACT_STATUS_NAMES[OK]), "ok"
+    )
     return Run(checked, name, values, number, contacts, status)
 
 
@@ -200,7 +210,7 @@ def check_seed(seed: Any) -> int:
     """Return the seed, or raise `InputError` unless it is an integer >= 0."""
     number = seed.item() if isinstance(seed, np.integer) else seed
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-        raise InputError(f"seed: found {shown(seed)}, allowed an integer >= 0")
+        raise InputError(f"seed: found {format_value(seed)}, expected an integer >= 0")
     return number
 
 
@@ -209,28 +219,29 @@ def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[
     worst = max((contact.error for contact in contacts), key=abs)
     if not abs(worst) <= limit:
         kind = "divergence" if worst > 0 else "convergence"
-        yield f"the largest error is {worst:+.4f} ({kind}), allowed {limit:g}"
+        yield f"the largest error is {worst:+.4f} ({kind}), limit {limit:g}"
 
 
-def _unlike(contacts: Sequence[ContactResult], mechanism: Mechanism) -> Iterator[str]:
+def _bound_reasons(contacts: Sequence[ContactResult], mechanism: Mechanism) -> Iterator[str]:
     """Yield sentences about the real contacts that are too hard, too short or too long."""
     for number, contact in enumerate(contacts, start=1):
         force, ideal_force = contact.peak_force, contact.reference_peak_force
-        if too_hard(force, ideal_force):
+        if is_peak_force_excessive(force, ideal_force):
             yield (
                 f"contact {number}: real peak force {force:.4g} N, {contact.peak_force_ratio:.3g} times "
-                f"the ideal contact's {ideal_force:.4g} N, allowed {MOST_FORCE:g} times"
+                f"the ideal contact's {ideal_force:.4g} N, expected {MAX_PEAK_FORCE_RATIO:g} times"
             )
         duration, ideal_duration = contact.duration, contact.reference_duration
-        if duration_off(duration, ideal_duration, mechanism.rig.control_period):
+        if is_duration_out_of_bounds(duration, ideal_duration, mechanism.rig.control_period):
             yield (
                 f"contact {number}: real contact of {1e3 * duration:.4g} ms, {contact.duration_ratio:.3g} "
-                f"times the ideal contact's {1e3 * ideal_duration:.4g} ms, allowed {SHORTEST:g} to "
-                f"{LONGEST:g} times"
+                f"times the ideal contact's {1e3 * ideal_duration:.4g} ms, expected "
+                f"{MIN_DURATION_RATIO:g} to "
+                f"{MAX_DURATION_RATIO:g} times"
             )
 
 
-def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
+def _build_contact_result(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
     """Return the results of one contact."""
     metrics = outcome.metrics
     status = int(metrics.status[slot, 0])
@@ -254,5 +265,5 @@ def _contact(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
         duration_ratio=value(outcome.duration_ratio, ended),
         approach_velocity=value(metrics.approach_velocity, reached),
         force_delay=value(metrics.force_delay, reached) if law.estimates_delay else None,
-        status=STATUS_NAMES[status],
+        status=CONTACT_STATUS_NAMES[status],
     )

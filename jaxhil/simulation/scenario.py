@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
-from jaxhil.contact.keys import Key
-from jaxhil.contact.laws import KEYS, ContactParameters, contact_law
-from jaxhil.contact.reference import Reference
+from jaxhil.contact.ideal_contact import IdealContact
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.laws import CONTACT_KEYS, ContactParameters, find_contact_law
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
-LONGEST_CONTACT = 10.0  # s; limit on the duration of a contact
+MAX_CONTACT_DURATION = 10.0  # s; limit on the duration of a contact
 
 
-class MotionSimulator(NamedTuple):
+class MotionSimulatorBatch(NamedTuple):
     """Motion simulator num(s)/den(s) e^(-s delay)."""
 
     numerator: Float[Array, "order *batch"]  # coefficients in descending powers of s [rad/s]
@@ -32,7 +32,7 @@ class MotionSimulator(NamedTuple):
     acceleration_limit: Float[Array, "*batch"]  # [m/s^2]; infinite if none
 
 
-class ForceSensor(NamedTuple):
+class ForceSensorBatch(NamedTuple):
     """Force sensor."""
 
     delay: Float[Array, "*batch"]  # transport delay [s]
@@ -44,7 +44,7 @@ class ForceSensor(NamedTuple):
     range: Float[Array, "*batch"]  # [N]; infinite if unlimited
 
 
-class PositionSensor(NamedTuple):
+class PositionSensorBatch(NamedTuple):
     """Position sensor."""
 
     delay: Float[Array, "*batch"]  # [s]
@@ -64,17 +64,17 @@ class Scenario(NamedTuple):
     control_period: Float[Array, "*batch"]  # T [s]
     # position of the hardware's surface [m]; the controller assumes 0
     contact_plane: Float[Array, "*batch"]
-    simulator: MotionSimulator  # motion simulator
-    force_sensor: ForceSensor  # force sensor
-    position_sensor: PositionSensor  # position sensor
+    simulator: MotionSimulatorBatch  # motion simulator
+    force_sensor: ForceSensorBatch  # force sensor
+    position_sensor: PositionSensorBatch  # position sensor
     time_limit: Float[Array, "*batch"]  # limit on the duration of a contact [s]
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise: seed, index of the scenario
     probe: Probe | None = None  # probe of the run; None without one
     # ideal contacts that are known beforehand, NaN for others; None if none is known
-    reference: Reference | None = None
+    reference: IdealContact | None = None
 
 
-def contact_slots(contacts: int) -> int:
+def count_contact_slots(contacts: int) -> int:
     """Return the number of result slots: a power of two, so that similar counts share a program."""
     return max(4, 1 << (contacts - 1).bit_length())
 
@@ -87,42 +87,44 @@ def build_scenarios(
     `draws` maps dotted paths to values, (number,), or (number, entries) for lists; other numbers are nominal.
     Without draws the batch is the nominal run alone. Noise keys depend only on `seed` and `first` + lane.
     """
-    table = _Table(mechanism, dict(draws or {}))
+    table = _MechanismNumbers(mechanism, dict(draws or {}))
     contact, rig, number = mechanism.contact, mechanism.rig, table.number
     indices = np.arange(first, first + number, dtype=np.uint32)
     key: Any = np.stack([np.full(number, seed & 0xFFFFFFFF, np.uint32), indices])
     contacts: Any = np.full(number, mechanism.approach.contacts, np.int32)
     return Scenario(
-        equivalent_mass=_mass(mechanism, table),
+        equivalent_mass=_build_mass(mechanism, table),
         velocity=table.scalar("approach.velocity"),
         contacts=contacts,
-        phase=_phase(mechanism, table),
+        phase=_build_phases(mechanism, table),
         clearance=table.scalar("contact.clearance"),
         contact=ContactParameters(
             stiffness=table.successive("contact.stiffness"),
-            damping=table.successive("contact.damping") * float(contact_law(contact.law).damped),
-            **{key.name: table.repeated(table.of_law(key)) for key in KEYS.values()},
+            damping=table.successive("contact.damping") * float(find_contact_law(contact.law).damped),
+            **{key.name: table.repeated(table.of_law(key)) for key in CONTACT_KEYS.values()},
         ),
         control_period=table.scalar("rig.control_period"),
         contact_plane=table.scalar("rig.contact_plane"),
-        simulator=_simulator(rig.simulator, table),
-        force_sensor=ForceSensor(*(table.scalar(f"rig.force_sensor.{name}") for name in ForceSensor._fields)),
-        position_sensor=PositionSensor(
-            *(table.scalar(f"rig.position_sensor.{name}") for name in PositionSensor._fields)
+        simulator=_build_motion_simulator(rig.simulator, table),
+        force_sensor=ForceSensorBatch(
+            *(table.scalar(f"rig.force_sensor.{name}") for name in ForceSensorBatch._fields)
         ),
-        time_limit=table.constant(LONGEST_CONTACT),
+        position_sensor=PositionSensorBatch(
+            *(table.scalar(f"rig.position_sensor.{name}") for name in PositionSensorBatch._fields)
+        ),
+        time_limit=table.constant(MAX_CONTACT_DURATION),
         key=key,
     )
 
 
-class _Table:
+class _MechanismNumbers:
     """Numbers of a mechanism by dotted path, drawn or nominal, one per lane."""
 
     def __init__(self, mechanism: Mechanism, draws: dict[str, Any]) -> None:
         # Namespace of the arrays: JAX or NumPy.
         self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
         self.number = len(next(iter(draws.values()))) if draws else 1
-        self.slots = contact_slots(mechanism.approach.contacts)
+        self.slots = count_contact_slots(mechanism.approach.contacts)
         self._mechanism, self._draws = mechanism, draws
 
     def drawn(self, path: str, default: Any = None) -> Any:
@@ -147,7 +149,7 @@ class _Table:
         value = self.np.asarray(self._draws.get(path, repeated))
         return self.np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
 
-    def of_law(self, key: Key) -> Any:
+    def of_law(self, key: ContactKey) -> Any:
         """Return a key that only some contact laws have, (..., number)."""
         path = f"contact.{key.name}"
         if isinstance(key.default, bool):
@@ -164,7 +166,7 @@ class _Table:
         return self.np.broadcast_to(entry, (self.slots, *entry.shape))
 
 
-def _phase(mechanism, table) -> Any:
+def _build_phases(mechanism, table) -> Any:
     """Return phases (slots, number); draws may contain one phase or one per contact."""
     phase = table.drawn("approach.phase")
     phase = table.np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
@@ -172,7 +174,7 @@ def _phase(mechanism, table) -> Any:
     return phase[:, np.minimum(np.arange(table.slots), phase.shape[1] - 1)].T
 
 
-def _mass(mechanism, table) -> Any:
+def _build_mass(mechanism, table) -> Any:
     """Return the equivalent mass [kg]."""
     if mechanism.bodies.equivalent_mass is not None:
         return table.scalar("bodies.equivalent_mass")
@@ -180,7 +182,7 @@ def _mass(mechanism, table) -> Any:
     return chaser * target / (chaser + target)
 
 
-def _simulator(simulator, table) -> MotionSimulator:
+def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
     """Return the motion simulator as a transfer function; `ideal` has order 0."""
     path = "rig.simulator."
     ones = table.constant(1.0)
@@ -206,7 +208,7 @@ def _simulator(simulator, table) -> MotionSimulator:
         missing = len(denominator) - 1 - len(numerator)
         numerator = table.np.concatenate([np.zeros((max(missing, 0), len(ones))), numerator])
         numerator = numerator[len(numerator) - (len(denominator) - 1) :]
-    return MotionSimulator(
+    return MotionSimulatorBatch(
         numerator,
         denominator,
         table.scalar(path + "delay"),

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.simulation.scenario import Scenario
 
-ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits, of Threefry's rounds
-PARITY = 0x1BD11BDA  # constant of Threefry's key schedule
+THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits, of Threefry's rounds
+THREEFRY_PARITY = 0x1BD11BDA  # constant of Threefry's key schedule
 
 
-class Noise(NamedTuple):
+class SensorNoise(NamedTuple):
     """Noise of readings, (ticks, *batch) or at one tick."""
 
     force: Array | None  # [N]; None for a sensor without noise
@@ -33,19 +33,19 @@ def draw_noise(
     scenario: Scenario,
     contact: Int[Array, "*batch"],
     age: Int[Array, "ticks *batch"],
-) -> Noise:
+) -> SensorNoise:
     """Return the noise of both sensors at the ticks `age` of the run of contact number `contact`."""
 
     def white(sensor, deviation):
         return deviation[None] * white_noise(scenario.key, contact, 2 * age + sensor, deviation.dtype)
 
-    return Noise(
+    return SensorNoise(
         white(0, scenario.force_sensor.noise_std) if has_force else None,
         white(1, scenario.position_sensor.noise_std) if has_position else None,
     )
 
 
-def lag(
+def apply_lag(
     reading: Float[Array, "*batch"],
     idle: Array,
     touching: Array,
@@ -59,7 +59,7 @@ def lag(
     `forces` [N], along parabolas through three of them each. It is 0 again for `free` [s].
     """
     arc = touching / (len(forces) // 2)
-    decay, straight, bow = _parabola(arc / _longer_than_0(time_constant))
+    decay, straight, bow = _lag_response(arc / _bound_above_zero(time_constant))
     reading = reading * lag_decay(idle, time_constant)
     for start, middle, end in zip(forces[:-2:2], forces[1:-1:2], forces[2::2], strict=True):
         bend = middle - (start + end) / 2
@@ -69,7 +69,7 @@ def lag(
 
 def lag_decay(duration: Array, time_constant: Array) -> Array:
     """Return the remaining fraction of the lag's output after `duration` [s] without force."""
-    return jnp.exp(-duration / _longer_than_0(time_constant))
+    return jnp.exp(-duration / _bound_above_zero(time_constant))
 
 
 def sample_force(
@@ -108,10 +108,10 @@ def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tupl
     This is Threefry-2x32 with 20 rounds: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1,
     2, 3" (2011). On a CPU, the version of `jax.random` would be a separate loop inside the loop over ticks.
     """
-    keys = key_0, key_1, key_0 ^ key_1 ^ PARITY
+    keys = key_0, key_1, key_0 ^ key_1 ^ THREEFRY_PARITY
     left, right = count_0 + keys[0], count_1 + keys[1]
     for turn in range(5):
-        for rotation in ROTATIONS[turn % 2]:
+        for rotation in THREEFRY_ROTATIONS[turn % 2]:
             left = left + right
             right = left ^ ((right << rotation) | (right >> (32 - rotation)))
         left = left + keys[(turn + 1) % 3]
@@ -119,13 +119,13 @@ def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tupl
     return left, right
 
 
-def _longer_than_0(time_constant):
+def _bound_above_zero(time_constant):
     """Return the time constant [s], at least a tiny positive number."""
     tiny = jnp.finfo(time_constant.dtype).tiny ** 0.5
     return jnp.where(time_constant > tiny, time_constant, tiny)
 
 
-def _parabola(span):
+def _lag_response(span):
     """Return the lag's response factors after `span` time constants.
 
     They are for the initial output, for an input s/span, and for an input 4 s/span (1 - s/span).

@@ -13,15 +13,15 @@ from jaxhil.contact.laws import deflection
 from jaxhil.laws.simulation_base import Signals
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.probe import Deviation, no_deviation
+from jaxhil.simulation.probe import Deviation, initial_deviation
 from jaxhil.simulation.scenario import Scenario
 
-LONGEST_FADING = 0.1  # s; longest wait for the command to decay, which a noisy command never does
-FADED = 1e-6  # of the command's peak; below it the command has decayed
-RUNAWAY = 1e3  # times the first approach speed; above it the run has diverged
+MAX_DECAY_WAIT = 0.1  # s; longest wait for the command to decay, which a noisy command never does
+COMMAND_DECAY_RATIO = 1e-6  # of the command's peak; below it the command has decayed
+DIVERGENCE_SPEED_RATIO = 1e3  # times the first approach speed; above it the run has diverged
 
 
-class Swings(NamedTuple):
+class CommandVariation(NamedTuple):
     """F_c in the current contact; all values begin with the 0 before the contact."""
 
     last: Float[Array, "*batch"]  # last value [N]
@@ -44,7 +44,7 @@ class Watch(NamedTuple):
     measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
     quiet: Float[Array, "*batch"]  # ticks since the last real force, or since a contact began without one
     works: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
-    swings: Swings | None  # swings of the command; None unless recorded
+    swings: CommandVariation | None  # swings of the command; None unless recorded
     shortfall: (
         Float[Array, "*batch"] | None
     )  # largest change of the position command by limits [m]; None without limits
@@ -55,17 +55,17 @@ class Watch(NamedTuple):
     deviation: Deviation | None  # deviation of x_d from the ideal contact; None without a probe
 
 
-class Rules(NamedTuple):
+class ContactEndConditions(NamedTuple):
     """Conditions for the end of a contact."""
 
     quiet: Float[Array, "*batch"]  # least ticks without a real force
     # ticks without a real force after which the command need not have decayed
-    patience: Float[Array, "*batch"]
+    max_quiet: Float[Array, "*batch"]
     fastest: Float[Array, "*batch"]  # speed beyond which the run has diverged [m/s]
     clearance: Float[Array, "*batch"]  # distance between two surfaces [m]; infinite for one surface
 
 
-def build_rules(scenario: Scenario) -> Rules:
+def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
     """Return the conditions for the end of a contact.
 
     A contact ends tau_f + 20 sensor time constants + 2 T after the last real force, or up to 0.1 s later,
@@ -73,8 +73,10 @@ def build_rules(scenario: Scenario) -> Rules:
     """
     sensor, period = scenario.force_sensor, scenario.control_period
     quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
-    patience = quiet + jnp.ceil(LONGEST_FADING / period)
-    return Rules(quiet, patience, RUNAWAY * scenario.velocity, scenario.clearance)
+    patience = quiet + jnp.ceil(MAX_DECAY_WAIT / period)
+    return ContactEndConditions(
+        quiet, patience, DIVERGENCE_SPEED_RATIO * scenario.velocity, scenario.clearance
+    )
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
@@ -92,18 +94,18 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         measured=jnp.zeros(like.shape, bool),
         quiet=zeros + 1e6,
         works=(zeros, zeros) if loop.energies else (),
-        swings=Swings(zeros, zeros, zeros, zeros) if loop.chatter else None,
+        swings=CommandVariation(zeros, zeros, zeros, zeros) if loop.chatter else None,
         shortfall=zeros if loop.has_limits else None,
         side=zeros + 1 if loop.is_two_sided else None,
         command=zeros if loop.is_two_sided else None,
         left=zeros if loop.is_two_sided else None,
-        deviation=no_deviation(like) if loop.probed else None,
+        deviation=initial_deviation(like) if loop.probed else None,
     )
 
 
 def record_contact(
     loop: Loop,
-    rules: Rules,
+    rules: ContactEndConditions,
     watch: Watch,
     signals: Signals,
     plant_signals: PlantSignals,
@@ -118,14 +120,14 @@ def record_contact(
         # A touch may begin and end between two samples.
         touching = touching | ((watch.recent[1] == 0) & (plant_signals.touched > 0))
     begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
-    side = _side(rules, watch, signals)
+    side = _choose_side(rules, watch, signals)
     peak_command = jnp.maximum(watch.peak_command, magnitude)
     # The hardware follows the numerical model with a delay.
     quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
     touched = plant_signals.touched
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
     in_contact = in_contact if touched is None else watch.in_contact + touched
-    ends = begun & _ends(rules, signals, side, quiet, magnitude, peak_command)
+    ends = begun & _has_ended(rules, signals, side, quiet, magnitude, peak_command)
     lasts = begun & ~watch.over
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
@@ -141,7 +143,7 @@ def record_contact(
         measured=watch.measured | ((in_contact > 0) & (signals.force_measured != 0)),
         quiet=quiet,
         works=tuple(total + work for total, work in zip(watch.works, plant_signals.works or (), strict=True)),
-        swings=watch.swings and _swing(watch.swings, command, lasts, ends),
+        swings=watch.swings and _update_variation(watch.swings, command, lasts, ends),
         shortfall=_largest_shortfall(watch, shortfall, lasts),
         side=side,
         command=magnitude if loop.is_two_sided else None,
@@ -164,20 +166,20 @@ def _has_begun(loop, rules, watch, signals, touching, magnitude):
     return begun if watch.side is None else begun & ~watch.over
 
 
-def _side(rules, watch, signals):
+def _choose_side(rules, watch, signals):
     """Return the nearer of two surfaces, constant after the contact begins; None with one surface."""
     if watch.side is None:
         return None
     position = signals.position_desired
-    return jnp.where(watch.elapsed == 0, _nearer(rules, position), watch.side)
+    return jnp.where(watch.elapsed == 0, _nearer_side(rules, position), watch.side)
 
 
-def _nearer(rules, position):
+def _nearer_side(rules, position):
     """Return the side of the nearer of two surfaces, 1 or -1."""
     return jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
 
 
-def _ends(rules, signals, side, quiet, magnitude, peak_command):
+def _has_ended(rules, signals, side, quiet, magnitude, peak_command):
     """Return whether a contact ends.
 
     It ends if the model moves away, there was no force for long enough, and the command has decayed. No
@@ -185,10 +187,10 @@ def _ends(rules, signals, side, quiet, magnitude, peak_command):
     contact before its whole impulse has acted.
     """
     velocity = signals.velocity_desired
-    faded = (magnitude <= FADED * peak_command) | (quiet >= rules.patience)
+    faded = (magnitude <= COMMAND_DECAY_RATIO * peak_command) | (quiet >= rules.max_quiet)
     if side is None:
         return (velocity < 0) & (quiet >= rules.quiet) & faded
-    faded |= _nearer(rules, signals.position_desired) != side
+    faded |= _nearer_side(rules, signals.position_desired) != side
     return (side * velocity < 0) & (quiet >= rules.quiet) & faded
 
 
@@ -197,7 +199,7 @@ def _peak_force(loop, watch, plant_signals, force):
     if plant_signals.peak is not None:
         return plant_signals.peak
     # If the position itself jumps at the ticks, the force is constant between them.
-    return force if loop.first_break == 0 else _vertex(watch.recent[0], watch.recent[1], force)
+    return force if loop.discontinuity_order == 0 else _parabola_peak(watch.recent[0], watch.recent[1], force)
 
 
 def _largest_shortfall(watch, shortfall, lasts):
@@ -207,14 +209,16 @@ def _largest_shortfall(watch, shortfall, lasts):
     return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)
 
 
-def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
+def _update_variation(
+    swings: CommandVariation, command: Array, lasts: Array, ends: Array
+) -> CommandVariation:
     """Update the swings of the command.
 
     Lanes whose contact `lasts` are updated. The command counts as 0 after the tick at which the contact
     `ends`.
     """
     step = jnp.abs(command - swings.last) + jnp.where(ends, jnp.abs(command), 0)
-    return Swings(
+    return CommandVariation(
         last=jnp.where(lasts, command, swings.last),
         highest=jnp.where(lasts & (command > swings.highest), command, swings.highest),
         lowest=jnp.where(lasts & (command < swings.lowest), command, swings.lowest),
@@ -222,7 +226,7 @@ def _swing(swings: Swings, command: Array, lasts: Array, ends: Array) -> Swings:
     )
 
 
-def _vertex(before, middle, now):
+def _parabola_peak(before, middle, now):
     """Return the largest force of the last period, at the peak of the parabola through three samples."""
     bend = 2 * middle - before - now
     peaks = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.environment import ONCE, computing, known_options
+from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, supported_options
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.metrics import Metrics, judge
 from jaxhil.sixdof.plausibility import check_scenario
@@ -45,7 +45,7 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
 
     Raise `InputError` if the start is invalid or a contact is too stiff to be integrated.
     """
-    with computing():
+    with jax_context():
         scenario = build_scenarios(mechanism)
         check_scenario(mechanism, scenario)
         metrics = jax.device_get(_compiled()(scenario))
@@ -89,4 +89,4 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
 @cache
 def _compiled() -> Callable[[Scenario], Metrics]:
     """Return the compiled function for the metrics."""
-    return jax.jit(_ideal_metrics, compiler_options=known_options(ONCE))
+    return jax.jit(_ideal_metrics, compiler_options=supported_options(SINGLE_RUN_OPTIONS))

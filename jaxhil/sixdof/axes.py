@@ -14,17 +14,17 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxhil.simulation.motion_simulator import (
-    Delay,
     Propagation,
-    advance,
-    propagation,
+    SplitDelay,
+    advance_state,
+    apply_row,
+    discretise,
     rate_row,
-    read,
-    read_measured,
+    read_measured_position,
     split_delay,
     steady_state,
 )
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.simulation.scenario import MotionSimulatorBatch
 
 
 class Axes(NamedTuple):
@@ -33,8 +33,8 @@ class Axes(NamedTuple):
     propagation: Propagation  # each axis's motion simulator, (..., axes, *batch)
     # row at the force sensor's sampling instant [1/s^2]; None unless a tool is weighed
     acceleration: Float[Array, "columns axes *batch"] | None
-    force: Delay  # delay of each axis plus the force sensor, (axes, *batch)
-    position: Delay  # delay of each axis plus the position sensor, (axes, *batch)
+    force: SplitDelay  # delay of each axis plus the force sensor, (axes, *batch)
+    position: SplitDelay  # delay of each axis plus the position sensor, (axes, *batch)
 
 
 class Motion(NamedTuple):
@@ -61,7 +61,7 @@ class Hardware(NamedTuple):
 
 
 def build_axes(
-    simulator: MotionSimulator,
+    simulator: MotionSimulatorBatch,
     force_delay: Float[Array, "*batch"],
     position_delay: Float[Array, "*batch"],
     control_period: Float[Array, "*batch"],
@@ -77,7 +77,7 @@ def build_axes(
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
     )
     measured = position.fraction if weighed else None
-    exact = propagation(simulator.numerator, simulator.denominator, period, force.fraction, measured, hold)
+    exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, measured, hold)
     acceleration = rate_row(exact.velocity, simulator.denominator, period) if weighed else None
     return Axes(exact, acceleration, force, position)
 
@@ -95,7 +95,10 @@ def enter(
     end = drive if hold == "linear" else start
     rows = axes.propagation
     settled = steady_state(rows, start, stride)
-    position, measured = read(rows.position, settled, start, end), read_measured(rows, settled, start, end)
+    position, measured = (
+        apply_row(rows.position, settled, start, end),
+        read_measured_position(rows, settled, start, end),
+    )
     newest = _samples(axes, position, stride / period[None], 0 * stride, measured)
     growth = _samples(axes, stride, 0 * stride, 0 * stride, stride)
     # The delay line contains the uniform motion of the past intervals.
@@ -135,8 +138,8 @@ def actuate(
     last = ring.size // (len(kinds) * command.size) - 1
     for kind, row in enumerate(kinds):
         index = ((tick & last) * len(kinds) + kind) * len(command)
-        ring = lax.dynamic_update_slice_in_dim(ring, read(row, state, start, end), index, 0)
-    return Hardware(commands[: latency + 1], advance(exact.transition, state, start, end), ring)
+        ring = lax.dynamic_update_slice_in_dim(ring, apply_row(row, state, start, end), index, 0)
+    return Hardware(commands[: latency + 1], advance_state(exact.transition, state, start, end), ring)
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:

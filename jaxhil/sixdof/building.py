@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Tool
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof import sensor
 from jaxhil.sixdof.approach import begin, touching_height
 from jaxhil.sixdof.bodies import Body, build_body, build_state
@@ -140,7 +140,7 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
     return Stewart(base, platform, height, jnp.asarray(stroke))
 
 
-def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulator:
+def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorBatch:
     """Return every axis's motion simulator as a transfer function; `ideal` has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
@@ -179,7 +179,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulator:
         missing = len(denominator) - 1 - len(numerator)
         numerator = numbers.np.concatenate([np.zeros((missing, *ones.shape)), numerator])
     limit: Any = np.full(ones.shape, np.inf)
-    return MotionSimulator(numerator, denominator, delay, limit, limit)
+    return MotionSimulatorBatch(numerator, denominator, delay, limit, limit)
 
 
 def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:

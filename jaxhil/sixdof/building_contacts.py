@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.contact.keys import Key
-from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
 from jaxhil.mechanism import six_axes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
@@ -157,13 +157,13 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
 
 def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
     """Return the contact law, specialised for the file's values."""
-    return contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
+    return find_contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
     """Return the parameters of one candidate, (number,) each; slopes and depths (segments, number)."""
 
-    def of_law(key: Key) -> Any:
+    def of_law(key: ContactKey) -> Any:
         if isinstance(key.default, bool):
             return np.full(numbers.number, getattr(contact, key.name))
         return numbers(f"{path}.{key.name}", key.neutral)

@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
-from jaxhil.laws.compensators import SIX_AXES
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
 from jaxhil.laws.phase_lead_per_axis.simulation import PhaseLeadPerAxis
-from jaxhil.laws.simulation_base import Constants, Gains, Signals
-from jaxhil.simulation.sensors import lag, white_noise
+from jaxhil.laws.simulation_base import Gains, KnownConstants, Signals
+from jaxhil.simulation.sensors import apply_lag, white_noise
 from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
@@ -63,7 +63,9 @@ class Loop(eqx.Module):
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
     has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
     has_sample_effects: bool = eqx.field(static=True, default=True)  # quantum, dead zone or range
-    compensator: str = eqx.field(static=True, default="none")  # name of the compensator, one of `SIX_AXES`
+    compensator: str = eqx.field(
+        static=True, default="none"
+    )  # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
     episodes: int = eqx.field(static=True, default=1)  # number of evaluated episodes
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
     pushed: bool = eqx.field(static=True, default=False)  # whether readings without a contact are not 0
@@ -173,7 +175,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
     zero = vector(jnp.zeros_like(at[:3]))
     nothing = Wrench(zero, zero)
-    law, constants = SIX_AXES[loop.compensator], _constants(rig)
+    law, constants = SIX_AXIS_COMPENSATORS[loop.compensator], _constants(rig)
     controllers = tuple(law.init(_gains(loop, rig, channel), constants, 1) for channel in range(6))
     return RunState(
         states,
@@ -254,7 +256,7 @@ def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench)
     def late(now: Array, before: Array, lagged: Array) -> Array:
         before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
         middle = (before + now) / 2
-        return lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
+        return apply_lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
 
     reading: Wrench = jax.tree.map(late, raw, last, lagged)
     return reading
@@ -262,7 +264,7 @@ def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench)
 
 def _compensate(loop: Loop, rig: Rig, contact: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
     """Apply the compensator to each channel separately."""
-    law, constants = SIX_AXES[loop.compensator], _constants(rig)
+    law, constants = SIX_AXIS_COMPENSATORS[loop.compensator], _constants(rig)
     forces, structure = jax.tree.flatten(contact)
     zero, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
     commands, next_states = [], []
@@ -282,14 +284,14 @@ def _wrench(channels: Array) -> Wrench:
 
 def _gains(loop: Loop, rig: Rig, channel: int) -> Gains:
     """Return the gains of a channel."""
-    law = SIX_AXES[loop.compensator]
+    law = SIX_AXIS_COMPENSATORS[loop.compensator]
     gains = {name: value[channel] for name, value in rig.gains.items()}
     return law.channel(gains, channel) if isinstance(law, PhaseLeadPerAxis) else gains
 
 
-def _constants(rig: Rig) -> Constants:
+def _constants(rig: Rig) -> KnownConstants:
     """Return the rig data that the controller knows."""
-    return Constants(rig.period, jnp.full_like(rig.period, jnp.inf))
+    return KnownConstants(rig.period, jnp.full_like(rig.period, jnp.inf))
 
 
 def _noise(rig: Rig, now: Array) -> Array:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.environment import ONCE, known_options
+from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 from jaxhil.simulation.plausibility import check_poles
 from jaxhil.sixdof.approach import FAR
 from jaxhil.sixdof.building_contacts import candidate_names
@@ -53,7 +53,7 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     where = "start" if mechanism.start is not None else "approach"
     if not ticks <= MOST_TICKS:
         found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
-        raise InputError(f"{mechanism.name}: {found}, allowed at most {MOST_TICKS:.0e}")
+        raise InputError(f"{mechanism.name}: {found}, expected at most {MOST_TICKS:.0e}")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
     check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
     begins: Beginning = jax.tree.map(np.asarray, _compiled()(scenario))
@@ -61,26 +61,26 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     if not np.all(np.isfinite(at)):
         found = f"nothing to touch below {FAR:g} m: it goes past the target"
         raise InputError(
-            f"{mechanism.name}: approach.offset: found {found}, allowed an approach that touches, in m"
+            f"{mechanism.name}: approach.offset: found {found}, expected an approach that touches, in m"
         )
     angle = float(np.linalg.norm(at[3:]))
     if angle > LARGEST_ATTITUDE:
         allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
         key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a rotation by {angle:.3g} rad at the start"
-        raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+        raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
     depth = float(begins.depth[0])
     if depth > 0:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
         change = "move the chaser along z of T" if mechanism.start else "turn or move sideways less"
         found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
-        raise InputError(f"{mechanism.name}: {found}, allowed one apart: {change}")
+        raise InputError(f"{mechanism.name}: {found}, expected one apart: {change}")
     _check_speed(mechanism, begins, float(scenario.control_period[0]))
     for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
         if caught.any() and not latch.latched:
             found = f"latch.{name}.depth: found {latch.depth:g} m, deep enough at the start already"
             allowed = "a depth or an angle that is not yet met there, or latched = true"
-            raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+            raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
     _check_legs(mechanism, begins)
 
 
@@ -93,7 +93,7 @@ def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) 
             key = "start.chaser.velocity" if mechanism.start else "approach.velocity"
             found = f"{key}: found shapes of contact.{name} that pass at {speed:.3g} m/s"
             allowed = f"at most {most:.3g} m/s: their size of {size:.3g} m in {BLIND} control periods"
-            raise InputError(f"{mechanism.name}: {found}, allowed {allowed}")
+            raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
 
 
 def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
@@ -108,17 +108,17 @@ def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
         if not number <= LARGEST_CONDITION:
             found = f"rig.simulator.base: found legs that hardly hold the platform with {pose}"
             allowed = f"joints whose Jacobian has a condition number of at most {LARGEST_CONDITION:g}"
-            raise InputError(f"{mechanism.name}: {found} (condition number {number:.3g}), allowed {allowed}")
+            raise InputError(f"{mechanism.name}: {found} (condition number {number:.3g}), expected {allowed}")
         if stroke is not None and not (stroke[0] <= lengths.min() and lengths.max() <= stroke[1]):
             found = f"rig.simulator.stroke: found legs from {lengths.min():.4g} to {lengths.max():.4g} m"
             allowed = f"{stroke[0]:g} to {stroke[1]:g} m: change stroke or height"
-            raise InputError(f"{mechanism.name}: {found} with {pose}, allowed {allowed}")
+            raise InputError(f"{mechanism.name}: {found} with {pose}, expected {allowed}")
 
 
 @cache
 def _compiled() -> Callable[[Scenario], Beginning]:
     """Return the compiled function for the start."""
-    return jax.jit(_beginning, compiler_options=known_options(ONCE))
+    return jax.jit(_beginning, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def _beginning(scenario: Scenario) -> Beginning:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.environment import ONCE, known_options
+from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.building_contacts import candidate_names
@@ -113,7 +113,7 @@ def _duration() -> Callable[..., Any]:
     def time(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> Any:
         return rollout(loop, gains, scenario).final_time
 
-    return jax.jit(time, static_argnums=0, compiler_options=known_options(ONCE))
+    return jax.jit(time, static_argnums=0, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def motion(bodies: Pair, states: States) -> tuple[Any, ...]:

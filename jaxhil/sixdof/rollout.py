@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.simulation.watch import FADED, LONGEST_FADING, RUNAWAY
+from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, DIVERGENCE_SPEED_RATIO, MAX_DECAY_WAIT
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import Loop, Rig, RunState, Tick, begin, build_rig, tick
@@ -36,7 +36,7 @@ class Watch(NamedTuple):
 
     begun: Bool[Array, "*batch"]
     entry: States  # last states of the numerical model that are free and without an episode
-    entry_tick: Int[Array, "*batch"]
+    onset_tick: Int[Array, "*batch"]
     entry_energy: Float[Array, "*batch"]  # energy of the relative motion then [J]
     touching: tuple[Bool[Array, "candidates *batch"], ...]
     touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
@@ -139,7 +139,7 @@ def _fresh(rig: Rig, states: States, now: Array, energy: Array) -> Watch:
     return Watch(
         begun=none > 0,
         entry=states,
-        entry_tick=now,
+        onset_tick=now,
         entry_energy=energy,
         touching=touching,
         touches=none,
@@ -181,7 +181,7 @@ def _enter_late(loop: Loop, rig: Rig, before: Progress, after: Progress, command
     Readings that are not 0 without a contact move the model until then.
     """
     free, _ = _freedom_and_energy(rig, after.run.states)
-    enters = after.active & ~free & (after.watch.entry_tick == before.lasted)
+    enters = after.active & ~free & (after.watch.onset_tick == before.lasted)
 
     def follow(watch: Watch) -> Watch:
         def step(carry: tuple[States, Array, Array], command: Wrench):
@@ -190,9 +190,9 @@ def _enter_late(loop: Loop, rig: Rig, before: Progress, after: Progress, command
             is_free = is_free & (deepest(rig.groups, relative(rig.bodies, moved)[0]) < 0)
             return (choose(is_free, moved, states), ticks + is_free.astype(ticks.dtype), is_free), None
 
-        start = watch.entry, watch.entry_tick, enters
+        start = watch.entry, watch.onset_tick, enters
         (entry, ticks, _), _ = lax.scan(step, start, commands)
-        return watch._replace(entry=entry, entry_tick=ticks)
+        return watch._replace(entry=entry, onset_tick=ticks)
 
     return after._replace(watch=lax.cond(jnp.any(enters), follow, lambda watch: watch, after.watch))
 
@@ -214,7 +214,9 @@ def _watch(rig: Rig, watch: Watch, seen: Tick) -> Watch:
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
     # No threshold depends on the noise; `jaxhil.simulation.watch` gives the reason.
-    faded = (command[0] <= FADED * highest[0]) & (command[1] <= FADED * highest[1])
+    faded = (command[0] <= COMMAND_DECAY_RATIO * highest[0]) & (
+        command[1] <= COMMAND_DECAY_RATIO * highest[1]
+    )
     return watch._replace(
         begun=watch.begun | now,
         touching=touching,
@@ -261,7 +263,7 @@ def _still(rig: Rig) -> Array:
 def _since(rig: Rig, watch: Watch) -> Array:
     """Return the number of ticks since the contact was over on the hardware; negative before."""
     still = _still(rig)
-    patience = still + jnp.ceil(LONGEST_FADING / rig.period).astype(jnp.int32)
+    patience = still + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
     return jnp.maximum(jnp.minimum(watch.quiet - still, watch.faded - 1), watch.quiet - patience)
 
 
@@ -278,7 +280,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     status = jnp.where(status != MISS, status, jnp.where(over, REBOUNDED, jnp.where(watch.begun, cut, MISS)))
     ends = progress.active & (over | out)
     entry_time, end_time = (
-        ticks.astype(period.dtype) * period for ticks in (watch.entry_tick, age - jnp.where(over, since, 0))
+        ticks.astype(period.dtype) * period for ticks in (watch.onset_tick, age - jnp.where(over, since, 0))
     )
     episode = Episode(
         entry=watch.entry,
@@ -301,7 +303,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
         active = active & (index < loop.episodes)
     fresh = _fresh(rig, run.states, age, energy)._replace(touching=watch.touching)
     watch = choose(over, fresh, watch)
-    ahead = watch._replace(entry=run.states, entry_tick=age, entry_energy=energy)
+    ahead = watch._replace(entry=run.states, onset_tick=age, entry_energy=energy)
     watch = choose(free & ~watch.begun & active, ahead, watch)
     return progress._replace(watch=watch, episodes=episodes, index=index, active=active)
 
@@ -309,6 +311,6 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
 def _failure(rig: Rig, watch: Watch, energy: Array) -> Array:
     """Return DIVERGED, NON_FINITE, REACH for an axis commanded beyond its workspace, or else MISS."""
     entry = jnp.maximum(watch.entry_energy, SLOW**2 / _share(rig))
-    status = jnp.where(energy > RUNAWAY**2 * entry, DIVERGED, MISS)
+    status = jnp.where(energy > DIVERGENCE_SPEED_RATIO**2 * entry, DIVERGED, MISS)
     status = jnp.where(watch.beyond, REACH, status)
     return jnp.where(jnp.isfinite(energy), status, NON_FINITE).astype(jnp.int32)

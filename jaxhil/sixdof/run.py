@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.files import write_csv
-from jaxhil.laws.compensators import SIX_AXES
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.environment import ONCE, computing, known_options
 from jaxhil.simulation.gain_choice import choose_gains
+from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, supported_options
 from jaxhil.simulation.run import check_seed
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.loop import Loop
@@ -92,7 +92,7 @@ class SixAxisRun:
     @cached_property
     def ticks(self) -> Recorded:
         """All ticks of the run."""
-        with computing():
+        with jax_context():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
@@ -108,15 +108,15 @@ def simulate_six_axes(
 ) -> SixAxisRun:
     """Run a nominal six-axis mechanism once; the arguments are those of `jaxhil.simulate`.
 
-    `compensator` is one of `SIX_AXES`; it acts on each channel of the wrench separately. Raise `InputError`
-    if an argument is invalid.
+    `compensator` is one of `SIX_AXIS_COMPENSATORS`; it acts on each channel of the wrench separately. Raise
+    `InputError` if an argument is invalid.
     """
-    if compensator not in SIX_AXES:
-        allowed = f"{', '.join(SIX_AXES)}: in six axes there are no others so far"
-        raise InputError(f"compensator: found {shown(compensator)}, allowed {allowed}")
+    if compensator not in SIX_AXIS_COMPENSATORS:
+        allowed = f"{', '.join(SIX_AXIS_COMPENSATORS)}: in six axes there are no others so far"
+        raise InputError(f"compensator: found {format_value(compensator)}, expected {allowed}")
     number = check_seed(seed)
     name, values = choose_gains(mechanism, compensator, gains)
-    with computing():
+    with jax_context():
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
         loop = loop_of(mechanism, name, scenario)
@@ -163,7 +163,7 @@ def _result(
 
 def final_in_space(mechanism: SixAxisMechanism, time: float) -> Final:
     """Return the motion in the ideal contact at a time [s] after a mechanism's start."""
-    with computing():
+    with jax_context():
         scenario = build_scenarios(mechanism)
         return _final(time, jax.device_get(_ideal_motion(scenario, np.array([time]))))
 
@@ -185,7 +185,7 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
     else:
         name = next(iter(mechanism.contact))
         found, allowed = f"contact.{name}: found forces", "a softer contact"
-    return f"{found} that take too many steps to follow in space, allowed {allowed}"
+    return f"{found} that take too many steps to follow in space, expected {allowed}"
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:
@@ -209,7 +209,7 @@ def _final(time: float, motion: Any) -> Final:
 @cache
 def _compiled() -> Callable[..., Any]:
     """Return the compiled function for runs."""
-    return jax.jit(_run, static_argnums=0, compiler_options=known_options(ONCE))
+    return jax.jit(_run, static_argnums=0, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float, UInt32
 
-from jaxhil.simulation.scenario import MotionSimulator
+from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.latch import Latch
@@ -22,7 +22,7 @@ class Scenario(NamedTuple):
     start: States  # numerical model at tick 0
     groups: tuple[ContactGroup, ...]  # candidates of the contact
     latches: tuple[Latch, ...]
-    simulator: MotionSimulator  # model of each axis, (..., axes, *batch), without limits
+    simulator: MotionSimulatorBatch  # model of each axis, (..., axes, *batch), without limits
     kinematics: Kinematics  # relation of axes and coordinates
     sensor: Sensor
     control_period: Float[Array, "*batch"]  # T [s]

@@ -14,9 +14,9 @@ import numpy as np
 
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation import environment
+from jaxhil.simulation import jax_environment
 from jaxhil.simulation import metrics as one_axis
-from jaxhil.simulation.contact_bounds import unlike_ideal
+from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.sixdof import building
@@ -43,7 +43,7 @@ class SixAxes(RigModel):
     axes: ClassVar[int] = 6
     run_name: ClassVar[str] = "episode"
     errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
-    compiler_options: ClassVar[Mapping[str, int | str]] = environment.SIX_AXES
+    compiler_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_OPTIONS
 
     def scenarios(
         self,
@@ -139,7 +139,7 @@ def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
         wanted=wanted,
         good=status == one_axis.OK,
         unlike=(status == one_axis.OK)
-        & unlike_ideal(
+        & is_contact_out_of_bounds(
             found.peak_force,
             found.reference_peak_force,
             found.duration,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.contact.dormand_prince import take_rolled_step
+from jaxhil.contact.dormand_prince import take_looped_step
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
 from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
@@ -151,7 +151,7 @@ def _try(
         now, memories = instant(space, states, flight.memories, offset)
         return slope_at(space, now), (now._replace(states=None), memories)
 
-    step = take_rolled_step(slope, flight.states, length)
+    step = take_looped_step(slope, flight.states, length)
     now, memories = step.found
     level: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
     return now._replace(states=level), memories, _size(space, step.error, speed) / TOLERANCE

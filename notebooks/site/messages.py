@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from tuning.__main__ import BAD, GOOD, INTERRUPTED, UNUSABLE
+from tuning.__main__ import EXIT_BAD, EXIT_GOOD, EXIT_INTERRUPTED, EXIT_UNUSABLE_INPUT
 
 ROOT = Path(__file__).resolve().parents[2]
 REFUSALS = {"InputError", "KeyProblem", "GainFileError"}
@@ -34,7 +34,7 @@ def _refusals(tree: ast.Module) -> Iterator[str]:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in REFUSALS:
                 words = [_words(one, scope) for one in node.args]
                 if len(words) == 3:  # a key's path, what was found, what is allowed
-                    words = [f"{GAP}: found {words[1]}, allowed {words[2]}"]
+                    words = [f"{GAP}: found {words[1]}, expected {words[2]}"]
                 text = re.sub(f"{GAP}+", GAP, " ".join("".join(words).split()))
                 if PLAIN.sub("", text):
                     yield text
@@ -72,10 +72,10 @@ HEAD = f"""\
 
 | exit code | meaning |
 | --- | --- |
-| {GOOD} | done and good |
-| {BAD} | done, and the verdict is bad: an error beyond `--limit`, a corrupt bundle, wrong alarms too often |
-| {UNUSABLE} | unusable input, or something that cannot be written: one line on standard error says why |
-| {INTERRUPTED} | interrupted; what was finished is kept |
+| {EXIT_GOOD} | done and good |
+| {EXIT_BAD} | done; the verdict is bad: an error beyond `--limit`, a corrupt bundle, too many wrong alarms |
+| {EXIT_UNUSABLE_INPUT} | unusable input, or no way to write a file: one line on standard error says why |
+| {EXIT_INTERRUPTED} | interrupted; what was finished is kept |
 
 Standard output has the result alone (with `--json` one JSON document); progress, notes and lines that begin
 with `warning:` go to standard error. A refusal is one line, `jaxhil: ` and what was found and what is

@@ -19,11 +19,11 @@ from tyro.conf import FlagCreatePairsOff, Positional
 import jaxhil
 import tuning
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.compensators import SIX_AXES as SIX_AXIS_LAWS
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS as SIX_AXIS_LAWS
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import builtin_names, load, load_any, six_axis_names, suite_names
-from jaxhil.mechanism.json_schema import json_schema
-from jaxhil.mechanism.keys import Key, Table, tables
+from jaxhil.mechanism.json_schema import build_json_schema
+from jaxhil.mechanism.keys import KeyDescription, TableDescription, describe_tables
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.cli.parser import DESCRIPTION, Command
@@ -36,7 +36,7 @@ def pages() -> dict[str, str]:
     return {
         "reference/mechanism_file.md": mechanism_file(),
         "reference/mechanism_file_six_axes.md": mechanism_file_six_axes(),
-        "reference/mechanism.schema.json": json.dumps(json_schema(), indent=2) + "\n",
+        "reference/mechanism.schema.json": json.dumps(build_json_schema(), indent=2) + "\n",
         "reference/commands.md": commands(),
         "reference/gains.md": gains(),
         "reference/messages.md": messages(),
@@ -46,12 +46,12 @@ def pages() -> dict[str, str]:
 
 def mechanism_file() -> str:
     """Every key of the mechanism file, and the built-in files."""
-    return "\n".join([MECHANISM_FILE, *map(_table_of_keys, tables()), BUILT_IN, *_built_in()]) + "\n"
+    return "\n".join([MECHANISM_FILE, *map(_table_of_keys, describe_tables()), BUILT_IN, *_built_in()]) + "\n"
 
 
 def mechanism_file_six_axes() -> str:
     """The same of six axes."""
-    described = map(_table_of_keys, tables(SixAxisMechanism))
+    described = map(_table_of_keys, describe_tables(SixAxisMechanism))
     rows = [[f"`{name}`", load_any(name).mechanism.source] for name in six_axis_names()]
     built_in = _table(["name", "where its numbers come from"], rows)
     return "\n".join([SIX_AXES, *described, BUILT_IN, built_in]) + "\n"
@@ -81,14 +81,14 @@ def gains() -> str:
 def python() -> str:
     """The functions and classes of the two front doors."""
     homes = {f"jaxhil.{name}": f"{home}.{name}" for name, home in jaxhil._HOMES.items()}
-    homes |= {f"tuning.{name}": f"tuning.front_door.{name}.{name}" for name in tuning.__all__}
+    homes |= {f"tuning.{name}": f"tuning.api.{name}.{name}" for name in tuning.__all__}
     options = {"show_root_heading": "false", "show_root_toc_entry": "false", "heading_level": "3"}
     stated = "".join(f"\n      {option}: {value}" for option, value in options.items())
     entries = [f"## {name}\n\n::: {home}\n    options:{stated}" for name, home in homes.items()]
     return "\n\n".join([PYTHON, *entries]) + "\n"
 
 
-def _table_of_keys(table: Table) -> str:
+def _table_of_keys(table: TableDescription) -> str:
     title = f"`[{table.path}]`" if table.path else "Head of the file"
     heads = ["key", "meaning", "unit", "allowed", "default", "used by"]
     return f"\n## {title}\n\n{table.meaning}\n\n{_table(heads, map(_row_of_key, table.keys))}\n"
@@ -101,7 +101,7 @@ def _row_of_gain(gain: Gain, mechanism: Mechanism) -> list[str]:
     return [f"`{gain.name}`", gain.unit, *numbers, "yes" if gain.tuned(mechanism) else "no"]
 
 
-def _row_of_key(key: Key) -> list[str]:
+def _row_of_key(key: KeyDescription) -> list[str]:
     unit = {None: "", "": "that of the key"}.get(key.unit, key.unit)
     default = "required" if key.required else "none" if key.default is None else f"`{_toml(key.default)}`"
     return [f"`{key.name}`", key.meaning, unit or "", key.allowed, default, ", ".join(key.users) or "all"]

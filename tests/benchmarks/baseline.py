@@ -17,7 +17,7 @@ from jaxhil.laws.response_error.simulation import ResponseError
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.metrics import NOT_REACHED
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.watch import build_rules
+from jaxhil.simulation.watch import build_end_conditions
 
 SOURCE = Path(__file__).with_name("baseline.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")
@@ -150,7 +150,7 @@ def _check_reach(loop: Loop, inputs: dict[str, np.ndarray]) -> None:
         delay = inputs["gains"][GAINS.index("identification_delay")]
         intervals.append(np.max(delay / inputs["period"]))
     if not max(intervals) <= loop.ring - 2:
-        raise ValueError(f"delays: found {max(intervals):g} periods, allowed {loop.ring - 2}")
+        raise ValueError(f"delays: found {max(intervals):g} periods, expected {loop.ring - 2}")
 
 
 def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
@@ -160,7 +160,7 @@ def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
         array = np.asarray(array, dtype)
         return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:-1], lanes)))
 
-    plant, rules = rig.propagation, build_rules(scenario)
+    plant, rules = rig.propagation, build_end_conditions(scenario)
     # Gains that the compensator lacks are multiplied, if at all, into nothing that is kept; 1 is harmless.
     table = [np.broadcast_to(np.asarray(gains.get(name, 1.0), float), (lanes,)) for name in GAINS]
     numbers = {
@@ -177,7 +177,7 @@ def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
         "steady_command": plant.steady_command,
         "steady_velocity": plant.steady_velocity,
         "quiet": rules.quiet,
-        "patience": rules.patience,
+        "patience": rules.max_quiet,
         "gains": np.stack(table),
     }
     counts = {

@@ -21,17 +21,17 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.one_axis import ONE_AXIS
 from jaxhil.simulation.scenario import Scenario
-from tuning.gains.objective import RMS, Problem, common_terms, residuals
+from tuning.gains.objective import RMS_OBJECTIVE, SolverProblem, compute_residuals, join_terms
 from tuning.gains.tasks import (
     TuneTask,
-    alike,
+    build_gain_bounds,
     build_task,
-    common_loop,
-    gain_bounds,
+    group_by_program,
+    join_loops,
+    list_tuned_gains,
     spread_points,
-    tuned_names,
 )
-from tuning.optimisation.unit_box import Bounds, to_coordinates, to_gains
+from tuning.optimisation.unit_box import GainBounds, to_coordinates, to_gains
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128
@@ -48,9 +48,9 @@ class Case:
     task: TuneTask
     loop: Loop
     names: tuple[str, ...]
-    bounds: Bounds
-    problem: Problem
-    placed_bounds: Bounds
+    bounds: GainBounds
+    problem: SolverProblem
+    placed_bounds: GainBounds
 
     @property
     def name(self) -> str:
@@ -94,8 +94,8 @@ def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
     """The cases of the mechanisms; like ones that tune the same gains share their programs."""
     tasks = [build_task(mechanism, COMPENSATOR, SCENARIOS, SEED) for mechanism in mechanisms]
     cases: dict[int, Case] = {}
-    for group in alike([task.loop for task in tasks], [task.scenarios for task in tasks]):
-        loop = common_loop([tasks[i].loop for i in group])
+    for group in group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks]):
+        loop = join_loops([tasks[i].loop for i in group])
         for i in group:
             cases[i] = _build_case(tasks[i], loop)
     return [cases[i] for i in range(len(tasks))]
@@ -106,10 +106,10 @@ def several(tree: Any, number: int) -> Any:
     return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (number, *leaf.shape)), tree)
 
 
-def over_scenarios(function: Callable[..., Array], problem: Problem, *arguments: Any) -> Array:
+def over_scenarios(function: Callable[..., Array], problem: SolverProblem, *arguments: Any) -> Array:
     """`function(problem, *arguments)` on every device with its share of the scenarios; (devices, ...)."""
     everywhere = PartitionSpec()
-    lanes_last = Problem(
+    lanes_last = SolverProblem(
         jax.tree.map(_lanes_last, problem.rig),
         *jax.tree.map(lambda leaf: everywhere, (problem.fixed, problem.weights)),
     )
@@ -125,17 +125,17 @@ def over_scenarios(function: Callable[..., Array], problem: Problem, *arguments:
 def _build_case(task: TuneTask, loop: Loop) -> Case:
     if np.ptp(task.scenarios.contacts) > 0:
         raise ValueError(f"{task.mechanism.name}: scenarios of different numbers of contacts")
-    names = tuned_names([task])
+    names = list_tuned_gains([task])
     rig = jax.jit(_build_constants, static_argnums=0)(loop, _dealt(task.scenarios))
     fixed: Any = {name: np.asarray(value) for name, value in task.literature.items() if name not in names}
     mesh = _mesh()
     lanes_last = jax.tree.map(lambda leaf: NamedSharding(mesh, _lanes_last(leaf)), rig)
     rig = jax.device_put(rig, lanes_last)
-    bounds = gain_bounds(task, names)
+    bounds = build_gain_bounds(task, names)
     fixed, weights, placed_bounds = jax.device_put(
-        (fixed, RMS.weights, bounds), NamedSharding(mesh, PartitionSpec())
+        (fixed, RMS_OBJECTIVE.weights, bounds), NamedSharding(mesh, PartitionSpec())
     )
-    return Case(task, loop, names, bounds, Problem(rig, fixed, weights), placed_bounds)
+    return Case(task, loop, names, bounds, SolverProblem(rig, fixed, weights), placed_bounds)
 
 
 def _build_constants(loop: Loop, scenarios: Scenario) -> RigConstants:
@@ -159,8 +159,8 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
 
         def some(i, found):
             coordinates = jax.lax.dynamic_slice_in_dim(points, i * together, together)
-            rows = residuals(
-                (ONE_AXIS, loop, names, common_terms([RMS])),
+            rows = compute_residuals(
+                (ONE_AXIS, loop, names, join_terms([RMS_OBJECTIVE])),
                 jax.vmap(to_gains, (0, None))(coordinates, bounds),
                 copies,
             )

@@ -13,13 +13,19 @@ from jaxtyping import Float
 from search_case import Case, several
 from search_methods import Trace
 
-from tuning.gains.multistart import AGREED, BATCHES, CANDIDATES, REACH, SURE
-from tuning.gains.objective import RMS, SCALE, common_terms, residuals
-from tuning.gains.rounds import FIRST_ROUND, inverse_hessian
+from tuning.gains.multistart import (
+    AGREEMENT_TOLERANCE,
+    CANDIDATES_PER_GENERATION,
+    MAX_START_BATCHES,
+    MIN_AGREEING_STARTS,
+    POLISH_STD,
+)
+from tuning.gains.multistart_solver import STEPS_BEFORE_SELECTION, compute_inverse_hessian
+from tuning.gains.objective import RESIDUAL_SCALE, RMS_OBJECTIVE, compute_residuals, join_terms
 from tuning.gains.tasks import spread_points
-from tuning.optimisation.derivative_free import apart, polish
-from tuning.optimisation.levenberg_marquardt import solve
-from tuning.optimisation.solution import Solution
+from tuning.optimisation.derivative_free import polish, select_distant_points
+from tuning.optimisation.levenberg_marquardt import solve_least_squares
+from tuning.optimisation.solution import SolverResult
 
 SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a batch
 STEPS = 25  # of Levenberg-Marquardt
@@ -39,17 +45,22 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     stages = _Stages(number, time.perf_counter())
     ends = [_Ends(np.empty(0), np.empty((0, gains)), np.empty((0, gains, gains))) for _ in starts]
     going = np.arange(number)
-    for batch in range(1 if warming else BATCHES):
+    for batch in range(1 if warming else MAX_START_BATCHES):
         points = np.stack([spread_points(starts[i], SCANNED, (int(i), batch)) for i in going])
         values = case.losses(points.reshape(-1, gains)).reshape(len(going), -1)
         stages.add(going, SCANNED, np.min(values, axis=1))
         order = np.argsort(values, axis=1)
-        first = [apart(own[ranks], None, DESCENTS) for own, ranks in zip(points, order, strict=True)]
-        found = _descend(case, np.concatenate(first), 1 if warming else FIRST_ROUND, number * DESCENTS)
+        first = [
+            select_distant_points(own[ranks], None, DESCENTS)
+            for own, ranks in zip(points, order, strict=True)
+        ]
+        found = _descend(
+            case, np.concatenate(first), 1 if warming else STEPS_BEFORE_SELECTION, number * DESCENTS
+        )
         loss = np.asarray(found.loss).reshape(len(going), DESCENTS)
         stages.add_steps(going, 1 + gains, found)
         best = np.argsort(loss, axis=1)[:, :GO_ON] + DESCENTS * np.arange(len(going))[:, None]
-        left = 1 if warming else STEPS - FIRST_ROUND
+        left = 1 if warming else STEPS - STEPS_BEFORE_SELECTION
         found = _descend(case, found.coordinates[best.reshape(-1)], left, number * GO_ON)
         stages.add_steps(going, 1 + gains, found)
         several = [
@@ -65,7 +76,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
     tops = [int(np.argmin(own.loss)) for own in ends]
     coordinates = np.stack([own.coordinates[top] for own, top in zip(ends, tops, strict=True)])
     shapes = [
-        inverse_hessian(own.curvature[top], SCALE * np.sqrt(2 * own.loss[top]))
+        compute_inverse_hessian(own.curvature[top], RESIDUAL_SCALE * np.sqrt(2 * own.loss[top]))
         for own, top in zip(ends, tops, strict=True)
     ]
 
@@ -74,7 +85,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
 
     last = polish(
         losses, coordinates, 1 if warming else POLISH,
-        candidates=CANDIDATES, reach=REACH, covariance=np.stack(shapes),
+        candidates=CANDIDATES_PER_GENERATION, reach=POLISH_STD, covariance=np.stack(shapes),
     )  # fmt: skip
     stages.add(np.arange(number), POLISH, last.loss)
     return stages.traces()
@@ -91,7 +102,7 @@ class _Ends(NamedTuple):
 def _agree(losses: np.ndarray) -> bool:
     # AGREED is of the rms error, the root of the loss.
     ranked = np.sort(losses)
-    return bool(ranked[SURE - 1] <= (1 + AGREED) ** 2 * ranked[0])
+    return bool(ranked[MIN_AGREEING_STARTS - 1] <= (1 + AGREEMENT_TOLERANCE) ** 2 * ranked[0])
 
 
 def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
@@ -107,14 +118,14 @@ def _sizes(number: int) -> list[int]:
     return [max(1, number >> halvings) for halvings in range(3)]
 
 
-def _descend(case: Case, coordinates, steps, most) -> Solution:
+def _descend(case: Case, coordinates, steps, most) -> SolverResult:
     """From some coordinates, of `most` at any time, in the smallest program that takes so many."""
     size = min(one for one in _sizes(most) if one >= len(coordinates))
     padded = np.concatenate([coordinates, np.repeat(coordinates[:1], size - len(coordinates), axis=0)])
     problems, bounds = several((case.problem, case.bounds), size)
-    static = case.loop, case.names, common_terms([RMS])
-    found = solve(
-        residuals, static, problems, bounds, np.clip(padded, 0, 1), np.array(steps), LONGEST, tile=1
+    static = case.loop, case.names, join_terms([RMS_OBJECTIVE])
+    found = solve_least_squares(
+        compute_residuals, static, problems, bounds, np.clip(padded, 0, 1), np.array(steps), LONGEST, tile=1
     )
     return jax.tree.map(lambda leaf: leaf[: len(coordinates)], jax.device_get(found))
 
@@ -135,7 +146,7 @@ class _Stages:
         self.best.append(reached)
         self.seconds.append((time.perf_counter() - self.begin) / self.number)
 
-    def add_steps(self, which, rollouts: int, found: Solution) -> None:
+    def add_steps(self, which, rollouts: int, found: SolverResult) -> None:
         """Descents of some of the starts, as many of each: an entry for every step."""
         begin = self.seconds[-1]
         end = (time.perf_counter() - self.begin) / self.number

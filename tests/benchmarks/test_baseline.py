@@ -11,8 +11,8 @@ from baseline import FLAGS, KINDS, RESULTS, SOURCE, compile_baseline
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import NOT_REACHED, OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios

@@ -16,12 +16,12 @@ from clusters import on_cluster, started
 from test_sweep import default_gains
 
 from jaxhil.simulation.gain_file import check_document
-from tuning.caches.cluster import Piece, on_workers
-from tuning.sweeps.chunks import run_parts
-from tuning.sweeps.manifest import Choices, build_manifest
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.run import run_sweep
-from tuning.sweeps.store import open_store, read_part
+from tuning.caches.cluster import WorkUnit, run_on_workers
+from tuning.sweeps.chunk_file import list_different_columns
+from tuning.sweeps.chunks import run_chunks
+from tuning.sweeps.manifest import ManifestOptions, build_manifest
+from tuning.sweeps.run_sweep import run_sweep
+from tuning.sweeps.store import open_store, read_chunk
 
 pytestmark = pytest.mark.benchmark
 CHUNK, PARTS, REPEATS = 4096, 32, 3
@@ -29,18 +29,18 @@ THOUSAND, PIECES = 1000, 4000
 STUBS = Path(__file__).with_name("stub_workers.py")
 
 
-def swept(folder, manifest, computer=run_parts):
+def swept(folder, manifest, computer=run_chunks):
     """Seconds of a sweep, and its rows."""
     store = open_store(folder, manifest, resume=False)
     begin = time.perf_counter()
     run_sweep(store, lambda *_: None, lambda *_: None, computer)
     took = time.perf_counter() - begin
-    return took, [read_part(store, part) for part in range(PARTS)]
+    return took, [read_chunk(store, part) for part in range(PARTS)]
 
 
 @pytest.mark.parametrize("workers", [2, 4, 8])
 def test_workers_beside_one_process_on_the_same_cores(workers, tmp_path, capsys):
-    manifest = build_manifest(check_document(default_gains()), Choices(PARTS * CHUNK, chunk=CHUNK))
+    manifest = build_manifest(check_document(default_gains()), ManifestOptions(PARTS * CHUNK, chunk=CHUNK))
     here, there = [], []
     with started(tmp_path) as cluster:
         for _ in range(workers):
@@ -49,7 +49,7 @@ def test_workers_beside_one_process_on_the_same_cores(workers, tmp_path, capsys)
         for turn in range(1 + REPEATS):
             own, rows = swept(tmp_path / f"here {turn}", manifest)
             other, found = swept(tmp_path / f"there {turn}", manifest, on_cluster(cluster.address))
-            assert all(same_rows(one, two) == [] for one, two in zip(rows, found, strict=True))
+            assert all(list_different_columns(one, two) == [] for one, two in zip(rows, found, strict=True))
             here.append(own)
             there.append(other)
     efficiency = min(here[1:]) / min(there[1:])
@@ -75,8 +75,8 @@ def test_the_scheduler_carries_a_thousand_workers(tmp_path, capsys):
                 assert stubs.poll() is None
                 time.sleep(1.0)
         scheduler, ours, begin = spent(cluster.processes[0]), time.process_time(), time.perf_counter()
-        pieces = (Piece(i, (-i,)) for i in range(PIECES))
-        found = dict(on_workers(cluster.address, abs, pieces, None, "stubs"))
+        pieces = (WorkUnit(i, (-i,)) for i in range(PIECES))
+        found = dict(run_on_workers(cluster.address, abs, pieces, None, "stubs"))
         took, ours = time.perf_counter() - begin, time.process_time() - ours
         scheduler = spent(cluster.processes[0]) - scheduler
     np.testing.assert_array_equal([found[i] for i in range(PIECES)], np.arange(PIECES))

@@ -17,12 +17,12 @@ import pytest
 from scipy import optimize
 
 from tuning.identification import free_motion
-from tuning.identification.hold import response as hold_response
-from tuning.identification.rational import STRUCTURES, Model
+from tuning.identification.hold import compute_hold_response as hold_response
+from tuning.identification.rational import STRUCTURES, MotionModel
 
 pytestmark = pytest.mark.benchmark
 SCRIPT = Path(__file__).with_name("identify_others.py")
-TRUE = Model(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
+TRUE = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 CONTACT = 3.0  # Hz, at which the lag counts
 AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
 
@@ -31,12 +31,12 @@ def by_hand(spectrum):
     """What one would write oneself: least squares on the response, no hold, no weights."""
 
     def left(parameters):
-        model = Model(STRUCTURES[2], np.array([*parameters[:2], 1e-3 * parameters[2]]))
+        model = MotionModel(STRUCTURES[2], np.array([*parameters[:2], 1e-3 * parameters[2]]))
         off = model.response(2j * np.pi * spectrum.frequency) - spectrum.output / spectrum.command
         return np.concatenate([off.real, off.imag])
 
     found = optimize.least_squares(left, [np.log(60.0), 0.0, 1.0]).x
-    return Model(STRUCTURES[2], np.array([*found[:2], 1e-3 * found[2]]))
+    return MotionModel(STRUCTURES[2], np.array([*found[:2], 1e-3 * found[2]]))
 
 
 def figures(response):
@@ -56,7 +56,7 @@ def test_methods(tmp_path, capsys):
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
     period, rows = timing.control_period, []
     begin = time.process_time()
-    ours = free_motion.estimate([run], timing)
+    ours = free_motion.fit_free_motion([run], timing)
     rows.append(
         ("jaxhil", ours.model.response(2j * np.pi * AT), ours.model.delay, time.process_time() - begin)
     )

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from tuning.identification.estimate import Options, identify
-from tuning.identification.force_readings import Readings
-from tuning.identification.motion import Motion
+from tuning.identification.force_readings import ForceReadings
+from tuning.identification.identify import IdentificationOptions, identify
+from tuning.identification.motion import MotionResponse
 
 pytestmark = pytest.mark.benchmark
 BAR = 10.0  # s, warm
@@ -26,7 +26,7 @@ UNITS = np.array([1e-3, 1e-6, 1e5, 100.0])
 def general(campaign, model):
     """The four numbers and the bias by a general optimizer."""
     runs = [run for run in campaign.runs if run.kind == "contact"]
-    motion, readings = Motion(model, runs, campaign.timing, 0.022), Readings.of(runs, 0.5)
+    motion, readings = MotionResponse(model, runs, campaign.timing, 0.022), ForceReadings.of(runs, 0.5)
 
     def residuals(scaled):
         delay, plane, stiffness, damping = scaled[:4] * UNITS
@@ -42,7 +42,7 @@ def general(campaign, model):
 
 def test_time_of_a_day(capsys):
     campaign = campaigns.campaign("clean", 0)
-    options = Options(law="kelvin_voigt")
+    options = IdentificationOptions(law="kelvin_voigt")
     identify(campaign, options=options)
     begin = time.process_time()
     found = identify(campaign, options=options)

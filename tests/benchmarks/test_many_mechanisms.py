@@ -13,7 +13,7 @@ from test_start_up import run
 import jaxhil
 import tuning
 from jaxhil.mechanism.file import builtin_path
-from jaxhil.simulation.environment import usable_cores
+from jaxhil.simulation.jax_environment import count_usable_cores
 
 pytestmark = pytest.mark.benchmark
 NUMBER, SINGLE = 64, 6
@@ -25,7 +25,7 @@ SHARE = 0.25
 
 def computing_seconds():
     """Processor time of all threads but this one, over the cores [s]."""
-    return (time.process_time() - time.thread_time()) / usable_cores()
+    return (time.process_time() - time.thread_time()) / count_usable_cores()
 
 
 def test_many_in_one_command_beside_as_many_commands(tmp_path, capsys):

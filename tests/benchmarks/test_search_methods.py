@@ -18,7 +18,7 @@ from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
 from search_ours import ours, warm_up
 from search_table import Results, judge, medians, ratios, table
 
-from tuning.gains.objective import RMS, SCALE, common_terms, residuals
+from tuning.gains.objective import RESIDUAL_SCALE, RMS_OBJECTIVE, compute_residuals, join_terms
 
 pytestmark = pytest.mark.benchmark
 
@@ -60,7 +60,7 @@ def test_methods_on(name, cases, compared, capsys):
     with capsys.disabled():
         print(
             f"\n\n{name}: {len(case.names)} gains, {STARTS} starts, {seconds:.2f} s for each;"
-            f" best rms error {SCALE * np.sqrt(2 * best):.3g}; {os.getloadavg()[0]:.1f} processes on"
+            f" best rms error {RESIDUAL_SCALE * np.sqrt(2 * best):.3g}; {os.getloadavg()[0]:.1f} processes on"
             f" {os.cpu_count()} cores\n{table(compared[name])}"
         )
 
@@ -89,9 +89,9 @@ def test_every_program_has_the_loss_of_tuning(cases):
         points = case.starts(5, 1)
         together = case.losses(points)
         np.testing.assert_allclose([case.losses(point[None])[0] for point in points], together, rtol=1e-9)
-        gains, static = case.gains_of(points), (case.loop, case.names, common_terms([RMS]))
+        gains, static = case.gains_of(points), (case.loop, case.names, join_terms([RMS_OBJECTIVE]))
         problems = several(case.problem, len(points))
-        rows = jax.jit(residuals, static_argnums=0, compiler_options=QUICK)(static, gains, problems)
+        rows = jax.jit(compute_residuals, static_argnums=0, compiler_options=QUICK)(static, gains, problems)
         np.testing.assert_allclose(together, np.sum(np.asarray(rows) ** 2, axis=1) / 2, rtol=1e-9)
         np.testing.assert_allclose(case.shares_of(gains), points, atol=1e-12)
         many = np.resize(points, (CAPACITY + 3, points.shape[1]))

@@ -19,15 +19,15 @@ import pytest
 
 from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.environment import SIX_AXES, known_options
-from jaxhil.simulation.evaluation import TILE
+from jaxhil.simulation.evaluation import TILE_SIZE
+from jaxhil.simulation.jax_environment import SIX_AXIS_OPTIONS, supported_options
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.loop import begin, build_rig, tick
 from jaxhil.sixdof.shapes import Drogue
 
 pytestmark = pytest.mark.benchmark
 TILES, REPEATS = 8, 25
-LANES = TILES * TILE  # lanes of a tile run side by side, tiles one after the other, as all batches do
+LANES = TILES * TILE_SIZE  # lanes of a tile run side by side, tiles one after the other, as all batches do
 TICKS = 384  # until the last of these lanes' episodes is over
 CPP, MUJOCO = 0.3, 30.0  # of their speeds
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-fno-math-errno", "-Wno-psabi", "-shared", "-fPIC")
@@ -97,7 +97,7 @@ def compiled(folder):
     return library
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=known_options(SIX_AXES))
+@partial(jax.jit, static_argnums=0, compiler_options=supported_options(SIX_AXIS_OPTIONS))
 def ticks(loop, rig, run):
     """States after all ticks."""
 
@@ -112,7 +112,7 @@ def tiled(tree):
     """(..., lanes) as (tiles, ..., lanes of a tile); numbers repeated."""
 
     def fold(leaf):
-        spread = jnp.broadcast_to(leaf, (*leaf.shape[:-1], LANES)).reshape(*leaf.shape[:-1], TILES, TILE)
+        spread = jnp.broadcast_to(leaf, (*leaf.shape[:-1], LANES)).reshape(*leaf.shape[:-1], TILES, TILE_SIZE)
         return jnp.moveaxis(spread, -2, 0)
 
     return jax.tree.map(lambda leaf: fold(leaf) if leaf.ndim else jnp.full(TILES, leaf), tree)

@@ -19,10 +19,10 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from test_throughput import PROCESSOR, best, case
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.simulation.environment import TICKS, known_options
+from jaxhil.simulation.jax_environment import TICK_OPTIONS, supported_options
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import run_contacts
-from tuning.gains.rounds import TILE
+from tuning.gains.multistart_solver import LANES_PER_TILE
 
 pytestmark = pytest.mark.benchmark
 REPEATS = 4
@@ -61,7 +61,7 @@ def test_a_command_that_ran_before_begins_soon(name, tmp_path, capsys):
 
 def compiling(traced, values):
     """Seconds that the compiler takes for a new program that only calls the one that is `traced` once."""
-    program = jax.jit(lambda values: traced(values), compiler_options=known_options(TICKS))
+    program = jax.jit(lambda values: traced(values), compiler_options=supported_options(TICK_OPTIONS))
     lowered = program.lower(values)
     begin = time.perf_counter()
     lowered.compile()
@@ -82,7 +82,7 @@ def nothing_kept():
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothing_kept, capsys):
     """A tile's restitutions and their derivatives by all gains, as the solver asks for them."""
-    loop, gains, scenarios = case(compensator, TILE)
+    loop, gains, scenarios = case(compensator, LANES_PER_TILE)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
 
     def with_derivatives(values):
@@ -94,7 +94,7 @@ def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothin
     def restitution(values):
         return run_contacts(loop, dict(zip(gains, values.T, strict=True)), rig).restitution
 
-    values = jnp.tile(jnp.array(list(gains.values())), (TILE, 1))
+    values = jnp.tile(jnp.array(list(gains.values())), (LANES_PER_TILE, 1))
     (took,) = best(partial(compiling, jax.jit(with_derivatives), values), repeats=2)
     with capsys.disabled():
         print(f"\n{PROCESSOR}, {compensator}, derivatives by {len(gains)} gains: compiled in {took:.1f} s")

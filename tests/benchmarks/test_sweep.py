@@ -19,11 +19,11 @@ from jaxhil.mechanism.file import load
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.loop import build_rig_constants
 from tuning.gain_file import build_document, write_gain_file
-from tuning.sweeps.chunks import build_sweep, run_parts
-from tuning.sweeps.draws import drawn_scenarios
-from tuning.sweeps.manifest import CHUNK, Choices, build_manifest
-from tuning.sweeps.store import open_store, write_part
-from tuning.sweeps.tally import add_rows, empty_tally
+from tuning.sweeps.chunks import build_sweep, run_chunks
+from tuning.sweeps.draws import draw_scenarios
+from tuning.sweeps.manifest import DEFAULT_CHUNK_SIZE, ManifestOptions, build_manifest
+from tuning.sweeps.store import open_store, write_chunk
+from tuning.sweeps.tally import add_to_tally, build_empty_tally
 
 pytestmark = pytest.mark.benchmark
 REPEATS = 5
@@ -54,31 +54,31 @@ def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
     if None in baselines:
         pytest.skip("no C++ compiler")
     loaded = check_document(default_gains())
-    manifest = build_manifest(loaded, Choices(PARTS * CHUNK, precision=precision))
+    manifest = build_manifest(loaded, ManifestOptions(PARTS * DEFAULT_CHUNK_SIZE, precision=precision))
     sweep = build_sweep(manifest)
     store = open_store(tmp_path / "store", manifest, resume=False)
     shares = {}
 
     def sweep_seconds():
-        begin, tally, written = time.perf_counter(), empty_tally(1), 0.0
-        for part, rows in run_parts(sweep, range(PARTS)):
+        begin, tally, written = time.perf_counter(), build_empty_tally(1), 0.0
+        for part, rows in run_chunks(sweep, range(PARTS)):
             started = time.perf_counter()
-            write_part(store, part, rows)
+            write_chunk(store, part, rows)
             written += time.perf_counter() - started
-            tally = add_rows(tally, rows)
+            tally = add_to_tally(tally, rows)
         took = time.perf_counter() - begin
         shares[took] = written / took
         return took
 
-    _, scenarios = drawn_scenarios(sweep.mechanism, "random", 0, 0, BASELINE_LANES)
+    _, scenarios = draw_scenarios(sweep.mechanism, "random", 0, 0, BASELINE_LANES)
     on_device = jax.tree.map(jnp.asarray, scenarios)
     rig = jax.jit(build_rig_constants, static_argnums=0)(sweep.loop, on_device)
     # Every scenario ends within the horizon.
     ends = [one.run(sweep.loop, rig, sweep.gains, on_device, 4000)["ticks"].max() for one in baselines]
     drawing = time.perf_counter()
     for part in range(32):
-        drawn_scenarios(sweep.mechanism, "random", 0, part * CHUNK, CHUNK)
-    drawing = 32 * CHUNK / (time.perf_counter() - drawing)
+        draw_scenarios(sweep.mechanism, "random", 0, part * DEFAULT_CHUNK_SIZE, DEFAULT_CHUNK_SIZE)
+    drawing = 32 * DEFAULT_CHUNK_SIZE / (time.perf_counter() - drawing)
     sweep_seconds()
     ours, theirs = [], []
     for _ in range(REPEATS):
@@ -89,7 +89,7 @@ def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
                 for one, end in zip(baselines, ends, strict=True)
             ]
         )
-    rate, compiled = PARTS * CHUNK / min(ours), BASELINE_LANES / np.min(theirs, axis=0)
+    rate, compiled = PARTS * DEFAULT_CHUNK_SIZE / min(ours), BASELINE_LANES / np.min(theirs, axis=0)
     with capsys.disabled():
         print(
             f"\nsweep, {precision}: scenarios/s over C++ to the fixed horizon of {ends[0]} ticks:"

@@ -18,14 +18,14 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.environment import TICKS, known_options
+from jaxhil.simulation.jax_environment import TICK_OPTIONS, supported_options
 from jaxhil.simulation.loop import build_rig_constants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS
-from jaxhil.simulation.rollout import run_contacts, run_to_its_end
+from jaxhil.simulation.rollout import run_contacts, run_until_done
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.batches import join
-from tuning.gains.rounds import TILE
+from tuning.batches import join_batches
+from tuning.gains.multistart_solver import LANES_PER_TILE
 
 pytestmark = pytest.mark.benchmark
 LANES = 16_384  # of a sweep's part
@@ -52,7 +52,7 @@ def case(compensator, lanes, names=("varying",)):
     for name in names:
         mechanism = load(name).mechanism
         batches.append(build_scenarios(mechanism, draw(mechanism, lanes // len(names), 1)))
-    scenarios = join(batches)
+    scenarios = join_batches(batches)
     mechanism = load(names[-1]).mechanism
     gains = {g.name: float(g.nominal(mechanism)) for g in COMPENSATORS[compensator].gains}
     return build_loop(mechanism, compensator, scenarios), gains, scenarios
@@ -64,7 +64,7 @@ def ticks_run(loop, common, per_lane, scenarios):
 
     def of_tile(arguments):
         gains, scenario = arguments
-        return run_to_its_end(loop, {**common, **gains}, build_rig_constants(loop, scenario)).tick
+        return run_until_done(loop, {**common, **gains}, build_rig_constants(loop, scenario)).tick
 
     return jax.lax.map(lambda device: jax.lax.map(of_tile, device), (per_lane, scenarios)) - loop.first_tick
 
@@ -102,7 +102,7 @@ def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
         return int(baseline.run(loop, rig, gains, on_device, 4000)["ticks"].max())
 
     # C++ too finds its numbers in place.
-    arguments = evaluation.place(*ONE_AXIS.shard(scenarios, gains))
+    arguments = evaluation.place_on_devices(*ONE_AXIS.shard(scenarios, gains))
     tiles = ticks_run(loop, *arguments)
     lane_steps = int(np.sum(tiles)) * arguments[-1].velocity.shape[-1]
     flown, skipped = horizon(flying[0]), horizon(skipping[0])
@@ -151,12 +151,18 @@ def jacobian(lanes, options):
 def test_jacobian_with_and_without_its_options_and_tiles(capsys):
     """Time a lane, in the tiles of tuning and twice as many lanes at once."""
     tuned = best(
-        jacobian(TILE, known_options(TICKS)), jacobian(2 * TILE, known_options(TICKS)), jacobian(2 * TILE, {})
+        jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
+        jacobian(2 * LANES_PER_TILE, supported_options(TICK_OPTIONS)),
+        jacobian(2 * LANES_PER_TILE, {}),
     )
-    ours, wide, plain = (time / lanes for time, lanes in zip(tuned, (TILE, 2 * TILE, 2 * TILE), strict=True))
+    ours, wide, plain = (
+        time / lanes
+        for time, lanes in zip(tuned, (LANES_PER_TILE, 2 * LANES_PER_TILE, 2 * LANES_PER_TILE), strict=True)
+    )
     with capsys.disabled():
         print(
-            f"\n{PROCESSOR}, Jacobian over 12 gains, time a lane in tiles of {TILE} over {2 * TILE} at once"
+            f"\n{PROCESSOR}, Jacobian over 12 gains, time a lane in tiles of {LANES_PER_TILE} over "
+            f"{2 * LANES_PER_TILE} at once"
             f" without options: {ours / plain:.2f} (with them {wide / plain:.2f})"
         )
     assert ours <= JACOBIAN * plain

@@ -11,11 +11,11 @@ import pytest
 from test_throughput import LANES, PROCESSOR, best, case, timed
 
 from jaxhil.simulation import evaluation
-from jaxhil.simulation.environment import ROLLOUT
+from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS
 from jaxhil.simulation.one_axis import ONE_AXIS, OneAxis
 
 pytestmark = pytest.mark.benchmark
-OURS = evaluation.TILE, ROLLOUT["xla_cpu_prefer_vector_width"]
+OURS = evaluation.TILE_SIZE, ROLLOUT_OPTIONS["xla_cpu_prefer_vector_width"]
 OTHERS = [(32, 512), (128, 512), (256, 512), (64, 256)]
 
 
@@ -32,11 +32,13 @@ def test_no_other_tiles_and_vectors_are_faster(compensator, monkeypatch, capsys)
         return ONE_AXIS.run_tiles(loop, *arguments)
 
     for tile, width in (OURS, *OTHERS):
-        options = {**ROLLOUT, "xla_cpu_prefer_vector_width": width}
-        monkeypatch.setattr(evaluation, "TILE", tile)
+        options = {**ROLLOUT_OPTIONS, "xla_cpu_prefer_vector_width": width}
+        monkeypatch.setattr(evaluation, "TILE_SIZE", tile)
         use(options)
         outcomes.append(ONE_AXIS.evaluate(loop, gains, scenarios))
-        runs.append(timed(partial(run, options, evaluation.place(*ONE_AXIS.shard(scenarios, gains)))))
+        runs.append(
+            timed(partial(run, options, evaluation.place_on_devices(*ONE_AXIS.shard(scenarios, gains))))
+        )
     ours, *others = best(*runs)
     rates = {own: ours / time for own, time in zip(OTHERS, others, strict=True)}
     with capsys.disabled():

@@ -7,12 +7,12 @@ from rich.console import Console
 from rich.table import Table
 
 from tuning import terminal
-from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
+from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, LawMetrics
 from tuning.statistics.intervals import Estimate
-from tuning.transparency.figures import winner
+from tuning.transparency.metrics import find_winner
 
-PERCENT = ("rms", "p99", "worst", "failures", "trajectory")
-HEADINGS = {
+PERCENT_METRICS = ("rms", "p99", "worst", "failures", "trajectory")
+METRIC_HEADINGS = {
     "rms": "rms %",
     "p99": "p99 %",
     "worst": "worst %",
@@ -24,69 +24,76 @@ HEADINGS = {
     "trajectory": "path %",
     "noise": "noise",
 }
-UNBOUNDED = 10_000  # console width [characters] that does not limit a table
-MARK = "*"  # marks a metric whose interval is better than those of all other laws
+UNLIMITED_WIDTH = 10_000  # console width [characters] that does not limit a table
+WINNER_MARK = "*"  # marks a metric whose interval is better than those of all other laws
 
 
-def winners(found: Sequence[LawFigures], which: str = TUNED) -> dict[str, str | None]:
-    """Return for every metric the law that wins on one mechanism, each law with its `best` gains."""
-    by_law = {result.law: best(result, which) for result in found}
-    return {name: winner(name, {law: m[name] for law, m in by_law.items()}) for name in HEADINGS}
+def find_winners(found: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
+    """Return the best law for every metric on one mechanism, each with its `choose_best_metrics` gains."""
+    by_law = {result.law: choose_best_metrics(result, which) for result in found}
+    return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
 
 
-def best(found: LawFigures, which: str = TUNED) -> dict[str, Estimate]:
+def choose_best_metrics(found: LawMetrics, which: str = TUNED_GAINS) -> dict[str, Estimate]:
     """Return the metrics with tuned gains or, if there are none, with the literature's."""
-    return found.figures.get(which) or found.figures[LITERATURE]
+    return found.figures.get(which) or found.figures[LITERATURE_GAINS]
 
 
-def mechanism_table(name: str, found: Sequence[LawFigures]) -> Table:
+def build_mechanism_table(name: str, found: Sequence[LawMetrics]) -> Table:
     """Return the table of every law with the literature's gains, settings and tuned gains."""
-    winning = winners(found)
+    winning = find_winners(found)
     rows = []
     for result in found:
         for which, metrics in result.figures.items():
-            is_best = metrics is best(result)
+            is_best = metrics is choose_best_metrics(result)
             rows.append(
                 [
-                    result.law if which == LITERATURE else f"  {which}",
-                    *(shown(key, metrics[key], is_best and winning[key] == result.law) for key in HEADINGS),
+                    result.law if which == LITERATURE_GAINS else f"  {which}",
+                    *(
+                        format_metric(key, metrics[key], is_best and winning[key] == result.law)
+                        for key in METRIC_HEADINGS
+                    ),
                 ]
             )
-    tuned = ", then tuned, but for those with settings" * _tuned(found)
+    tuned = ", then tuned, but for those with settings" * _has_tuned_gains(found)
     title = f"{name}: each law with the literature's gains{tuned}"
-    return _unfolded(terminal.table(title, ["law", *HEADINGS.values()], rows))
+    return _set_compact_style(terminal.build_table(title, ["law", *METRIC_HEADINGS.values()], rows))
 
 
-def leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Table:
+def build_leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> Table:
     """Return the table of rms errors [%] of every law and setting (columns) on every mechanism (rows)."""
     results = [result for name in names for result in found[name]]
     laws = list(dict.fromkeys(result.law for result in results))
     columns = dict.fromkeys((result.law, which) for result in results for which in ("", *result.settings))
     columns = sorted(columns, key=lambda column: laws.index(column[0]))
-    winning = {name: winners(found[name])["rms"] for name in names}
+    winning = {name: find_winners(found[name])["rms"] for name in names}
     rows = []
     for name in names:
         cells = []
         by_law = {result.law: result for result in found[name]}
         for law, which in columns:
             result = by_law.get(law)
-            metrics = result and (result.figures.get(which) if which else best(result))
-            cells.append(shown("rms", metrics["rms"], winning[name] == law and not which) if metrics else "-")
+            metrics = result and (result.figures.get(which) if which else choose_best_metrics(result))
+            cells.append(
+                format_metric("rms", metrics["rms"], winning[name] == law and not which) if metrics else "-"
+            )
         rows.append([name.removeprefix("suite-"), *cells])
     headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
-    tuned = any(map(_tuned, found.values()))
+    tuned = any(map(_has_tuned_gains, found.values()))
     how = "each law tuned, but for those with settings" if tuned else "each law with the literature's gains"
-    table = _unfolded(terminal.table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows))
+    table = _set_compact_style(
+        terminal.build_table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows)
+    )
     table.padding = (0, 0)
-    table.width = Console(width=UNBOUNDED).measure(table).maximum
+    table.width = Console(width=UNLIMITED_WIDTH).measure(table).maximum
     return table
 
 
-def least(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> str:
+def describe_least_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> str:
     """Return a sentence with the law of least rms error per mechanism, regardless of the intervals."""
     led: dict[str, list[str]] = {}
     for name in names:
-        errors = {result.law: best(result)["rms"].value for result in found[name]}
+        errors = {result.law: choose_best_metrics(result)["rms"].value for result in found[name]}
         finite = {law: value for law, value in errors.items() if np.isfinite(value)}
         if len(finite) > 1:
             led.setdefault(min(finite, key=lambda law: finite[law]), []).append(name.removeprefix("suite-"))
@@ -95,18 +102,18 @@ def least(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> st
     return f"Least rms error: {'; '.join(texts)}." if led else ""
 
 
-def _tuned(found: Sequence[LawFigures]) -> bool:
-    return any(TUNED in result.figures for result in found)
+def _has_tuned_gains(found: Sequence[LawMetrics]) -> bool:
+    return any(TUNED_GAINS in result.figures for result in found)
 
 
-def _unfolded(table: Table) -> Table:
+def _set_compact_style(table: Table) -> Table:
     """Keep names of a table on one line and its columns close together."""
     table.columns[0].no_wrap = True
     table.padding = (0, 1, 0, 0)
     return table
 
 
-def shown(key: str, figure: Estimate, wins: bool = False) -> str:
+def format_metric(key: str, figure: Estimate, wins: bool = False) -> str:
     """Return a metric with three digits, and with a mark if it wins."""
-    value = 100 * figure.value if key in PERCENT else figure.value
-    return terminal.figure(value, 3) + MARK * wins
+    value = 100 * figure.value if key in PERCENT_METRICS else figure.value
+    return terminal.format_number(value, 3) + WINNER_MARK * wins

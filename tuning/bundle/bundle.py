@@ -12,15 +12,22 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import TEMPORARY, exchange, remove_stale, sync_folder, temporary_name, writing
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import (
+    TEMPORARY_SUFFIX,
+    exchange_names,
+    remove_stale,
+    report_write_errors,
+    sync_folder,
+    temporary_name,
+)
 from jaxhil.rig import GainFileError, digest
 from jaxhil.rig.gain_file import read_gain_document
 from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
 from tuning.bundle.manifest import is_bundle
-from tuning.verification.stops import Stop
+from tuning.verification.stops import ControllerStop
 
 
 class Bundle(NamedTuple):
@@ -33,7 +40,7 @@ class Bundle(NamedTuple):
     # reason for an early end of the comparison with the simulation, for each recorded run; None if complete
     ended: list[str | None]
     reasons: list[str]  # disagreements, in words
-    stop: Stop | None  # stop of the nominal run by the limits; None if there is none
+    stop: ControllerStop | None  # stop of the nominal run by the limits; None if there is none
     passing: dict[str, float] | None  # limits with which that run is not stopped, or None
 
 
@@ -65,22 +72,22 @@ def build_bundle(
         InputError: If the runtime refuses the limits, or the compensator does not support a format.
     """
     from jaxhil.simulation.gain_file import check_document
-    from tuning.bundle.vectors import as_csv, make_vectors
+    from tuning.bundle.vectors import format_csv, make_vectors
 
-    exported = with_limits(document, limits, rates)
+    exported = replace_limits(document, limits, rates)
     loaded = check_document(exported)
     progress("recording test vectors")
     vectors = make_vectors(loaded, seed)
     progress("writing the bundle")
-    files = bundle_files(exported, formats, as_csv(vectors.rows).encode("ascii"))
+    files = bundle_files(exported, formats, format_csv(vectors.rows).encode("ascii"))
     if sign is not None:
-        files[selftest.SIGNATURE] = sign(files[selftest.MANIFEST])
+        files[selftest.SIGNATURE_FILE] = sign(files[selftest.MANIFEST_FILE])
     runs = len({row.run for row in vectors.rows})
     comparison = vectors.ended, vectors.reasons, vectors.stop, vectors.passing
     return Bundle(exported, files, len(vectors.rows), runs, *comparison)
 
 
-def with_limits(
+def replace_limits(
     document: Mapping[str, Any],
     limits: Mapping[str, float | None] | None,
     rates: Mapping[str, Any] | None = None,
@@ -92,48 +99,50 @@ def with_limits(
     if limits is None:
         return dict(document)
     figures = {**document["figures"], **({"watchdog": rates} if rates else {})}
-    changed = {**document, "limits": limits_section(limits), "figures": figures}
+    changed = {**document, "limits": build_limits_section(limits), "figures": figures}
     return {**changed, "sha256": digest(changed)}
 
 
-def limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
+def build_limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
     """Return the section `limits` of a gain file: value and unit by name."""
     return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
 
 
-def check_target(folder: Path) -> None:
+def check_bundle_folder(folder: Path) -> None:
     """Check that a bundle may be written to a folder: a new or empty one, or one with an unchanged bundle.
 
     Raise `InputError` otherwise, so that no changed or additional file is lost.
     """
-    where = one_line(str(folder))
+    where = to_one_line(str(folder))
     try:
         if not folder.exists() and not folder.is_symlink():
             return
         if not folder.is_dir():
-            raise InputError(f"{where}: found a file, allowed a folder for the bundle")
-        _own_files(folder)
+            raise InputError(f"{where}: found a file, expected a folder for the bundle")
+        _list_bundle_files(folder)
     except OSError as error:
-        raise InputError(f"{where}: cannot be read: {one_line(error.strerror or str(error))}") from None
+        raise InputError(f"{where}: cannot be read: {to_one_line(error.strerror or str(error))}") from None
 
 
-def check_mechanism(folder: Path, name: str) -> None:
+def check_same_mechanism(folder: Path, name: str) -> None:
     """Raise `InputError` if the folder has a bundle of a mechanism with another name."""
     try:
         earlier = read_gain_document(folder / "gains.json")["mechanism"]["name"]
     except (GainFileError, KeyError, TypeError):
-        return  # nothing there, or a changed bundle, for which `check_target` raises an error
+        return  # nothing there, or a changed bundle, for which `check_bundle_folder` raises an error
     if earlier != name:
-        found = f"found the bundle of mechanism {shown(earlier)}, expected that of {shown(name)}"
-        raise InputError(f"{one_line(str(folder))}: {found}, or none: name another folder by --output")
+        found = (
+            f"found the bundle of mechanism {format_value(earlier)}, expected that of {format_value(name)}"
+        )
+        raise InputError(f"{to_one_line(str(folder))}: {found}, or none: name another folder by --output")
 
 
 def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write all files of the bundle, or keep the previous state after an error. Raise `InputError`."""
-    check_target(folder)
+    check_bundle_folder(folder)
     target = folder.resolve()
     new = target.with_name(temporary_name())
-    with writing(folder):
+    with report_write_errors(folder):
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_stale(target.parent)
         new.mkdir()
@@ -147,25 +156,25 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
                     os.fsync(file.fileno())
             for subfolder in {(new / name).parent for name in files}:
                 sync_folder(subfolder)
-            _put(new, target)
+            _replace_folder(new, target)
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)
             raise
         sync_folder(target.parent)
 
 
-def _put(new: Path, target: Path) -> None:
+def _replace_folder(new: Path, target: Path) -> None:
     """Move the new folder to the place of the old one, and delete the old one."""
     if not target.exists():
         os.replace(new, target)
         return
-    _swap(new, target)
+    _exchange_folders(new, target)
     old = new
     try:
         # The old folder is checked again, so that files added in between are not deleted.
-        names = _own_files(old)
+        names = _list_bundle_files(old)
     except BaseException:
-        _swap(old, target)
+        _exchange_folders(old, target)
         raise
     with suppress(OSError):
         for name in names:
@@ -173,16 +182,16 @@ def _put(new: Path, target: Path) -> None:
         old.rmdir()
 
 
-def _swap(new: Path, target: Path) -> None:
+def _exchange_folders(new: Path, target: Path) -> None:
     """Exchange the names of two folders."""
     try:
-        exchange(new, target)
+        exchange_names(new, target)
         return
     except OSError as error:
         if error.errno not in (errno.ENOSYS, errno.EINVAL):
             raise
     # A power failure between the two steps leaves the old folder under its temporary name.
-    old = target.with_name(f".{target.name}.{os.getpid()}.old{TEMPORARY}")
+    old = target.with_name(f".{target.name}.{os.getpid()}.old{TEMPORARY_SUFFIX}")
     os.replace(target, old)
     try:
         os.replace(new, target)
@@ -192,27 +201,32 @@ def _swap(new: Path, target: Path) -> None:
     os.replace(old, new)
 
 
-def _own_files(folder: Path) -> list[str]:
+def _list_bundle_files(folder: Path) -> list[str]:
     """Return the paths of an unchanged bundle's files, then of its folders, the innermost first.
 
     Paths of folders end with a slash. The list is empty for an empty folder. Raise `InputError` if the folder
     contains anything else.
     """
-    where, allowed = one_line(str(folder)), "allowed a new or empty folder, or a bundle as it was exported"
+    where, allowed = (
+        to_one_line(str(folder)),
+        "expected a new or empty folder, or a bundle as it was exported",
+    )
     inside = sorted(os.listdir(folder))
     if not inside:
         return []
     if not is_bundle(folder):
-        raise InputError(f"{where}: found {shown(inside[0])} and no bundle, {allowed}")
-    contents, problems = selftest.differences(str(folder))
+        raise InputError(f"{where}: found {format_value(inside[0])} and no bundle, {allowed}")
+    contents, problems = selftest.find_differences(str(folder))
     files = [*contents]
     for name, text in problems:
-        if not name.endswith(selftest.CACHE):
-            raise InputError(f"{where}: {one_line(name, 80)}: {text}; {allowed}")
+        if not name.endswith(selftest.PYTHON_CACHE):
+            raise InputError(f"{where}: {to_one_line(name, 80)}: {text}; {allowed}")
         for entry in list(os.scandir(folder / name)):
             # Python's cache may contain only compiled files.
             if not (entry.is_file(follow_symlinks=False) and entry.name.endswith(".pyc")):
-                raise InputError(f"{where}: {name}{one_line(entry.name, 80)}: no file of a bundle; {allowed}")
+                raise InputError(
+                    f"{where}: {name}{to_one_line(entry.name, 80)}: no file of a bundle; {allowed}"
+                )
             files.append(name + entry.name)
     folders = {f"{name[:index]}/" for name in files for index, sign in enumerate(name) if sign == "/"}
     return [*files, *sorted(folders, key=len, reverse=True)]

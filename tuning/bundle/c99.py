@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
-from jaxhil.codegen import Program, SubsetError
-from jaxhil.errors import InputError, one_line
+from jaxhil.codegen import CProgram, SubsetError
+from jaxhil.errors import InputError, to_one_line
 from jaxhil.rig.controller import Controller
 from jaxhil.rig.faults import FAULTS
 from jaxhil.rig.gain_file import GainFile, check_gain_document
@@ -24,19 +24,19 @@ from jaxhil.rig.limits import LIMITS
 from jaxhil.rig.registry import COMPENSATORS, Compensator
 from tuning.bundle.c99_tables import (
     UNUSABLE,
-    constants,
-    faults_table,
-    gains_table,
-    limits_table,
-    statuses_table,
+    faults_fragment,
+    gain_file_constants,
+    gains_fragment,
+    limits_fragment,
+    statuses_fragment,
 )
 
-HEADER, SOURCE = "jaxhil_controller.h", "jaxhil_controller.c"
-GAINS, TEST = "jaxhil_gains.h", "test_vectors.c"
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-FOLDER = resources.files("tuning") / "bundle"
+HEADER_FILE, SOURCE_FILE = "jaxhil_controller.h", "jaxhil_controller.c"
+GAINS_FILE, TEST_FILE = "jaxhil_gains.h", "test_vectors.c"
+COMPILER_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
+TEST_PROGRAM_FOLDER = resources.files("tuning") / "bundle"
 # Methods and properties in the C interface, in the header's order.
-PUBLIC = {
+PUBLIC_METHODS = {
     "tare": "tare",
     "step": "step",
     "position_command": "position_command",
@@ -53,9 +53,9 @@ PUBLIC = {
     "_last_count": "last_contact",
 }
 
-_SAMPLES = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
+_DELAY_LINE_LENGTH = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
 
-_HEADER = """\
+_HEADER_TEMPLATE = """\
 /* The controller of a hardware-in-the-loop docking rig, with the compensator `{law}`.
  *
  * C99, no allocation, no library but math.h. The caller owns the struct:
@@ -103,7 +103,7 @@ extern "C" {{
 #endif
 """
 
-_SOURCE = """\
+_SOURCE_TEMPLATE = """\
 /* See jaxhil_controller.h. */
 #include "jaxhil_controller.h"
 
@@ -118,7 +118,7 @@ _SOURCE = """\
 
 {definitions}"""
 
-_GAINS = """\
+_GAINS_TEMPLATE = """\
 /* Gains of the compensator `{law}` and limits, from the gain file whose content has the SHA-256
  * {digest}.
  * Decimal, 17 significant digits: a compiler reads back the same doubles.
@@ -135,7 +135,7 @@ _GAINS = """\
 """
 
 
-_PROTOTYPES = """
+_PROTOTYPES_TEMPLATE = """
 /* Begin with these gains and limits. False if they are not admitted, or ask for a longer delay than this code
  * holds: the controller then stays tripped, with the cause JAXHIL_UNUSABLE. */
 bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits);
@@ -144,7 +144,7 @@ bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const
 void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
 """
 
-_INIT = """
+_INIT_TEMPLATE = """
 static void jaxhil_clear(jaxhil_controller *controller) {{
     unsigned char *bytes = (unsigned char *)controller;
     for (size_t n = 0; n < sizeof *controller; n++) {{
@@ -179,7 +179,7 @@ void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, d
 """
 
 
-def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:
+def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:
     """Return the files of the controller in C99 by name: header, source, gains, test program.
 
     Equal documents give equal texts.
@@ -198,33 +198,37 @@ def c99_texts(document: Mapping[str, Any], source: str = "gain document") -> dic
     gain_file = check_gain_document(document, source)
     Controller(gain_file, source)  # raises an error for delays longer than any delay line
     law = gain_file.compensator
-    declarations, definitions = _generated(law, COMPENSATORS[law])
+    declarations, definitions = _generate_code(law, COMPENSATORS[law])
     return {
-        HEADER: _HEADER.format(law=law, lengths=_lengths(declarations, gain_file), declarations=declarations),
-        SOURCE: _SOURCE.format(definitions=definitions),
-        GAINS: _GAINS.format(law=law, digest=document["sha256"], constants=constants(gain_file)),
-        TEST: (FOLDER / TEST).read_text(encoding="utf-8"),
+        HEADER_FILE: _HEADER_TEMPLATE.format(
+            law=law, lengths=_define_lengths(declarations, gain_file), declarations=declarations
+        ),
+        SOURCE_FILE: _SOURCE_TEMPLATE.format(definitions=definitions),
+        GAINS_FILE: _GAINS_TEMPLATE.format(
+            law=law, digest=document["sha256"], constants=gain_file_constants(gain_file)
+        ),
+        TEST_FILE: (TEST_PROGRAM_FOLDER / TEST_FILE).read_text(encoding="utf-8"),
     }
 
 
 @functools.cache
-def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
+def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
     """Return declarations and definitions of the controller with a compensator."""
     signs = {
-        "gains": {name: _sign(gain.lowest) for name, gain in class_.gains.items()},
-        "limits": {name: _sign(limit.lowest) for name, limit in LIMITS.items()},
+        "gains": {name: _sign_condition(gain.lowest) for name, gain in class_.gains.items()},
+        "limits": {name: _sign_condition(limit.lowest) for name, limit in LIMITS.items()},
     }
     enumerators = {fault.name.upper(): fault.bit for fault in FAULTS} | {"UNUSABLE": UNUSABLE}
     enumerators |= {status.name.upper(): status.number for status in STATUSES}
-    methods = {name: vars(Controller)[name] for name in PUBLIC}
+    methods = {name: vars(Controller)[name] for name in PUBLIC_METHODS}
     functions: dict[str, Any] = {
         name: member.fget if isinstance(member, property) else member for name, member in methods.items()
     }
-    program = Program(
+    program = CProgram(
         "jaxhil_",
         structs=signs,
         names={class_: "law", ContactCount: "contact_record", Tare: "bias_tare"},
-        public={functions[name]: f"jaxhil_{named}" for name, named in PUBLIC.items()},
+        public={functions[name]: f"jaxhil_{named}" for name, named in PUBLIC_METHODS.items()},
         bindings={Compensator: class_},
         enumerators=enumerators,
     )
@@ -236,24 +240,24 @@ def _generated(law: str, class_: type[Compensator]) -> tuple[str, str]:
         program.add(vars(Controller)["identified"].fget, Controller)
         output = program.output()
     except SubsetError as error:
-        raise InputError(one_line(f"c99: {law}: {error}; `--format csv` leaves C out")) from None
-    tables = [gains_table(law), limits_table(), faults_table(), statuses_table()]
+        raise InputError(to_one_line(f"c99: {law}: {error}; `--format csv` leaves C out")) from None
+    tables = [gains_fragment(law), limits_fragment(), faults_fragment(), statuses_fragment()]
     declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
     defined = "\n".join(table.definitions for table in tables if table.definitions)
-    init = _INIT.format(law_error=", &error" if constructor.fails else "")
-    return f"{declared}{output.declarations}{_PROTOTYPES}", f"{defined}\n{output.definitions}{init}"
+    init = _INIT_TEMPLATE.format(law_error=", &error" if constructor.fails else "")
+    return f"{declared}{output.declarations}{_PROTOTYPES_TEMPLATE}", f"{defined}\n{output.definitions}{init}"
 
 
-def _sign(lowest: float) -> str:
+def _sign_condition(lowest: float) -> str:
     """Return the C condition on the sign of a value with this lower bound."""
     return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 
-def _lengths(declarations: str, gain_file: GainFile) -> str:
+def _define_lengths(declarations: str, gain_file: GainFile) -> str:
     """Return the definitions of the lengths of all delay lines."""
     lines = []
     delays = {**gain_file.limits, **gain_file.gains}
-    for name in dict.fromkeys(_SAMPLES.findall(declarations)):
+    for name in dict.fromkeys(_DELAY_LINE_LENGTH.findall(declarations)):
         whole = math.floor(delays[name.lower()] / gain_file.control_period + 1e-9)
         lines.append(
             f"\n/* Samples of the line that delays by `{name.lower()}`: raise it to load longer delays. */\n"

@@ -9,25 +9,25 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, span
+from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, format_range
 from jaxhil.rig.faults import FAULTS, UNUSABLE
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.rig.law_status import STATUSES
 from jaxhil.rig.limits import LIMITS
 from jaxhil.rig.registry import COMPENSATORS
 
-WIDTH = 110
+MAX_LINE_WIDTH = 110
 
 
 # Conditions of `limits.complete` besides the range of each limit.
-_FIT = (
+_LIMIT_RELATIONS = (
     "limits->measured_lowest < limits->measured_highest",
     "limits->command_lowest < limits->command_highest",
     "!(limits->retreat_velocity > limits->velocity_limit)",
 )
 
 
-class Table(NamedTuple):
+class CFragment(NamedTuple):
     """Fragment of C code made from a table."""
 
     comment: str  # comment above it
@@ -35,7 +35,7 @@ class Table(NamedTuple):
     definitions: str  # code for the source
 
 
-def decimal(value: float) -> str:
+def format_double(value: float) -> str:
     """Return a double as C text with 17 significant digits, which is read back as the same double."""
     if math.isinf(value):
         return "INFINITY" if value > 0.0 else "-INFINITY"
@@ -43,56 +43,56 @@ def decimal(value: float) -> str:
     return text if "." in text or "e" in text else f"{text}.0"
 
 
-def gains_table(law: str) -> Table:
+def gains_fragment(law: str) -> CFragment:
     """Return the struct `jaxhil_gains` of a compensator, and the check of its values."""
-    clearance = f"(({_within('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
+    clearance = f"(({_range_condition('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
     entries = [
-        ("control_period", f"s, {span(*CONTROL_PERIODS)}"),
-        ("clearance", f"m, {span(*DISTANCES)}, of a contact with two sides; infinite with one"),
+        ("control_period", f"s, {format_range(*CONTROL_PERIODS)}"),
+        ("clearance", f"m, {format_range(*DISTANCES)}, of a contact with two sides; infinite with one"),
     ]
-    checks = [_within("control_period", *CONTROL_PERIODS), clearance]
+    checks = [_range_condition("control_period", *CONTROL_PERIODS), clearance]
     for name, gain in COMPENSATORS[law].gains.items():
-        entries.append((name, f"{gain.unit}, {span(gain.lowest, gain.highest)}"))
-        checks.append(_within(name, gain.lowest, gain.highest))
-    return Table(
+        entries.append((name, f"{gain.unit}, {format_range(gain.lowest, gain.highest)}"))
+        checks.append(_range_condition(name, gain.lowest, gain.highest))
+    return CFragment(
         f"/* The gains of the compensator `{law}`, within bounds that no gain file can move. */\n",
-        _struct("jaxhil_gains", entries),
-        _check("jaxhil_gains_admitted", "jaxhil_gains", "gains", checks),
+        _define_struct("jaxhil_gains", entries),
+        _check_function("jaxhil_gains_admitted", "jaxhil_gains", "gains", checks),
     )
 
 
-def limits_table() -> Table:
+def limits_fragment() -> CFragment:
     """Return the struct `jaxhil_limits`, the check of its values, and the default limits."""
     entries = [
-        (name, f"{limit.unit}, {span(limit.lowest, limit.highest)}: {limit.meaning}")
+        (name, f"{limit.unit}, {format_range(limit.lowest, limit.highest)}: {limit.meaning}")
         for name, limit in LIMITS.items()
     ]
-    checks = [_within(name, limit.lowest, limit.highest, "limits") for name, limit in LIMITS.items()]
-    defaults = _values(
+    checks = [_range_condition(name, limit.lowest, limit.highest, "limits") for name, limit in LIMITS.items()]
+    defaults = _initialisers(
         {name: limit.default for name, limit in LIMITS.items()},
         {name: limit.unit for name, limit in LIMITS.items()},
     )
-    return Table(
+    return CFragment(
         "/* The limits of the controller, each within bounds that no gain file can move. */\n",
-        _struct("jaxhil_limits", entries),
+        _define_struct("jaxhil_limits", entries),
         f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
-        + _check("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *_FIT]),
+        + _check_function("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *_LIMIT_RELATIONS]),
     )
 
 
-def faults_table() -> Table:
+def faults_fragment() -> CFragment:
     """Return the bits of the faults, and the function for their names."""
     named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in FAULTS]
     lines = []
     for name, fault in named:
-        lines.append(_comment(f"{fault.condition}; reaction: {fault.reaction}", "    "))
+        lines.append(_format_comment(f"{fault.condition}; reaction: {fault.reaction}", "    "))
         lines.append(f"    {name} = 0x{fault.bit:X},\n")
     lines.append(
         "    /* the gains or limits given to jaxhil_init are not admitted; reaction: stays tripped */\n"
     )
     lines.append(f"    JAXHIL_UNUSABLE = 0x{UNUSABLE:X}\n")
     cases = "".join(f'    case {name}:\n        return "{fault.name}";\n' for name, fault in named)
-    return Table(
+    return CFragment(
         "/* What can go wrong on the rig, and what the controller does about it: one bit each, raised on\n"
         " * the tick at which it happens. A trip is latched. */\n",
         f"enum {{\n{''.join(lines)}}};\n\n"
@@ -105,13 +105,15 @@ def faults_table() -> Table:
     )
 
 
-def statuses_table() -> Table:
+def statuses_fragment() -> CFragment:
     """Return the statuses of a compensator, and the function for their names."""
     named = [(f"JAXHIL_{status.name.upper()}", status) for status in STATUSES]
-    lines = [f"{_comment(status.meaning, '    ')}    {name} = {status.number}" for name, status in named]
+    lines = [
+        f"{_format_comment(status.meaning, '    ')}    {name} = {status.number}" for name, status in named
+    ]
     joined = ",\n".join(lines)
     cases = "".join(f'    case {name}:\n        return "{status.name}";\n' for name, status in named)
-    return Table(
+    return CFragment(
         "/* What a law may say of its last command. */\n",
         f"enum {{\n{joined}\n}};\n\n"
         '/* The name of a status; "" if there is none of the number. */\n'
@@ -121,7 +123,7 @@ def statuses_table() -> Table:
     )
 
 
-def constants(gain_file: GainFile) -> str:
+def gain_file_constants(gain_file: GainFile) -> str:
     """Return the gains and the limits of a gain file as constants of those structs."""
     units = {"control_period": "s", "clearance": "m"}
     units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
@@ -133,38 +135,40 @@ def constants(gain_file: GainFile) -> str:
     limit_units = {name: limit.unit for name, limit in LIMITS.items()}
     limits = {name: gain_file.limits[name] for name in LIMITS}
     return (
-        f"static const jaxhil_gains jaxhil_exported_gains = {{\n{_values(gains, units)}}};\n\n"
-        f"static const jaxhil_limits jaxhil_exported_limits = {{\n{_values(limits, limit_units)}}};\n"
+        f"static const jaxhil_gains jaxhil_exported_gains = {{\n{_initialisers(gains, units)}}};\n\n"
+        f"static const jaxhil_limits jaxhil_exported_limits = {{\n{_initialisers(limits, limit_units)}}};\n"
     )
 
 
-def _values(values: Mapping[str, float], units: Mapping[str, str]) -> str:
+def _initialisers(values: Mapping[str, float], units: Mapping[str, str]) -> str:
     """Return initialisers in the order of the struct; C++ has no names for fields before C++20."""
-    return "".join(f"    {decimal(value)}, /* {name}, {units[name]} */\n" for name, value in values.items())
+    return "".join(
+        f"    {format_double(value)}, /* {name}, {units[name]} */\n" for name, value in values.items()
+    )
 
 
-def _struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
+def _define_struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
     """Return the definition of a struct of doubles."""
-    lines = "".join(f"{_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
+    lines = "".join(f"{_format_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
     return f"typedef struct {{\n{lines}}} {name};\n"
 
 
-def _within(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
+def _range_condition(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
     """Return a C condition that a value is in its range; without bounds, that it is finite."""
     open_below, open_above = math.isinf(lowest), math.isinf(highest)
     conditions = [f"isfinite({struct}->{name})"] * (open_below or open_above)
-    conditions += [] if open_below else [f"{struct}->{name} >= {decimal(lowest)}"]
-    conditions += [] if open_above else [f"{struct}->{name} <= {decimal(highest)}"]
+    conditions += [] if open_below else [f"{struct}->{name} >= {format_double(lowest)}"]
+    conditions += [] if open_above else [f"{struct}->{name} <= {format_double(highest)}"]
     return " && ".join(conditions)
 
 
-def _check(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:
+def _check_function(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:
     """Return a C function that checks all conditions."""
     joined = " &&\n           ".join(checks)
     return f"static bool {function}(const {struct} *{argument}) {{\n    return {joined};\n}}\n"
 
 
-def _comment(text: str, indent: str) -> str:
+def _format_comment(text: str, indent: str) -> str:
     """Return text as an indented C comment."""
-    lines = textwrap.wrap(text, WIDTH - len(indent) - 6, break_long_words=False)
+    lines = textwrap.wrap(text, MAX_LINE_WIDTH - len(indent) - 6, break_long_words=False)
     return f"{indent}/* {f'{chr(10)}{indent} * '.join(lines)} */\n"

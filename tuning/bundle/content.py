@@ -14,9 +14,9 @@ from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.manifest import manifest_text
 
-TUNING = Path(__file__).parents[1]
+TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
-COPIED = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
+COPIED_FILES = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
 
 
 def code_files(compensator: str) -> dict[str, bytes]:
@@ -34,10 +34,10 @@ def code_files(compensator: str) -> dict[str, bytes]:
         KeyError: If the runtime does not know the compensator.
         ValueError: If the runtime's modules cannot be joined to one file.
     """
-    from tuning.bundle.single_file import runtime_source
+    from tuning.bundle.single_file import build_runtime_source
 
-    copied = {Path(name).name: (TUNING / name).read_bytes() for name in COPIED}
-    return {"jaxhil_runtime.py": runtime_source(compensator).encode(), **copied}
+    copied = {Path(name).name: (TUNING_FOLDER / name).read_bytes() for name in COPIED_FILES}
+    return {"jaxhil_runtime.py": build_runtime_source(compensator).encode(), **copied}
 
 
 def bundle_files(
@@ -76,11 +76,11 @@ def bundle_files(
     for name in formats:
         files.update(WRITERS[name](document))
     files["README.md"] = readme_text(document, files).encode()
-    files[selftest.MANIFEST] = manifest_text(files, document)
+    files[selftest.MANIFEST_FILE] = manifest_text(files, document)
     return files
 
 
-def formats_among(names: Collection[str], document: Mapping[str, Any]) -> list[str]:
+def find_formats(names: Collection[str], document: Mapping[str, Any]) -> list[str]:
     """Return the formats of which a bundle with these file names contains files."""
     from tuning.bundle.writers import WRITERS
 

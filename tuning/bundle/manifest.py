@@ -15,7 +15,7 @@ from typing import Any
 from tuning.bundle import selftest
 
 # Files by which a folder is recognised as a bundle.
-MARKS = (selftest.MANIFEST, selftest.SIGNATURE, "selftest.py", "jaxhil_runtime.py")
+BUNDLE_MARKERS = (selftest.MANIFEST_FILE, selftest.SIGNATURE_FILE, "selftest.py", "jaxhil_runtime.py")
 
 
 def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:
@@ -24,24 +24,24 @@ def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> by
     for name, content in sorted(files.items()):
         entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
         if is_text(content):
-            entry["lines"] = selftest.line_checks(content)
+            entry["lines"] = selftest.line_checksums(content)
         entries[name] = entry
     body = json.dumps(
         {
             "schema": selftest.SCHEMA,
-            "version": version(),
+            "version": package_version(),
             "compensator": document["compensator"],
             "gains_sha256": document["sha256"],
-            "values": dict(sorted(selftest.leaves(document, ""))),
+            "values": dict(sorted(selftest.flatten_document(document, ""))),
             "files": entries,
         },
         indent=1,
     ).encode("ascii")
     body = body.removesuffix(b"\n}")
-    return body + selftest.own_seal(body)
+    return body + selftest.build_manifest_seal(body)
 
 
-def version() -> str:
+def package_version() -> str:
     """Return the version of this package, as written into manifests."""
     try:
         return f"jaxhil {metadata.version('jaxhil')}"
@@ -60,4 +60,4 @@ def is_text(content: bytes) -> bool:
 
 def is_bundle(folder: Path) -> bool:
     """Return whether a folder contains a bundle, or remains of one."""
-    return folder.is_dir() and any(os.path.lexists(folder / name) for name in MARKS)
+    return folder.is_dir() and any(os.path.lexists(folder / name) for name in BUNDLE_MARKERS)

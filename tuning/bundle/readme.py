@@ -7,7 +7,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from jaxhil.errors import one_line
+from jaxhil.errors import to_one_line
 from jaxhil.rig.bounds import FORCES, POSITIONS, SPEEDS
 from jaxhil.rig.faults import FAULTS
 from jaxhil.rig.law_status import STATUSES
@@ -15,7 +15,7 @@ from jaxhil.rig.law_status import STATUSES
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 
 # Files and folders of a bundle with their purpose.
-CONTENT = {
+FILE_DESCRIPTIONS = {
     "gains.json": "the gains, their limits for the rig, and all that they were tuned for and over",
     "jaxhil_runtime.py": "the controller, in Python without further packages",
     "vectors.csv": "recorded and hostile ticks, and what the controller commands at each",
@@ -34,9 +34,9 @@ CONTENT = {
 def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
     """Return the README of the bundle of a gain document that contains these files."""
     present = {*(name.partition("/")[0] for name in files), "manifest.json"}
-    table_rows = [f"| `{name}` | {text} |" for name, text in CONTENT.items() if name in present]
+    table_rows = [f"| `{name}` | {text} |" for name, text in FILE_DESCRIPTIONS.items() if name in present]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        mechanism=_text(one_line(document["mechanism"]["name"], 80)),
+        mechanism=_escape_text(to_one_line(document["mechanism"]["name"], 80)),
         compensator=document["compensator"],
         period=repr(document["control_period"]),
         digest=document["sha256"],
@@ -50,24 +50,25 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
 
 def status_table() -> str:
     """Return the runtime's table of a compensator's statuses in Markdown."""
-    rows = [f"| `{status.name}` | {_cell(status.meaning)} |" for status in STATUSES]
+    rows = [f"| `{status.name}` | {_escape_cell(status.meaning)} |" for status in STATUSES]
     return "\n".join(("| status | says |", "|---|---|", *rows))
 
 
 def fault_table() -> str:
     """Return the runtime's table of faults in Markdown: bit, name, condition, reaction."""
     rows = [
-        f"| `{fault.bit:#x}` | `{fault.name}` | {_cell(fault.condition)} | {_cell(fault.reaction)} |"
+        f"| `{fault.bit:#x}` | `{fault.name}` | {_escape_cell(fault.condition)} | "
+        f"{_escape_cell(fault.reaction)} |"
         for fault in FAULTS
     ]
     return "\n".join(("| bit | fault | raised when | reaction |", "|---|---|---|---|", *rows))
 
 
-def _text(text: str) -> str:
+def _escape_text(text: str) -> str:
     """Return a user's text with escaped Markdown and HTML."""
     return re.sub(r"([\\`*_\[\]|~$#])", r"\\\1", html.escape(text, quote=False))
 
 
-def _cell(text: str) -> str:
+def _escape_cell(text: str) -> str:
     """Return a text for a cell of a Markdown table."""
     return text.replace("|", "\\|")

@@ -8,31 +8,31 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
+from jaxhil.errors import InputError, to_one_line
 from jaxhil.files import open_input
 
-LARGEST = 65536  # bytes; largest size of a key's file
+MAX_KEY_BYTES = 65536  # bytes; largest size of a key's file
 
 
-def signer(path: Path) -> Callable[[bytes], bytes]:
+def load_signer(path: Path) -> Callable[[bytes], bytes]:
     """Return a function that signs bytes with the private key in a file. Raise `InputError`."""
-    ed25519, serialization = _library()
+    ed25519, serialization = _import_cryptography()
     allowed = "an Ed25519 private key without a passphrase, as PEM"
-    key = _key(path, allowed, lambda text: serialization.load_pem_private_key(text, password=None))
+    key = _read_key(path, allowed, lambda text: serialization.load_pem_private_key(text, password=None))
     if not isinstance(key, ed25519.Ed25519PrivateKey):
-        raise _refusal(path, "another kind of key", allowed)
+        raise _key_error(path, "another kind of key", allowed)
     return key.sign
 
 
-def verifier(path: Path) -> Callable[[bytes, bytes], bool]:
+def load_verifier(path: Path) -> Callable[[bytes, bytes], bool]:
     """Return a function that checks signatures by the public key in a file. Raise `InputError`."""
-    ed25519, serialization = _library()
+    ed25519, serialization = _import_cryptography()
     from cryptography.exceptions import InvalidSignature
 
     allowed = "an Ed25519 public key as PEM"
-    key = _key(path, allowed, serialization.load_pem_public_key)
+    key = _read_key(path, allowed, serialization.load_pem_public_key)
     if not isinstance(key, ed25519.Ed25519PublicKey):
-        raise _refusal(path, "another kind of key", allowed)
+        raise _key_error(path, "another kind of key", allowed)
 
     def is_signature(signature: bytes, content: bytes) -> bool:
         try:
@@ -44,38 +44,38 @@ def verifier(path: Path) -> Callable[[bytes, bytes], bool]:
     return is_signature
 
 
-def _library() -> tuple[Any, Any]:
+def _import_cryptography() -> tuple[Any, Any]:
     """Import and return the modules of `cryptography`. Raise `InputError` if it is not installed."""
     try:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError:
         raise InputError(
-            "signing: found no package cryptography, allowed with it: pip install 'jaxhil[sign]'"
+            "signing: found no package cryptography, expected with it: pip install 'jaxhil[sign]'"
         ) from None
     return ed25519, serialization
 
 
-def _key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
+def _read_key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
     """Read a key from a PEM file by the function `load`. Raise `InputError`."""
     from cryptography.exceptions import UnsupportedAlgorithm
 
     try:
         with open_input(path) as file:
-            text = file.read(LARGEST + 1)
+            text = file.read(MAX_KEY_BYTES + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{one_line(str(path))}: cannot be read: {one_line(reason)}") from None
-    if len(text) > LARGEST:
-        raise _refusal(path, "a larger file", allowed)
+        raise InputError(f"{to_one_line(str(path))}: cannot be read: {to_one_line(reason)}") from None
+    if len(text) > MAX_KEY_BYTES:
+        raise _key_error(path, "a larger file", allowed)
     try:
         return load(text)
     except TypeError:
-        raise _refusal(path, "an encrypted key", allowed) from None
+        raise _key_error(path, "an encrypted key", allowed) from None
     except (ValueError, UnsupportedAlgorithm):
-        raise _refusal(path, "no such key", allowed) from None
+        raise _key_error(path, "no such key", allowed) from None
 
 
-def _refusal(path: Path, found: str, allowed: str) -> InputError:
+def _key_error(path: Path, found: str, allowed: str) -> InputError:
     """Return the error for an unusable key file."""
-    return InputError(f"{one_line(str(path))}: found {found}, allowed {allowed}")
+    return InputError(f"{to_one_line(str(path))}: found {found}, expected {allowed}")

@@ -15,12 +15,12 @@ from types import ModuleType
 from typing import NamedTuple
 
 import jaxhil.rig
-from tuning.bundle.foreign_law import module_text
+from tuning.bundle.user_compensator import module_text
 
-OUTSIDE = {*sys.stdlib_module_names, "numpy"}
+EXTERNAL_PACKAGES = {*sys.stdlib_module_names, "numpy"}
 
 
-class Source(NamedTuple):
+class ModuleSource(NamedTuple):
     """Source of a module of the package."""
 
     name: str  # full name of the module
@@ -29,10 +29,10 @@ class Source(NamedTuple):
     inside: dict[str, str]  # module of the package by the name imported from it
     outside: tuple[str, ...]  # import lines for external modules
     # statements that are left out in one file: docstring, imports, `__all__`
-    dropped: tuple[ast.stmt, ...]
+    omitted_statements: tuple[ast.stmt, ...]
 
 
-def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
+def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
     """Return the text of `jaxhil_runtime.py`: all that `package` offers, with one compensator.
 
     Args:
@@ -52,11 +52,11 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
     class_ = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS[compensator]
     law, generated = class_.__module__, {}
     if law.partition(".")[0] != root:
-        generated[law] = source_of(module_text(class_, compensator), law, f"{compensator}.py", root)
+        generated[law] = parse_source(module_text(class_, compensator), law, f"{compensator}.py", root)
     offered = read_source(f"{package.__name__}.__init__")
-    sources = _in_order([law, *_offering(offered)], generated)
+    sources = _sort_by_imports([law, *_public_modules(offered)], generated)
     _check_unique(sources)
-    public = [name for name in _public(offered) if name in offered.inside]
+    public = [name for name in _public_names(offered) if name in offered.inside]
     imports = {line for source in sources for line in source.outside}
     needed = "NumPy beside it" if any("numpy" in line for line in imports) else "nothing else to install"
     lines = [
@@ -68,7 +68,7 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
         '"""',
         "",
         *sorted(imports, key=lambda line: ("numpy" in line, line.startswith("from"), line)),
-        *(line for source in sources for line in _section(source)),
+        *(line for source in sources for line in _module_section(source)),
         "",
         "",
         "__all__ = [" + ", ".join(f'"{name}"' for name in public) + "]",
@@ -81,16 +81,16 @@ def runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
     return text
 
 
-def read_source(name: str) -> Source:
+def read_source(name: str) -> ModuleSource:
     """Return a module by its full name, with its docstring, imports and `__all__` separated."""
     root, _, below = name.partition(".")
     path = Path(str(sys.modules[root].__file__)).parent / f"{below.replace('.', '/')}.py"
     if not path.is_file():
         raise ValueError(f"{name}: found no module's file, expected imports of names from modules")
-    return source_of(path.read_text(encoding="utf-8"), name, path.name, root)
+    return parse_source(path.read_text(encoding="utf-8"), name, path.name, root)
 
 
-def source_of(text: str, name: str, file: str, root: str) -> Source:
+def parse_source(text: str, name: str, file: str, root: str) -> ModuleSource:
     """Return a module from its text; imports from the package `root` are internal."""
     tree = ast.parse(text, file)
     inside: dict[str, str] = {}
@@ -104,40 +104,40 @@ def source_of(text: str, name: str, file: str, root: str) -> Source:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{root}."):
             if node not in tree.body:
                 raise ValueError(f"{where}: an import of the package within a block")
-            inside.update(_from_inside(node, where))
+            inside.update(_internal_imports(node, where))
         elif node in tree.body:
-            outside.extend(_from_outside(node, where))
+            outside.extend(_external_imports(node, where))
         if node in tree.body:
             dropped.append(node)
-    return Source(name, text, tree, inside, tuple(outside), tuple(dropped))
+    return ModuleSource(name, text, tree, inside, tuple(outside), tuple(dropped))
 
 
-def _from_inside(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
+def _internal_imports(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
     """Yield each name that an import of the package binds, and its module."""
     for alias in node.names:
         if alias.asname is not None:
-            raise ValueError(f"{where}: imports {alias.name} under another name, allowed its own")
+            raise ValueError(f"{where}: imports {alias.name} under another name, expected its own")
         yield alias.name, str(node.module)
 
 
-def _from_outside(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
+def _external_imports(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
     """Yield one import line for each imported name."""
     for alias in node.names:
         module = node.module or "" if isinstance(node, ast.ImportFrom) else alias.name
         if isinstance(node, ast.ImportFrom) and node.level:
-            raise ValueError(f"{where}: a relative import, allowed imports by a module's full name")
-        if module.partition(".")[0] not in OUTSIDE:
-            raise ValueError(f"{where}: imports {module}, allowed the standard library and NumPy")
+            raise ValueError(f"{where}: a relative import, expected imports by a module's full name")
+        if module.partition(".")[0] not in EXTERNAL_PACKAGES:
+            raise ValueError(f"{where}: imports {module}, expected the standard library and NumPy")
         line = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
         yield f"from {module} {line}" if isinstance(node, ast.ImportFrom) else line
 
 
-def _in_order(names: Iterable[str], generated: dict[str, Source]) -> list[Source]:
+def _sort_by_imports(names: Iterable[str], generated: dict[str, ModuleSource]) -> list[ModuleSource]:
     """Return the wanted modules and all modules that they import, each after its own imports.
 
     Modules in `generated` are not read from files.
     """
-    ordered: dict[str, Source] = {}
+    ordered: dict[str, ModuleSource] = {}
 
     def visit(name: str, above: tuple[str, ...]) -> None:
         if name in above:
@@ -154,19 +154,19 @@ def _in_order(names: Iterable[str], generated: dict[str, Source]) -> list[Source
     return list(ordered.values())
 
 
-def _check_unique(sources: Iterable[Source]) -> None:
+def _check_unique(sources: Iterable[ModuleSource]) -> None:
     """Raise ValueError if two modules bind the same name, or a name has two external meanings."""
     owners: dict[str, str] = {}
     for source in sources:
-        bound = {name: source.name for statement in source.tree.body for name in _bound_by(statement)}
+        bound = {name: source.name for statement in source.tree.body for name in _bound_names(statement)}
         for line in source.outside:
             bound[re.split(r"[ .]", line.rpartition(" as ")[2].rpartition("import ")[2])[0]] = line
         for name, owner in bound.items():
             if owners.setdefault(name, owner) != owner:
-                raise ValueError(f"{name}: found in {owners[name]} and in {owner}, allowed once")
+                raise ValueError(f"{name}: found in {owners[name]} and in {owner}, expected once")
 
 
-def _bound_by(statement: ast.stmt) -> Iterator[str]:
+def _bound_names(statement: ast.stmt) -> Iterator[str]:
     """Yield the names that a top-level statement binds, except for imports and `__all__`."""
     if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
         yield statement.name
@@ -176,20 +176,20 @@ def _bound_by(statement: ast.stmt) -> Iterator[str]:
                 yield node.id
 
 
-def _section(source: Source) -> Iterator[str]:
+def _module_section(source: ModuleSource) -> Iterator[str]:
     """Yield the module's docstring as a comment, then its text without the dropped statements."""
     yield from ("", "", f"# ---- {source.name} " + "-" * (100 - len(source.name)))
     for line in (ast.get_docstring(source.tree) or "").splitlines():
         yield f"# {line}".rstrip()
     yield ""
     lines = source.text.splitlines()
-    for statement in source.dropped:
+    for statement in source.omitted_statements:
         for number in range(statement.lineno - 1, statement.end_lineno or statement.lineno):
             lines[number] = ""
     yield re.sub(r"\n{4,}", "\n\n\n", "\n".join(lines)).strip("\n")
 
 
-def _public(offered: Source) -> list[str]:
+def _public_names(offered: ModuleSource) -> list[str]:
     """Return the names in `__all__` of a module. Raise ValueError if there are none."""
     for statement in offered.tree.body:
         if isinstance(statement, ast.Assign) and _assigns(statement, "__all__"):
@@ -197,9 +197,9 @@ def _public(offered: Source) -> list[str]:
     raise ValueError("the runtime's __init__ says nothing in __all__")
 
 
-def _offering(offered: Source) -> list[str]:
+def _public_modules(offered: ModuleSource) -> list[str]:
     """Return the modules of the public names."""
-    return [offered.inside[name] for name in _public(offered) if name in offered.inside]
+    return [offered.inside[name] for name in _public_names(offered) if name in offered.inside]
 
 
 def _assigns(statement: ast.stmt, name: str) -> bool:

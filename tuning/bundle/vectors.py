@@ -1,9 +1,9 @@
 """Test vectors: inputs and commands of the runtime tick by tick, which a controller must reproduce.
 
-`recorded` replays the nominal run and random draws of the simulated loop through the runtime, together with
-the commands of the simulated controller. `hostile` damages segments of the nominal run: readings and model
-states that are not finite, huge or stuck, and ticks that are late, missing or backwards in time. Position
-commands are those for a numerical model that is integrated under the runtime's force.
+`record_vectors` replays the nominal run and random draws of the simulated loop through the runtime, together
+with the commands of the simulated controller. `make_damaged_rows` damages segments of the nominal run:
+readings and model states that are not finite, huge or stuck, and ticks that are late, missing or backwards in
+time. Position commands are those for a numerical model that is integrated under the runtime's force.
 """
 
 import csv
@@ -15,37 +15,37 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxhil.mechanism.correlation import certain
+from jaxhil.mechanism.correlation import fix_at_nominal
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import Controller
-from jaxhil.rig.faults import LAW_IN_DOUBT, names
+from jaxhil.rig.faults import LAW_IN_DOUBT, fault_names
 from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.integrators import INTEGRATORS
-from jaxhil.simulation.recording import Lane, nominal_and_draws, record_lanes
-from tuning.verification.replay import (
+from jaxhil.simulation.recording import LaneRecord, nominal_and_draws, record_lanes
+from tuning.verification.runtime_replay import (
     REPLAY_LIMIT,
-    command_range,
-    near_threshold,
-    parting,
-    relative_difference,
+    compute_command_range,
+    compute_relative_difference,
+    find_divergence_tick,
+    find_threshold_ticks,
 )
-from tuning.verification.stops import Stop, find_stop, passing_limits
+from tuning.verification.stops import ControllerStop, find_passing_limits, find_stop
 
-BEGINS, NEXT_CONTACT = 1, 2  # events of a tick; 0 for none
-DRAWS = 3
-LONGEST_RUN = 6000  # ticks
-HOSTILE_RUNS, HOSTILE_TICKS = 48, 60
-DAMAGED = 0.06  # share of the hostile ticks that are damaged
-OF_ONE_RIG = ("rig.control_period", "contact.clearance")  # fixed by the gain file, so not drawn
-EXTREMES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)
+RUN_START, NEXT_CONTACT = 1, 2  # events of a tick; 0 for none
+DEFAULT_DRAWS = 3
+MAX_RUN_TICKS = 6000  # ticks
+DAMAGED_RUNS, DAMAGED_RUN_TICKS = 48, 60
+DAMAGED_TICK_SHARE = 0.06  # share of the hostile ticks that are damaged
+KEYS_FIXED_BY_GAIN_FILE = ("rig.control_period", "contact.clearance")  # fixed by the gain file, so not drawn
+EXTREME_VALUES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)
 
 
-class Inputs(NamedTuple):
+class ControllerInputs(NamedTuple):
     """Inputs of the controller in one tick."""
 
     run: int  # number of the run
-    event: int  # `BEGINS`, `NEXT_CONTACT`, or 0
+    event: int  # `RUN_START`, `NEXT_CONTACT`, or 0
     force_measured: float  # [N]
     position_desired: float  # position of the numerical model [m]
     velocity_desired: float  # velocity of the numerical model [m/s]
@@ -57,10 +57,10 @@ class Inputs(NamedTuple):
     zeroed: bool = False  # whether the model gets no force, for any command
 
 
-class Row(NamedTuple):
+class VectorRow(NamedTuple):
     """Line of vectors.csv, in SI units."""
 
-    run: int  # this field and the next six as in `Inputs`
+    run: int  # this field and the next six as in `ControllerInputs`
     event: int
     force_measured: float
     position_desired: float
@@ -76,110 +76,120 @@ class Row(NamedTuple):
     force_simulated: float  # simulated force command; NaN if there is none to compare with
 
 
-class Recorded(NamedTuple):
+class RecordedVectors(NamedTuple):
     """Vectors of recorded runs."""
 
-    rows: list[Row]  # ticks of all runs
+    rows: list[VectorRow]  # ticks of all runs
     mass: float  # equivalent mass of the nominal run [kg]
     ended: list[str | None]  # for each run the reason for an early end of the comparison, or None
     reasons: list[str]  # disagreements, in words
-    stop: Stop | None  # stop of the nominal run by the limits; None if there is none
+    stop: ControllerStop | None  # stop of the nominal run by the limits; None if there is none
     passing: dict[str, float] | None  # limits with which that run is not stopped, or None
 
 
-def recorded(loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DRAWS) -> Recorded:
+def record_vectors(
+    loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DEFAULT_DRAWS
+) -> RecordedVectors:
     """Replay the nominal run and draws of the uncertain numbers through the runtime."""
-    mechanism = one_rig(loaded.mechanism)
+    mechanism = remove_fixed_uncertainty(loaded.mechanism)
     batch = nominal_and_draws(mechanism, 1 + draws, seed)
     _, lanes = record_lanes(loaded, batch)
     rows, ended, reasons = [], [], []
     for run, lane in enumerate(lanes):
         mass = float(batch.equivalent_mass[run])
         controller = Controller(gain_file)
-        inputs = list(_of_lane(run, lane, gain_file.control_period))
-        run_rows, identified, acting = _through(controller, inputs, mechanism.rig.integrator, mass, gain_file)
-        run_rows, end, reason = _compared(run_rows, inputs, identified, acting, lane, gain_file)
+        inputs = list(_lane_inputs(run, lane, gain_file.control_period))
+        run_rows, identified, acting = _run_controller(
+            controller, inputs, mechanism.rig.integrator, mass, gain_file
+        )
+        run_rows, end, reason = _compare_with_simulation(
+            run_rows, inputs, identified, acting, lane, gain_file
+        )
         rows += run_rows
         ended.append(end)
         if reason:
             reasons.append(f"{'the nominal run' if run == 0 else f'draw {run}'}, {reason}")
     stop = find_stop(gain_file, lanes[0])
-    passing = None if stop is None else passing_limits(gain_file, lanes[0])
-    return Recorded(rows, float(batch.equivalent_mass[0]), ended, reasons, stop, passing)
+    passing = None if stop is None else find_passing_limits(gain_file, lanes[0])
+    return RecordedVectors(rows, float(batch.equivalent_mass[0]), ended, reasons, stop, passing)
 
 
-def hostile(
-    nominal: Sequence[Row], integrator: str, mass: float, gain_file: GainFile, seed: int
-) -> list[Row]:
+def make_damaged_rows(
+    nominal: Sequence[VectorRow], integrator: str, mass: float, gain_file: GainFile, seed: int
+) -> list[VectorRow]:
     """Return the runtime's rows for damaged segments of the nominal run.
 
     `mass` is the equivalent mass of the numerical model [kg].
     """
     source = random.Random(seed)
-    rows: list[Row] = []
-    for run in range(HOSTILE_RUNS):
-        begin = source.randrange(max(1, len(nominal) - HOSTILE_TICKS))
-        segment = nominal[begin : begin + HOSTILE_TICKS]
-        inputs = list(_damaged(source, run, segment, gain_file.control_period))
-        rows += _through(Controller(gain_file), inputs, integrator, mass, gain_file)[0]
+    rows: list[VectorRow] = []
+    for run in range(DAMAGED_RUNS):
+        begin = source.randrange(max(1, len(nominal) - DAMAGED_RUN_TICKS))
+        segment = nominal[begin : begin + DAMAGED_RUN_TICKS]
+        inputs = list(_damage_inputs(source, run, segment, gain_file.control_period))
+        rows += _run_controller(Controller(gain_file), inputs, integrator, mass, gain_file)[0]
     return rows
 
 
-def make_vectors(loaded: LoadedGains, seed: int, draws: int = DRAWS) -> Recorded:
+def make_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> RecordedVectors:
     """Return the recorded runs, followed by the hostile ones."""
     gain_file = check_gain_document(loaded.document)
-    vectors = recorded(loaded, gain_file, seed, draws)
+    vectors = record_vectors(loaded, gain_file, seed, draws)
     nominal = [row for row in vectors.rows if row.run == 0]
-    damaged = hostile(nominal, loaded.mechanism.rig.integrator, vectors.mass, gain_file, seed)
+    damaged = make_damaged_rows(nominal, loaded.mechanism.rig.integrator, vectors.mass, gain_file, seed)
     last = max((row.run for row in vectors.rows), default=-1) + 1
     return vectors._replace(rows=[*vectors.rows, *(row._replace(run=last + row.run) for row in damaged)])
 
 
-def as_csv(rows: Sequence[Row]) -> str:
+def format_csv(rows: Sequence[VectorRow]) -> str:
     """Return the text of vectors.csv: a header, then one line per tick with Python's repr; '' for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
+    writer.writerow(VectorRow._fields)
     writer.writerows(["" if value is None else repr(value) for value in row] for row in rows)
     return text.getvalue()
 
 
-def one_rig(mechanism: Mechanism) -> Mechanism:
+def remove_fixed_uncertainty(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism without uncertainty of the values that the gain file fixes."""
-    return certain(mechanism, OF_ONE_RIG)
+    return fix_at_nominal(mechanism, KEYS_FIXED_BY_GAIN_FILE)
 
 
-def _of_lane(run: int, lane: Lane, period: float) -> Iterator[Inputs]:
+def _lane_inputs(run: int, lane: LaneRecord, period: float) -> Iterator[ControllerInputs]:
     """Yield the inputs of one simulated run, tick by tick."""
     readings = zip(*(leaf.tolist() for leaf in lane.signals), strict=True)
     for tick, (force, position, velocity, measured, age) in enumerate(readings):
-        if tick == LONGEST_RUN:
+        if tick == MAX_RUN_TICKS:
             return
-        event = BEGINS if tick == 0 else NEXT_CONTACT if age == 0 else 0
+        event = RUN_START if tick == 0 else NEXT_CONTACT if age == 0 else 0
         zeroed = bool(age == 0 and lane.zeroed)
         simulated = nan if zeroed else float(lane.command[tick])
-        yield Inputs(run, event, force, position, velocity, measured, tick * period, None, simulated, zeroed)
+        yield ControllerInputs(
+            run, event, force, position, velocity, measured, tick * period, None, simulated, zeroed
+        )
 
 
-def _damaged(source: random.Random, run: int, segment: Sequence[Row], period: float) -> Iterator[Inputs]:
+def _damage_inputs(
+    source: random.Random, run: int, segment: Sequence[VectorRow], period: float
+) -> Iterator[ControllerInputs]:
     """Yield the inputs of a segment of the nominal run with random damage."""
     timed = source.random() < 0.8
     time, stuck = source.uniform(0.0, 1e3), {}
     for tick, row in enumerate(segment):
-        event = BEGINS if tick == 0 else NEXT_CONTACT if source.random() < DAMAGED / 4 else 0
-        inputs = Inputs(run, event, *row[2:6], time)
-        damage = source.choice(_DAMAGES) if source.random() < DAMAGED else ""
-        if damage in Inputs._fields[2:6]:
-            inputs = inputs._replace(**{damage: _extreme(source, getattr(inputs, damage))})
+        event = RUN_START if tick == 0 else NEXT_CONTACT if source.random() < DAMAGED_TICK_SHARE / 4 else 0
+        inputs = ControllerInputs(run, event, *row[2:6], time)
+        damage = source.choice(_DAMAGE_KINDS) if source.random() < DAMAGED_TICK_SHARE else ""
+        if damage in ControllerInputs._fields[2:6]:
+            inputs = inputs._replace(**{damage: _draw_extreme(source, getattr(inputs, damage))})
         elif damage == "stuck":
-            name = source.choice(Inputs._fields[2:6])
+            name = source.choice(ControllerInputs._fields[2:6])
             stuck[name] = (getattr(inputs, name), source.randrange(1, 40))
         elif damage == "clock":
             time += source.choice((1e-9, 0.4, 0.7, 1.6, 3.0, 50.0, -1.0, -50.0, 1e12)) * period
             inputs = inputs._replace(time=source.choice((time, time, time, nan, inf, -inf)))
         elif damage == "motion":
             motion = [row.position, row.velocity, row.acceleration]
-            motion[source.randrange(3)] = _extreme(source, row.position)
+            motion[source.randrange(3)] = _draw_extreme(source, row.position)
             inputs = inputs._replace(motion=tuple(motion))
         for name, (value, left) in list(stuck.items()):
             inputs = inputs._replace(**{name: value})
@@ -190,17 +200,21 @@ def _damaged(source: random.Random, run: int, segment: Sequence[Row], period: fl
         time += period
 
 
-_DAMAGES = (*Inputs._fields[2:6], "stuck", "clock", "motion")
+_DAMAGE_KINDS = (*ControllerInputs._fields[2:6], "stuck", "clock", "motion")
 
 
-def _extreme(source: random.Random, value: float) -> float:
+def _draw_extreme(source: random.Random, value: float) -> float:
     """Return a random extreme value, or a random change of `value`."""
-    return source.choice((*EXTREMES, 1e3 * value, -value, value + source.gauss(0.0, 1.0)))
+    return source.choice((*EXTREME_VALUES, 1e3 * value, -value, value + source.gauss(0.0, 1.0)))
 
 
-def _through(
-    controller: Controller, inputs: Sequence[Inputs], integrator: str, mass: float, gain_file: GainFile
-) -> tuple[list[Row], list[tuple[float, float]], list[int]]:
+def _run_controller(
+    controller: Controller,
+    inputs: Sequence[ControllerInputs],
+    integrator: str,
+    mass: float,
+    gain_file: GainFile,
+) -> tuple[list[VectorRow], list[tuple[float, float]], list[int]]:
     """Return per tick the runtime's row, the identified stiffness and damping, and the acting faults."""
     rows, identified, acting = [], [], []
     move = INTEGRATORS[integrator]
@@ -220,21 +234,21 @@ def _through(
         command = controller.position_command(*motion)
         # The faults of a tick are complete only after both commands.
         faults = controller.faults
-        rows.append(Row(*reading[:7], *motion, force, command, faults, reading.force_simulated))
+        rows.append(VectorRow(*reading[:7], *motion, force, command, faults, reading.force_simulated))
         identified.append(controller.identified)
         # The fault LAW_IN_DOUBT changes no command, and a trip between two contacts is in the cause only.
         acting.append(faults & ~LAW_IN_DOUBT | controller.cause)
     return rows, identified, acting
 
 
-def _compared(
-    rows: list[Row],
-    inputs: Sequence[Inputs],
+def _compare_with_simulation(
+    rows: list[VectorRow],
+    inputs: Sequence[ControllerInputs],
     identified: Sequence[tuple[float, float]],
     acting: Sequence[int],
-    lane: Lane,
+    lane: LaneRecord,
     gain_file: GainFile,
-) -> tuple[list[Row], str | None, str | None]:
+) -> tuple[list[VectorRow], str | None, str | None]:
     """Compare the runtime's rows with the simulation.
 
     Return the rows with the simulated force as far as it is comparable, the reason for an early end, and the
@@ -248,13 +262,13 @@ def _compared(
     forces = np.array([row.force_command for row in rows])
     positions = np.array([row.position_command for row in rows])
     expected = np.array([reading.force_simulated for reading in inputs])
-    error, span = relative_difference(forces, expected)
-    near = near_threshold(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
+    error, span = compute_relative_difference(forces, expected)
+    near = find_threshold_ticks(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
     end, end_reason = number, None
     if len(faulty):
         end = int(faulty[0])
-        end_reason = f"tick {end}: the controller acts on {', '.join(names(acting[end]))}"
-    parted = parting(error, list(np.array(identified).T), lane.identified, near)
+        end_reason = f"tick {end}: the controller acts on {', '.join(fault_names(acting[end]))}"
+    parted = find_divergence_tick(error, list(np.array(identified).T), lane.identified, near)
     if parted is not None and parted < end:
         end = parted
         end_reason = f"tick {end}: rounding decides at a threshold"
@@ -265,22 +279,22 @@ def _compared(
         reason = (
             f"tick {tick}: force command found {forces[tick].item()!r} N, simulated "
             f"{expected[tick].item()!r} N: they differ by {error[tick]:.1e} of the command's range "
-            f"{span:.4g} N, allowed {REPLAY_LIMIT:.0e}"
+            f"{span:.4g} N, limit {REPLAY_LIMIT:.0e}"
         )
     elif lane.sent is not None:
         simulated = np.asarray(lane.sent)[:end]
-        apart, span = relative_difference(positions[:end], simulated)
+        apart, span = compute_relative_difference(positions[:end], simulated)
         if np.any(apart > REPLAY_LIMIT):
             tick = int(np.argmax(apart > REPLAY_LIMIT))
             reason = (
                 f"tick {tick}: position command found {positions[tick].item()!r} m, simulated "
                 f"{simulated[tick].item()!r} m: they differ by {apart[tick]:.1e} of the command's range "
-                f"{span:.4g} m, allowed {REPLAY_LIMIT:.0e}"
+                f"{span:.4g} m, limit {REPLAY_LIMIT:.0e}"
             )
     # The range of commands must come from the compared ticks, because the file contains no others.
     comparable = expected.copy()
     comparable[end:] = nan
-    exceeding = np.flatnonzero(np.abs(forces - comparable) > REPLAY_LIMIT * command_range(comparable))
+    exceeding = np.flatnonzero(np.abs(forces - comparable) > REPLAY_LIMIT * compute_command_range(comparable))
     if len(exceeding):
         comparable[int(exceeding[0]) :] = nan
     return (

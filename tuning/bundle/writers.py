@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.rig.limits import LIMITS
 
-NODE = "/jaxhil_controller"
-LONGEST_MATLAB_NAME = 63
+ROS2_NODE = "/jaxhil_controller"
+MAX_MATLAB_NAME_LENGTH = 63
 _MAT_HEADER = b"MATLAB 5.0 MAT-file, made by jaxhil export"
 
 
-class Entry(NamedTuple):
+class GainOrLimit(NamedTuple):
     """Gain or limit."""
 
     value: float  # [SI]
@@ -29,23 +29,23 @@ class Entry(NamedTuple):
     upper: float | None = None  # upper bound; None for a limit
 
 
-def gain_entries(document: Mapping[str, Any]) -> dict[str, Entry]:
+def gain_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
     """Return the document's gains by name."""
     return {
-        name: Entry(float(gain["value"]), gain["unit"], float(gain["lower"]), float(gain["upper"]))
+        name: GainOrLimit(float(gain["value"]), gain["unit"], float(gain["lower"]), float(gain["upper"]))
         for name, gain in document["gains"].items()
     }
 
 
-def limit_entries(document: Mapping[str, Any]) -> dict[str, Entry]:
+def limit_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
     """Return the document's limits by name; an empty dictionary if it has none."""
     return {
-        name: Entry(_limit(name, limit["value"]), limit["unit"])
+        name: GainOrLimit(_limit_value(name, limit["value"]), limit["unit"])
         for name, limit in document.get("limits", {}).items()
     }
 
 
-def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
+def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return a ROS 2 parameter file: `/jaxhil_controller: ros__parameters:` with nested names.
 
     Every number has a decimal point and every text is quoted, so that ROS 2 reads them as double and string.
@@ -76,13 +76,13 @@ def ros2_yaml(document: Mapping[str, Any]) -> dict[str, bytes]:
         },
     }
     # ROS 2 refuses empty tables.
-    tables = {NODE: {"ros__parameters": _without_empty(parameters)}}
+    tables = {ROS2_NODE: {"ros__parameters": _without_empty(parameters)}}
     text = yaml.dump(tables, Dumper=Dumper, sort_keys=False, default_flow_style=False, width=1000)
     heading = f"# Parameters of the compensator {document['compensator']}, in SI units.\n"
     return {"ros2.yaml": (heading + text).encode("ascii")}
 
 
-def matlab(document: Mapping[str, Any]) -> dict[str, bytes]:
+def matlab_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return `gains.mat` with a struct `jaxhil`.
 
     Its fields are compensator, control_period, mechanism, sha256, gains and limits; each gain and limit is a
@@ -101,51 +101,51 @@ def matlab(document: Mapping[str, Any]) -> dict[str, bytes]:
         or np.empty((0, 0)),
     }
     for name in (*gains, *limits):
-        if len(name) > LONGEST_MATLAB_NAME:
-            allowed = f"allowed {LONGEST_MATLAB_NAME}"
-            raise InputError(f"matlab: {shown(name)}: found {len(name)} characters, {allowed}")
+        if len(name) > MAX_MATLAB_NAME_LENGTH:
+            allowed = f"expected {MAX_MATLAB_NAME_LENGTH}"
+            raise InputError(f"matlab: {format_value(name)}: found {len(name)} characters, {allowed}")
     file = io.BytesIO()
     savemat(file, {"jaxhil": content}, format="5", long_field_names=True, oned_as="row")
     # SciPy writes the date into the first 116 characters; without it, equal gains give equal files.
     return {"gains.mat": _MAT_HEADER.ljust(116) + file.getvalue()[116:]}
 
 
-def csv_table(document: Mapping[str, Any]) -> dict[str, bytes]:
+def csv_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return `gains.csv`: name, value, unit, lower, upper; limits are named `limits.NAME`, without bounds."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("name", *Entry._fields))
+    writer.writerow(("name", *GainOrLimit._fields))
     entries = {
-        "control_period": Entry(float(document["control_period"]), "s"),
+        "control_period": GainOrLimit(float(document["control_period"]), "s"),
         **gain_entries(document),
         **{f"limits.{name}": entry for name, entry in limit_entries(document).items()},
     }
     for name, entry in entries.items():
-        writer.writerow((name, *(_cell(value) for value in entry)))
+        writer.writerow((name, *(_format_cell(value) for value in entry)))
     return {"gains.csv": text.getvalue().encode("ascii")}
 
 
-def c99(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the controller in C99, in the folder `c99`. Raise `InputError` if it has no C code."""
-    from tuning.bundle.c99 import c99_texts
+def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the controller in C99, in the folder `c99_files`. Raise `InputError` if it has no C code."""
+    from tuning.bundle.c99 import generate_c99
 
-    return {f"c99/{name}": text.encode("ascii") for name, text in c99_texts(document).items()}
+    return {f"c99/{name}": text.encode("ascii") for name, text in generate_c99(document).items()}
 
 
 WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
-    "ros2": ros2_yaml,
-    "matlab": matlab,
-    "csv": csv_table,
-    "c99": c99,
+    "ros2": ros2_files,
+    "matlab": matlab_files,
+    "csv": csv_files,
+    "c99": c99_files,
 }
 
 
-def _limit(name: str, value: float | None) -> float:
+def _limit_value(name: str, value: float | None) -> float:
     """Return the value of a limit; for null its default, which has no effect."""
     return LIMITS[name].default if value is None else float(value)
 
 
-def _cell(value: float | str | None) -> str:
+def _format_cell(value: float | str | None) -> str:
     """Return a table cell as text; empty for None."""
     if value is None or isinstance(value, str):
         return value or ""

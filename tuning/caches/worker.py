@@ -1,7 +1,7 @@
 """Code that runs on the workers of a dask.distributed cluster.
 
 A worker imports this module with its first piece, and JAX only after the flags of JAX are set, as a command
-does. If other code on the worker starts JAX earlier, this module has to be a preload: `PRELOAD`.
+does. If other code on the worker starts JAX earlier, this module has to be a preload: `PRELOAD_COMMAND`.
 """
 
 import pickle
@@ -9,16 +9,16 @@ import threading
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError
-from jaxhil.simulation.environment import prepare, rounding_flags, xla_flags
-from jaxhil.simulation.sources import sources_sha256, versions
+from jaxhil.simulation.jax_environment import active_xla_flags, prepare_jax, rounding_flags
+from jaxhil.simulation.source_fingerprint import dependency_versions, sources_sha256
 
-PRELOAD = "dask worker ADDRESS --preload tuning.caches.worker"
+PRELOAD_COMMAND = "dask worker ADDRESS --preload tuning.caches.worker"
 
 # A worker may have several threads, but only one program may run at a time.
-_one_at_a_time = threading.Lock()
+_run_lock = threading.Lock()
 
 
-class Setting(NamedTuple):
+class ProcessSetting(NamedTuple):
     """Properties of a process that affect the last bits of a result."""
 
     sources_sha256: str  # SHA-256 of the packages' files
@@ -26,41 +26,43 @@ class Setting(NamedTuple):
     xla_flags: str | None  # flags of XLA that change rounding; None: any flags are allowed
 
 
-def setting() -> Setting:
+def get_process_setting() -> ProcessSetting:
     """Return the setting of this process."""
-    return Setting(sources_sha256(), versions(), rounding_flags(xla_flags()))
+    return ProcessSetting(sources_sha256(), dependency_versions(), rounding_flags(active_xla_flags()))
 
 
 def dask_setup(worker: Any) -> None:
     """Start JAX with the flags of a command, when dask preloads this module."""
-    prepare()
+    prepare_jax()
 
 
-def run(content: bytes, asked: Setting | None) -> Any:
+def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
     """Call a pickled function with its pickled arguments.
 
     Raise `InputError` if this process does not have the setting `asked`, and any exception of the function.
     """
-    with _one_at_a_time:
-        prepare()
+    with _run_lock:
+        prepare_jax()
         if asked is not None:
-            check_setting(asked, setting())
+            check_process_setting(asked, get_process_setting())
         function, arguments = pickle.loads(content)
         return function(*arguments)
 
 
-def check_setting(asked: Setting, here: Setting) -> None:
+def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
     """Raise `InputError` if the results of a worker may differ from those of the process that asks."""
-    for name in Setting._fields:
+    for name in ProcessSetting._fields:
         found, allowed = getattr(here, name), getattr(asked, name)
         if found == allowed or allowed is None:
             continue
         if name == "sources_sha256":
-            raise differs(f"{name}: found {found[:12]}, allowed {allowed[:12]} (another jaxhil)", False)
-        raise differs(f"{name}: found {found}, allowed {allowed}", name == "xla_flags")
+            raise build_setting_error(
+                f"{name}: found {found[:12]}, expected {allowed[:12]} (another jaxhil)", False
+            )
+        raise build_setting_error(f"{name}: found {found}, expected {allowed}", name == "xla_flags")
 
 
-def differs(what: str, flags: bool) -> InputError:
+def build_setting_error(what: str, flags: bool) -> InputError:
     """Return the error for a worker with another setting; if `flags` differ, it says how to start workers."""
-    advice = f"; start workers by: {PRELOAD}" if flags else ""
+    advice = f"; start workers by: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

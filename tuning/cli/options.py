@@ -5,8 +5,8 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from tuning.front_door.compare import CompareOptions
-from tuning.front_door.options import (
+from tuning.api.compare import CompareOptions
+from tuning.api.options import (
     CompensatorName,
     Files,
     GainSource,
@@ -18,12 +18,12 @@ from tuning.front_door.options import (
     Setting,
     Timings,
     Unset,
-    folder,
-    number,
-    text,
+    folder_option,
+    number_option,
+    text_option,
 )
-from tuning.front_door.sweep_options import SweepOptions
-from tuning.front_door.tune_options import TuneOptions
+from tuning.api.sweep_options import SweepOptions
+from tuning.api.tune_options import TuneOptions
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 DEFAULT_PLOT = "jaxhil-out/simulate.png"
@@ -31,7 +31,7 @@ DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
 
 @dataclass(frozen=True)
-class Init:
+class InitOptions:
     """Write a mechanism file to start from, with the meaning, unit, range and default of every key.
 
     Example: jaxhil init rig-300kg --output my-rig.toml
@@ -41,21 +41,23 @@ class Init:
 
     name: Annotated[
         Positional[str | None],
-        text(
+        text_option(
             "[NAME]",
             "Built-in mechanism to copy the values from, by default 'varying'; or the file, NAME.toml.",
         ),
     ] = None
     output: Annotated[
-        str | None, text("FILE", "File to write; by default mechanism.toml.", aliases=("-o",))
+        str | None, text_option("FILE", "File to write; by default mechanism.toml.", aliases=("-o",))
     ] = None
-    list: Annotated[FlagCreatePairsOff[bool], text(None, "Only list the names; write nothing.")] = False
+    list: Annotated[FlagCreatePairsOff[bool], text_option(None, "Only list the names; write nothing.")] = (
+        False
+    )
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
-class Simulate:
+class SimulateOptions:
     """Run the contacts once; report restitution, reference, error, peak force and duration of each.
 
     Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
@@ -75,19 +77,19 @@ class Simulate:
     ] = None
     animate: Annotated[
         str | None,
-        text(
+        text_option(
             "FILM", "Six axes: animate the ideal contact beside the one on the rig, to a .gif or .mp4 file."
         ),
     ] = None
     log: Annotated[
         str | None,
-        text("FILE", "Write every tick to a CSV file; for one axis it is a log that identify reads."),
+        text_option("FILE", "Write every tick to a CSV file; for one axis it is a log that identify reads."),
     ] = None
     reference: Annotated[
         bool, arg(help="Six axes: simulate only the ideal contact of the two bodies, without the rig.")
     ] = False
     limit: Limit = 0.01
-    seed: Annotated[int, number("Seed of the sensor noise.")] = 0
+    seed: Annotated[int, number_option("Seed of the sensor noise.")] = 0
     json: Json = False
     timings: Timings = False
 
@@ -105,7 +107,7 @@ class Tune(TuneOptions):
     """
 
     files: Files = ()
-    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out"
+    output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out"
     overrides: Overrides = ()
     unset: Unset = ()
     resume: Resume = False
@@ -123,10 +125,10 @@ class Sweep(SweepOptions):
     otherwise 1.
     """
 
-    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder_option.")]
     output: Annotated[
         str | None,
-        text(
+        text_option(
             "DIR",
             "Folder of the store; by default NAME-sweep beside the gain file NAME.json.",
             aliases=("-o",),
@@ -137,7 +139,7 @@ class Sweep(SweepOptions):
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayOptions:
     """Run one scenario of a sweep again, and check that all its numbers are the same to the last bit.
 
     Example: jaxhil replay jaxhil-out/varying/gains-sweep 1234 --plot worst.png
@@ -168,9 +170,9 @@ class Compare(CompareOptions):
 
     files: Files = ()
     suites: Annotated[
-        FlagCreatePairsOff[bool], text(None, "Also the standard suites, in addition to the files.")
+        FlagCreatePairsOff[bool], text_option(None, "Also the standard suites, in addition to the files.")
     ] = False
-    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out/compare"
+    output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/compare"
     overrides: Overrides = ()
     unset: Unset = ()
     resume: Resume = False
@@ -179,14 +181,15 @@ class Compare(CompareOptions):
 
 
 @dataclass(frozen=True)
-class Mechanisms:
+class MechanismsOptions:
     """List the built-in mechanism files, with their sources and paths.
 
     Example: jaxhil mechanisms --json
     """
 
     schema: Annotated[
-        FlagCreatePairsOff[bool], text(None, "Print the JSON Schema of mechanism files instead, for editors.")
+        FlagCreatePairsOff[bool],
+        text_option(None, "Print the JSON Schema of mechanism files instead, for editors."),
     ] = False
     json: Json = False
     timings: Timings = False

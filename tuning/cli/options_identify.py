@@ -5,11 +5,11 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.front_door.options import Json, Timings, folder, number, text
+from tuning.api.options import Json, Timings, folder_option, number_option, text_option
 
 
 @dataclass(frozen=True)
-class Identify:
+class IdentifyOptions:
     """Estimate a mechanism file with uncertainty from a rig's logs; check that the model explains the logs.
 
     Example: jaxhil identify day1/*.csv --map logs.toml --prior rig-300kg
@@ -21,77 +21,91 @@ class Identify:
 
     logs: Annotated[
         Positional[tuple[str, ...]],
-        text(
-            "LOG [LOG ...]", "Logs: text, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS."
+        text_option(
+            "LOG [LOG ...]",
+            "Logs: text_option, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS.",
         ),
     ] = ()
     map: Annotated[
         str | None,
-        text(
+        text_option(
             "FILE", "Meaning of the columns and kind of the runs (TOML); by default those of simulate --log."
         ),
     ] = None
     guess: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "Only print a draft of --map, made from the names and contents of the columns."),
+        text_option(None, "Only print a draft of --map, made from the names and contents of the columns."),
     ] = False
     design: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "Write the rig commands that best identify a mechanism, given as --prior or LOGS."),
+        text_option(None, "Write the rig commands that best identify a mechanism, given as --prior or LOGS."),
     ] = False
     stroke: Annotated[
-        float, number("With --design: largest displacement of the rig in either direction [m].")
+        float, number_option("With --design: largest displacement of the rig in either direction [m].")
     ] = 0.002
     prior: Annotated[
         str | None,
-        text("MECHANISM", "Mechanism file, or a built-in's name, for values that the logs do not show."),
+        text_option(
+            "MECHANISM", "Mechanism file, or a built-in's name, for values that the logs do not show."
+        ),
     ] = None
     check: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "Compare the logs with a mechanism, --prior or the last of LOGS; estimate nothing."),
+        text_option(
+            None, "Compare the logs with a mechanism, --prior or the last of LOGS; estimate nothing."
+        ),
     ] = False
     bayes: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "Use the normal entries of the prior's [uncertainty] as evidence, with the logs."),
+        text_option(None, "Use the normal entries of the prior's [uncertainty] as evidence, with the logs."),
     ] = False
-    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out/identified"
+    output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/identified"
     stage: Annotated[
         str | None,
-        text("KIND", "Use only runs of this kind (free, press, contact or tap), and runs at rest."),
+        text_option("KIND", "Use only runs of this kind (free, press, contact or tap), and runs at rest."),
     ] = None
     order: Annotated[
-        str, text("NUMBER", "Order of the motion simulator; by default 'auto', chosen from the logs.")
+        str, text_option("NUMBER", "Order of the motion simulator; by default 'auto', chosen from the logs.")
     ] = "auto"
-    law: Annotated[str | None, text("NAME", "Contact law; by default chosen from the contacts.")] = None
+    law: Annotated[str | None, text_option("NAME", "Contact law; by default chosen from the contacts.")] = (
+        None
+    )
     fix: Annotated[
         UseAppendAction[tuple[str, ...]],
-        text(
+        text_option(
             "KEY=VALUE",
-            "Known value, a number or a list of numbers, such as rig.contact_plane=0; repeatable.",
+            "Known value, a number_option or a list of numbers, such as rig.contact_plane=0; repeatable.",
         ),
     ] = ()
-    hold_out: Annotated[float, number("Share of the contacts used to validate the fit to the others.")] = 0.2
+    hold_out: Annotated[
+        float, number_option("Share of the contacts used to validate the fit to the others.")
+    ] = 0.2
     bootstrap: Annotated[
-        int, number("Fits to resampled contacts; they widen intervals if contacts differ by more than noise.")
+        int,
+        number_option(
+            "Fits to resampled contacts; they widen intervals if contacts differ by more than noise."
+        ),
     ] = 0
     limit: Annotated[
         float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
     ] = 0.01
     scheduler: Annotated[
         str | None,
-        text("ADDRESS", "With --bootstrap: a dask.distributed cluster whose workers run the fits."),
+        text_option("ADDRESS", "With --bootstrap: a dask.distributed cluster whose workers run the fits."),
     ] = None
     resume: Annotated[
         FlagCreatePairsOff[bool],
-        text(None, "With --bootstrap: continue after an interruption; finished fits are not repeated."),
+        text_option(
+            None, "With --bootstrap: continue after an interruption; finished fits are not repeated."
+        ),
     ] = False
-    seed: Annotated[int, number("Seed of the random draws for the intervals.")] = 0
+    seed: Annotated[int, number_option("Seed of the random draws for the intervals.")] = 0
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
-class Monitor:
+class MonitorOptions:
     """Check contact by contact that the rig still matches the identified mechanism; find when it changed.
 
     Example: jaxhil monitor identified/mechanism.toml day2/contact_*.csv --map logs.toml
@@ -101,15 +115,16 @@ class Monitor:
     """
 
     mechanism: Annotated[
-        Positional[str], text("MECHANISM", "Mechanism file, such as identify writes, or a built-in's name.")
+        Positional[str],
+        text_option("MECHANISM", "Mechanism file, such as identify writes, or a built-in's name."),
     ]
     logs: Annotated[
         Positional[tuple[str, ...]],
-        text("LOG [LOG ...]", "Logs of contacts, in the order of their recording."),
+        text_option("LOG [LOG ...]", "Logs of contacts, in the order of their recording."),
     ] = ()
     map: Annotated[
         str | None,
-        text(
+        text_option(
             "FILE", "Meaning of the columns and kind of the runs (TOML); by default those of simulate --log."
         ),
     ] = None

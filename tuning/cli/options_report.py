@@ -5,8 +5,8 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from tuning.front_door.map import MapOptions
-from tuning.front_door.options import (
+from tuning.api.map import MapOptions
+from tuning.api.options import (
     CompensatorName,
     GainSource,
     Json,
@@ -15,11 +15,11 @@ from tuning.front_door.options import (
     Setting,
     Timings,
     Unset,
-    folder,
-    text,
+    folder_option,
+    text_option,
 )
 
-AXIS = "PATH[=LOW:HIGH]"
+AXIS_METAVAR = "PATH[=LOW:HIGH]"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,26 +33,26 @@ class Map(MapOptions):
 
     x: Annotated[
         str,
-        text(
-            AXIS,
+        text_option(
+            AXIS_METAVAR,
             "Key along x, in SI units, or gains.NAME. Default range: the key's uncertainty, else 0.3 to 3 "
             "times its value; for a gain its bounds.",
         ),
     ]
-    y: Annotated[str, text(AXIS, "Key along y, like x.")]
+    y: Annotated[str, text_option(AXIS_METAVAR, "Key along y, like x.")]
     file: OptionalFile = None
     compensator: CompensatorName = None
     setting: Setting = None
     gains: GainSource = None
     overrides: Overrides = ()
     unset: Unset = ()
-    output: Annotated[str, folder("Folder for the results.")] = "jaxhil-out/map"
+    output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/map"
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportOptions:
     """Write one HTML page for a review board from the results of the other commands.
 
     Example: jaxhil report jaxhil-out/varying jaxhil-out/varying/gains-sweep jaxhil-out/bundle
@@ -63,14 +63,14 @@ class Report:
 
     results: Annotated[
         Positional[tuple[str, ...]],
-        text(
+        text_option(
             "RESULT [RESULT ...]",
             "Results for one mechanism, at most one of each command: folders or files; for monitor the "
             "output of --json.",
         ),
     ] = ()
     output: Annotated[
-        str, text("FILE", "File of the page; by default jaxhil-out/report.html.", aliases=("-o",))
+        str, text_option("FILE", "File of the page; by default jaxhil-out/report.html.", aliases=("-o",))
     ] = "jaxhil-out/report.html"
     json: Json = False
     timings: Timings = False

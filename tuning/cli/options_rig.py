@@ -5,9 +5,9 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from tuning.front_door.export import ExportOptions
-from tuning.front_door.options import Json, Limit, Timings, folder, number, text
-from tuning.front_door.verify import VerifyOptions
+from tuning.api.export import ExportOptions
+from tuning.api.options import Json, Limit, Timings, folder_option, number_option, text_option
+from tuning.api.verify import VerifyOptions
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 
@@ -22,15 +22,17 @@ class Export(ExportOptions):
     good runs, or to miss bad ones, more often than allowed.
     """
 
-    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
-    output: Annotated[str, folder("Folder of the bundle.")] = "jaxhil-out/bundle"
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder_option.")]
+    output: Annotated[str, folder_option("Folder of the bundle.")] = "jaxhil-out/bundle"
     sweep: Annotated[
         str | None,
-        text("STORE", "Folder of a sweep of these gains, from which limits and alarm rates are computed."),
+        text_option(
+            "STORE", "Folder of a sweep of these gains, from which limits and alarm rates are computed."
+        ),
     ] = None
     formats: Annotated[
         UseAppendAction[tuple[str, ...]],
-        text(
+        text_option(
             "NAME[,NAME]",
             "Also write the gains for ros2, matlab, csv, c99; repeatable; by default all.",
             name="format",
@@ -38,7 +40,7 @@ class Export(ExportOptions):
     ] = ()
     limits: Annotated[
         UseAppendAction[tuple[str, ...]],
-        text(
+        text_option(
             "LIMIT=VALUE",
             "Limit of this rig, such as command_lowest=-0.05 (SI), or none; repeatable.",
             name="set",
@@ -59,7 +61,7 @@ class Verify(VerifyOptions):
     """
 
     path: Annotated[
-        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder.")
+        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder_option.")
     ]
     json: Json = False
     timings: Timings = False
@@ -75,7 +77,9 @@ class RigOptions:
     restitution error exceeds the limit, or the controller trips although no faults are injected.
     """
 
-    path: Annotated[Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, gain file, or its folder.")]
+    path: Annotated[
+        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, gain file, or its folder_option.")
+    ]
     duration: Annotated[float, arg(metavar="SECONDS", help="Duration of the run.")] = 10.0
     drops: Annotated[
         float,
@@ -91,9 +95,9 @@ class RigOptions:
         float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, in either direction.")
     ] = 0.0
     realtime: Annotated[
-        FlagCreatePairsOff[bool], text(None, "Request real-time priority for both processes.")
+        FlagCreatePairsOff[bool], text_option(None, "Request real-time priority for both processes.")
     ] = False
-    seed: Annotated[int, number("Seed of sensor noise, contact phases and injected faults.")] = 0
+    seed: Annotated[int, number_option("Seed of sensor noise, contact phases and injected faults.")] = 0
     plot: Annotated[
         str | None,
         arg(

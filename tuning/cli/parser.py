@@ -12,23 +12,23 @@ from typing import Annotated
 import tyro
 from tyro.conf import subcommand
 
+from tuning.api.sweep_options import DEFAULT_SOBOL_SCENARIOS
 from tuning.cli.options import (
     DEFAULT_PLOT,
     DEFAULT_REPLAY_PLOT,
     PLOT_SUFFIXES,
     Compare,
-    Init,
-    Mechanisms,
-    Replay,
-    Simulate,
+    InitOptions,
+    MechanismsOptions,
+    ReplayOptions,
+    SimulateOptions,
     Sweep,
     Tune,
 )
-from tuning.cli.options_identify import Identify, Monitor
-from tuning.cli.options_report import Map, Report
+from tuning.cli.options_identify import IdentifyOptions, MonitorOptions
+from tuning.cli.options_report import Map, ReportOptions
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
-from tuning.cli.timings import measured
-from tuning.front_door.sweep_options import DEFAULT_DRIVERS
+from tuning.cli.timings import report_timings
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 
@@ -38,20 +38,20 @@ jaxhil --version prints the version. Completion by the Tab key, for bash (or zsh
 jaxhil --tyro-write-completion bash ~/.local/share/bash-completion/completions/jaxhil"""
 
 Command = (
-    Annotated[Init, subcommand("init")]
-    | Annotated[Simulate, subcommand("simulate")]
-    | Annotated[Identify, subcommand("identify")]
-    | Annotated[Monitor, subcommand("monitor")]
+    Annotated[InitOptions, subcommand("init")]
+    | Annotated[SimulateOptions, subcommand("simulate")]
+    | Annotated[IdentifyOptions, subcommand("identify")]
+    | Annotated[MonitorOptions, subcommand("monitor")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Sweep, subcommand("sweep")]
-    | Annotated[Replay, subcommand("replay")]
+    | Annotated[ReplayOptions, subcommand("replay")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
     | Annotated[RigOptions, subcommand("rig")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Map, subcommand("map")]
-    | Annotated[Report, subcommand("report")]
-    | Annotated[Mechanisms, subcommand("mechanisms")]
+    | Annotated[ReportOptions, subcommand("report")]
+    | Annotated[MechanismsOptions, subcommand("mechanisms")]
 )
 
 
@@ -64,12 +64,12 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         Command,  # pyright: ignore[reportArgumentType]
         prog="jaxhil",
         description=DESCRIPTION,
-        args=complete_bare(words),
+        args=complete_bare_options(words),
     )
 
     def run() -> int:
         command = type(options).__name__.removesuffix("Options").lower()
-        with measured(options.timings):
+        with report_timings(options.timings):
             return importlib.import_module(f"tuning.cli.commands.{command}").run(options)
 
     return run
@@ -81,7 +81,7 @@ def _print_version() -> int:
     return 0
 
 
-def complete_bare(arguments: list[str]) -> list[str]:
+def complete_bare_options(arguments: list[str]) -> list[str]:
     """Add the default value to each `--plot`, `--drivers` or `--rare` without a value."""
     completed = []
     default_plots = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
@@ -92,7 +92,7 @@ def complete_bare(arguments: list[str]) -> list[str]:
         if word == "--plot" and not following.lower().endswith(PLOT_SUFFIXES):
             completed.append(plot)
         elif word in ("--drivers", "--rare") and not _is_number(following):
-            completed.append(str(DEFAULT_DRIVERS) if word == "--drivers" else "0")
+            completed.append(str(DEFAULT_SOBOL_SCENARIOS) if word == "--drivers" else "0")
     return completed
 
 

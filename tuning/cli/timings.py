@@ -12,37 +12,37 @@ from contextlib import contextmanager
 from tuning import terminal
 
 # Kind of work of jax's monitoring events.
-EVENTS = {
+EVENT_KINDS = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "tracing",
     "/jax/core/compile/backend_compile_duration": "compiling",
     "/jax/compilation_cache/cache_retrieval_time_sec": "reading kept programs",
 }
 # Kinds by priority: time that counts for one kind does not count for a later one.
-KINDS = ("importing", "reading kept programs", "compiling", "tracing")
-Span = tuple[float, float]
+WORK_KINDS = ("importing", "reading kept programs", "compiling", "tracing")
+TimeInterval = tuple[float, float]
 
 
 @contextmanager
-def measured(wanted: bool) -> Iterator[None]:
+def report_timings(wanted: bool) -> Iterator[None]:
     """Report on standard error how the time within the context was spent, if wanted."""
     if not wanted:
         yield
         return
-    begun, spans = time.monotonic(), {kind: [] for kind in KINDS}
+    begun, spans = time.monotonic(), {kind: [] for kind in WORK_KINDS}
     try:
-        with _imports(spans):
+        with _record_times(spans):
             yield
     finally:
-        terminal.note(f"took: {said(begun, time.monotonic(), spans)}")
+        terminal.note(f"took: {format_timings(begun, time.monotonic(), spans)}")
 
 
-def said(begun: float, ended: float, spans: dict[str, list[Span]]) -> str:
+def format_timings(begun: float, ended: float, spans: dict[str, list[TimeInterval]]) -> str:
     """Return a text with the time of each kind of work [s], the largest first."""
     shares, counted, before = {}, [], 0.0
-    for kind in KINDS:
+    for kind in WORK_KINDS:
         counted += spans[kind]
-        together = covered(counted)
+        together = union_duration(counted)
         shares[kind], before = together - before, together
     shares["all else"] = max(ended - begun - before, 0.0)
     parts = sorted(shares.items(), key=lambda part: -part[1])
@@ -50,7 +50,7 @@ def said(begun: float, ended: float, spans: dict[str, list[Span]]) -> str:
     return f"{ended - begun:.2f} s in all: {listed}"
 
 
-def covered(spans: list[Span]) -> float:
+def union_duration(spans: list[TimeInterval]) -> float:
     """Return the length of the union of time intervals [s]."""
     total, until = 0.0, float("-inf")
     for begin, end in sorted(spans):
@@ -60,7 +60,7 @@ def covered(spans: list[Span]) -> float:
 
 
 @contextmanager
-def _imports(spans: dict[str, list[Span]]) -> Iterator[None]:
+def _record_times(spans: dict[str, list[TimeInterval]]) -> Iterator[None]:
     """Record the times of imports and, once jax is imported, of its events in `spans`."""
     plain, listening = builtins.__import__, []
 
@@ -70,9 +70,9 @@ def _imports(spans: dict[str, list[Span]]) -> Iterator[None]:
             sys.modules["jax"].monitoring.register_event_duration_secs_listener(heard)
 
     def heard(event: str, seconds: float, **_: object) -> None:
-        if event in EVENTS:
+        if event in EVENT_KINDS:
             now = time.monotonic()
-            spans[EVENTS[event]].append((now - seconds, now))
+            spans[EVENT_KINDS[event]].append((now - seconds, now))
 
     def timed(name: str, *arguments, **keywords):
         begun = time.monotonic()

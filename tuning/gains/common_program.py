@@ -15,17 +15,17 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxhil.contact.laws import ContactLaw, ContactParameters, contact_law
-from jaxhil.contact.mixture import AnyOf
-from jaxhil.contact.reference import Reference
+from jaxhil.contact.ideal_contact import IdealContact
+from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
+from jaxhil.contact.mixture import LawMixture
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.mechanism.uncertainty import extremes
-from jaxhil.simulation.building import build_loop
-from jaxhil.simulation.cells import NO_CELLS, CellCounts, join_counts
+from jaxhil.mechanism.uncertainty import draw_extremes
+from jaxhil.simulation.cells import NO_CELLS, CellCounts, merge_cell_counts
 from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
-_PARTS = (
+_OPTIONAL_FLAGS = (
     "has_lag",
     "has_force_bias",
     "has_force_noise",
@@ -33,7 +33,7 @@ _PARTS = (
     "has_sample_effects",
     "has_limits",
 )
-_APART = ("integrator", "hold", "latency", "is_two_sided")
+_DISTINGUISHING_PROPERTIES = ("integrator", "hold", "latency", "is_two_sided")
 
 
 @dataclass(frozen=True)
@@ -44,29 +44,29 @@ class CommonProgram:
     segments: int  # largest number of segments of a contact law
     slots: int  # result slots
     parts: tuple[str, ...]  # names of the optional parts of the loop that any of the mechanisms has
-    first_break: int  # order of the lowest derivative that is discontinuous at a tick
+    discontinuity_order: int  # order of the lowest derivative that is discontinuous at a tick
     ring: int  # samples in the delay lines
     cells: CellCounts  # numbers of cells of a sampling interval
     beforehand: bool  # whether integrated ideal contacts are computed before the simulation
 
-    def law(self, beforehand: bool | None = None) -> AnyOf:
+    def law(self, beforehand: bool | None = None) -> LawMixture:
         """Return the mixture of the laws, which integrates ideal contacts unless they come `beforehand`."""
-        return AnyOf(self._kinds, self.beforehand if beforehand is None else beforehand)
+        return LawMixture(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
         """Return the different simulated laws; two names may share one."""
-        return tuple(dict.fromkeys(contact_law(name).simulated for name in self.laws))
+        return tuple(dict.fromkeys(find_contact_law(name).simulated for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
         """Return the loop of one mechanism in the form that this program takes."""
-        parts = {name: name in self.parts for name in _PARTS}
+        parts = {name: name in self.parts for name in _OPTIONAL_FLAGS}
         return dataclasses.replace(
             loop,
             law=self.law(),
-            first_break=self.first_break,
+            discontinuity_order=self.discontinuity_order,
             ring=max(self.ring, loop.ring),
-            cells=join_counts([self.cells, loop.cells]),
+            cells=merge_cell_counts([self.cells, loop.cells]),
             **parts,
         )
 
@@ -85,73 +85,79 @@ class CommonProgram:
         missing = self.segments - stiffness.shape[1]
         # The added segments repeat the last slope, so that the contact model is unchanged.
         stiffness = np.concatenate([stiffness, np.repeat(stiffness[:, -1:], missing, axis=1)], axis=1)
-        deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED)
+        deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED_DEPTH)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
         depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
-        law = contact_law(mechanism.contact.law).simulated
+        law = find_contact_law(mechanism.contact.law).simulated
         kind: Any = np.full((self.slots, number), self._kinds.index(law), np.int32)
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
         reference: Any = None
         if self.beforehand:
             unknown: Any = np.full((self.slots, number), np.nan)
-            reference = Reference(*[unknown] * 3) if law.closed_form else self._first(law, batch)
+            reference = IdealContact(*[unknown] * 3) if law.closed_form else self._first(law, batch)
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
         """Return the ideal first contact of every scenario, repeated in every slot."""
         contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
-        reference = jax.device_get(_reference(law, contact, batch.equivalent_mass, batch.velocity))
+        reference = jax.device_get(
+            _compute_ideal_contact(law, contact, batch.equivalent_mass, batch.velocity)
+        )
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), reference)
 
 
-UNREACHED = 1.0  # m; larger than the penetration of any mechanism
+UNREACHED_DEPTH = 1.0  # m; larger than the penetration of any mechanism
 
 
 @partial(jax.jit, static_argnums=0)
-def _reference(law: ContactLaw, contact: ContactParameters, mass: Array, velocity: Array) -> Reference:
+def _compute_ideal_contact(
+    law: ContactLaw, contact: ContactParameters, mass: Array, velocity: Array
+) -> IdealContact:
     return law.reference(contact, mass, velocity)
 
 
-def common_programs(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
+def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
     """Return the indices of the mechanisms that share a program, and the program, in order of first index."""
     # Scenarios with every uncertain number at either end show each part of the loop that a draw may need.
-    batches = [build_scenarios(mechanism, extremes(mechanism)) for mechanism in mechanisms]
+    batches = [build_scenarios(mechanism, draw_extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, batches, strict=True)):
         key = (
-            *(getattr(loop, name) for name in _APART),
+            *(getattr(loop, name) for name in _DISTINGUISHING_PROPERTIES),
             len(batch.simulator.denominator),
-            _later(mechanisms[index]),
+            _needs_simulated_speeds(mechanisms[index]),
         )
         groups.setdefault(key, []).append(index)
     return [
-        (group, _common([mechanisms[i] for i in group], group, loops, batches)) for group in groups.values()
+        (group, _build_common_program([mechanisms[i] for i in group], group, loops, batches))
+        for group in groups.values()
     ]
 
 
-def _later(mechanism: Mechanism) -> bool:
+def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
     """Return whether ideal contacts must be integrated at speeds that only the simulation yields."""
-    return mechanism.approach.contacts > 1 and not contact_law(mechanism.contact.law).closed_form
+    return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).closed_form
 
 
-def _common(mechanisms, group, loops, batches) -> CommonProgram:
+def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
     segments = [b.contact.stiffness.shape[1] if b.contact.stiffness.ndim == 3 else 1 for b in batches]
     return CommonProgram(
         laws=tuple(dict.fromkeys(mechanism.contact.law for mechanism in mechanisms)),
         segments=max(segments[i] for i in group),
         slots=max(batches[i].phase.shape[0] for i in group),
-        parts=tuple(name for name in _PARTS if any(getattr(loops[i], name) for i in group)),
-        first_break=min(loops[i].first_break for i in group),
+        parts=tuple(name for name in _OPTIONAL_FLAGS if any(getattr(loops[i], name) for i in group)),
+        discontinuity_order=min(loops[i].discontinuity_order for i in group),
         ring=max(loops[i].ring for i in group),
-        cells=_cells(mechanisms, [loops[i] for i in group], [batches[i] for i in group]),
-        beforehand=not _later(mechanisms[0]) and not all(loops[i].law.closed_form for i in group),
+        cells=_join_cell_counts(mechanisms, [loops[i] for i in group], [batches[i] for i in group]),
+        beforehand=not _needs_simulated_speeds(mechanisms[0])
+        and not all(loops[i].law.closed_form for i in group),
     )
 
 
-def _cells(mechanisms, loops, batches) -> CellCounts:
+def _join_cell_counts(mechanisms, loops, batches) -> CellCounts:
     """Return cell counts that suffice for every mechanism, `NO_CELLS` if no loop has cells."""
     if not any(loop.has_cells for loop in loops):
         return NO_CELLS
     exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]
-    return join_counts([loop.cells for loop in exact])
+    return merge_cell_counts([loop.cells for loop in exact])

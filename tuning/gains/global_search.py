@@ -1,7 +1,7 @@
 """Comparison of tuned gains with the best gains of a global search on the same objective.
 
-The search covers the whole box, does not start from the tuned gains and takes `FACTOR` times as many
-evaluations as tuning.
+The search covers the whole box, does not start from the tuned gains and takes `EVALUATION_FACTOR` times as
+many evaluations as tuning.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,8 @@ from tuning.gains.settings import TuneSettings
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
-FACTOR = 50
-LANES = 8192  # least number of lanes per call; many lanes are faster than few
+EVALUATION_FACTOR = 50
+MIN_LANES_PER_CALL = 8192  # least number of lanes per call; many lanes are faster than few
 
 
 class GlobalComparison(NamedTuple):
@@ -33,14 +33,16 @@ def compare_with_global_search(
     task: int,
     found: MultistartResult,
     settings: TuneSettings,
-    factor: int = FACTOR,
+    factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
     """Search the box of one task with `factor` times the evaluations of tuning; None if all starts failed."""
     if found.best is None:
         return None
 
     def losses(points):
-        return validation.losses(found.quiet or settings.objective, [task], points[None], lanes=LANES)[0]
+        return validation.losses(
+            found.quiet or settings.objective, [task], points[None], lanes=MIN_LANES_PER_CALL
+        )[0]
 
     budget = factor * found.evaluations
     search = search_globally(losses, len(validation.names), budget, seed=settings.seed + 1)

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.simulation.outcome import Outcome
 
-ALLOWED = "a function of metrics that returns a finite number >= 0"
+FUNCTION_REQUIREMENT = "a function of metrics that returns a finite number >= 0"
 
 
 class ScenarioMetrics(NamedTuple):
@@ -42,7 +42,7 @@ class MetricsFunction:
 
     def __init__(self, function: Callable[[ScenarioMetrics], Any]):
         self.function = function
-        self._several = jax.jit(jax.vmap(self._value))
+        self._vectorised = jax.jit(jax.vmap(self._value))
 
     def check(self, contacts: int, scenarios: int) -> None:
         """Raise `InputError` if the function does not return one number for (contacts, scenarios) metrics."""
@@ -52,13 +52,20 @@ class MetricsFunction:
         try:
             result = jax.eval_shape(self.function, metrics)
         except Exception as error:
-            reason = one_line(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", 160)
-            raise InputError(f"objective: found one that raises {reason}, allowed {ALLOWED}") from None
+            reason = to_one_line(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", 160)
+            raise InputError(
+                f"objective: found one that raises {reason}, expected {FUNCTION_REQUIREMENT}"
+            ) from None
         if not isinstance(result, jax.ShapeDtypeStruct) or not jnp.issubdtype(result.dtype, jnp.floating):
             name = getattr(result, "dtype", type(result).__name__)
-            raise InputError(f"objective: found one that returns {shown(str(name))}, allowed {ALLOWED}")
+            raise InputError(
+                f"objective: found one that returns {format_value(str(name))}, expected "
+                f"{FUNCTION_REQUIREMENT}"
+            )
         if result.shape != ():
-            raise InputError(f"objective: found one that returns shape {result.shape}, allowed {ALLOWED}")
+            raise InputError(
+                f"objective: found one that returns shape {result.shape}, expected {FUNCTION_REQUIREMENT}"
+            )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
         """Return the values of several sets of metrics, leaves (several, contacts, scenarios); traceable."""
@@ -66,16 +73,18 @@ class MetricsFunction:
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
         """Return `values` in NumPy, NaN for non-finite ones; raise `InputError` if one is negative."""
-        values = np.asarray(self._several(metrics), float)
+        values = np.asarray(self._vectorised(metrics), float)
         if np.any(values < 0):
-            raise InputError(f"objective: found {float(np.nanmin(values)):.6g}, allowed {ALLOWED}")
+            raise InputError(
+                f"objective: found {float(np.nanmin(values)):.6g}, expected {FUNCTION_REQUIREMENT}"
+            )
         return np.where(np.isfinite(values), values, np.nan)
 
     def _value(self, metrics: ScenarioMetrics) -> Float[Array, ""]:
         return jnp.asarray(self.function(metrics), metrics.error.dtype)
 
 
-def scenario_metrics(outcome: Outcome, failed: float) -> ScenarioMetrics:
+def build_scenario_metrics(outcome: Outcome, failed: float) -> ScenarioMetrics:
     """Return the metrics of an outcome, leaves (contacts, *batch); failed contacts have error `failed`."""
     metrics = outcome.metrics
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.

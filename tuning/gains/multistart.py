@@ -19,25 +19,38 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.errors import InputError
-from jaxhil.simulation.environment import float64, program_folder
-from tuning.gains.metrics_function import ALLOWED
-from tuning.gains.objective import RMS, Objective, one_each
-from tuning.gains.quiet import begin_at, is_quiet, least_error, loudness_of, quietest, tolerance_of
-from tuning.gains.rounds import Start, inverse_hessian, prepare_solver, solve_tasks, step_runs
-from tuning.gains.scan import SCENARIOS, scan, scan_evaluations
+from jaxhil.simulation.jax_environment import program_folder, use_float64
+from tuning.gains.metrics_function import FUNCTION_REQUIREMENT
+from tuning.gains.multistart_solver import (
+    StartResult,
+    compile_solver,
+    compute_inverse_hessian,
+    count_step_runs,
+    solve_tasks,
+)
+from tuning.gains.objective import RMS_OBJECTIVE, Objective, list_objectives
+from tuning.gains.quiet_gains import (
+    build_least_error_objective,
+    build_quiet_objective,
+    choose_quiet_starts,
+    compute_command_excess,
+    compute_training_tolerance,
+    is_quiet_search_needed,
+)
+from tuning.gains.scan import SCAN_SCENARIOS, count_scan_evaluations, scan_gain_ranges
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask, tuned_names
+from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-KINKED = 3  # factor on the evaluations without derivatives for a user's function
-BATCHES = 4  # largest number of batches of starts
-SURE = 3  # starts that must agree; two may converge to the same poor minimum
-AGREED = 0.005  # relative difference of values that count as the same minimum
+NONSMOOTH_POLISH_FACTOR = 3  # factor on the evaluations without derivatives for a user's function
+MAX_START_BATCHES = 4  # largest number of batches of starts
+MIN_AGREEING_STARTS = 3  # starts that must agree; two may converge to the same poor minimum
+AGREEMENT_TOLERANCE = 0.005  # relative difference of values that count as the same minimum
 # The same with probes: another draw of the scenarios would change the value by more.
-PROBED_AGREED = 0.02
-FREEING, FREEING_REACH = 24, 0.2  # search from a stuck start: generations, first standard deviation
-REACH, CANDIDATES = (
+PROBED_AGREEMENT_TOLERANCE = 0.02
+RESTART_GENERATIONS, RESTART_STD = 24, 0.2  # search from a stuck start: generations, first standard deviation
+POLISH_STD, CANDIDATES_PER_GENERATION = (
     0.1,
     16,
 )  # final search without derivatives: first standard deviation, points per generation
@@ -48,8 +61,8 @@ Objectives = Objective | Sequence[Objective]  # one of all tasks, or one per tas
 class MultistartResult(NamedTuple):
     """Result of the search for one task."""
 
-    best: Start | None  # best start, improved without derivatives; None if all failed
-    starts: list[Start]  # all starts, batch by batch
+    best: StartResult | None  # best start, improved without derivatives; None if all failed
+    starts: list[StartResult]  # all starts, batch by batch
     # Evaluations of the objective. A Jacobian over P gains counts as 1 + P, a point of a scan as the share of
     # the scenarios on which it may be evaluated.
     evaluations: int
@@ -58,10 +71,10 @@ class MultistartResult(NamedTuple):
 
 
 @dataclass
-class _Search:
+class _SearchState:
     """Starts of one task so far, and their evaluations of the objective."""
 
-    starts: list[Start] = field(default_factory=list)
+    starts: list[StartResult] = field(default_factory=list)
     evaluations: int = 0
 
 
@@ -77,31 +90,33 @@ def find_gains(
     single start is the literature's, in the only batch. `meanwhile` is called while the solver's program
     compiles.
     """
-    tasks, quiet = validation.tasks, is_quiet(validation.tasks[0], settings)
-    objective = least_error(settings.objective) if quiet else settings.objective
+    tasks, quiet = validation.tasks, is_quiet_search_needed(validation.tasks[0], settings)
+    objective = build_least_error_objective(settings.objective) if quiet else settings.objective
     settings = replace(settings, objective=objective)
     probed = tasks[0].probed
-    agreed = PROBED_AGREED if probed else AGREED
-    searches = [_Search() for _ in tasks]
+    agreed = PROBED_AGREEMENT_TOLERANCE if probed else AGREEMENT_TOLERANCE
+    searches = [_SearchState() for _ in tasks]
     _check_function(validation, objective)
     going = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
     if probed or objective.function is not None:
         for i, search in enumerate(searches):
-            search.starts, more = _freed(validation, i, search.starts, agreed, settings.seed, objective)
+            search.starts, more = _restart_stuck_starts(
+                validation, i, search.starts, agreed, settings.seed, objective
+            )
             search.evaluations += more
     # Where starts agree within PROBED_AGREED, the draw of the scenarios matters more than a further descent.
     polishing = 0 if probed and not going else settings.polish * len(validation.names)
     if objective.function is not None:
         # A user's function may have many kinks, as a maximum has.
-        polishing *= KINKED
-    objectives, ends = one_each(objective, len(tasks)), [search.starts for search in searches]
-    quieter = _quieten(validation, settings, first, searches) if quiet else {}
+        polishing *= NONSMOOTH_POLISH_FACTOR
+    objectives, ends = list_objectives(objective, len(tasks)), [search.starts for search in searches]
+    quieter = _search_quieter_gains(validation, settings, first, searches) if quiet else {}
     for i, (search, found) in quieter.items():
         objectives[i], ends[i] = search, found
     if polishing:
         runs = polishing * len(tasks) * tasks[0].lanes
         validation.work.begin("searching on without derivatives", runs)
-    best = finish(validation, ends, polishing, settings.seed, objectives)
+    best = polish_best_starts(validation, ends, polishing, settings.seed, objectives)
     return [
         MultistartResult(
             top,
@@ -113,30 +128,32 @@ def find_gains(
     ]
 
 
-def _quieten(
+def _search_quieter_gains(
     validation: Validation,
     settings: TuneSettings,
     first: Sequence[Sequence[Mapping[str, float]]] | None,
-    searches: list[_Search],
-) -> dict[int, tuple[Objective, list[Start]]]:
+    searches: list[_SearchState],
+) -> dict[int, tuple[Objective, list[StartResult]]]:
     """Search for quieter gains from those of least error; return objective and final starts by task index.
 
     Only tasks whose error is within the limit take part. The number of starts is that of the first batch, so
     that the same program is used.
     """
     tasks, objective = validation.tasks, settings.objective
-    best = [ranked[0] if (ranked := _ranked(search.starts)) else None for search in searches]
-    tolerance = tolerance_of(objective.limit, tasks[0].number)
+    best = [ranked[0] if (ranked := _rank_starts(search.starts)) else None for search in searches]
+    tolerance = compute_training_tolerance(objective.limit, tasks[0].number)
     accurate = {i: top for i, top in enumerate(best) if top and top.rms <= tolerance}
     if not accurate:
         return {}
-    number, steps = _starts_of_batch(settings, first), settings.steps
+    number, steps = _count_batch_starts(settings, first), settings.steps
     begun = [np.empty((0, len(validation.names)))] * len(tasks)
     objectives = [objective] * len(tasks)
     for i, top in accurate.items():
-        begun[i] = begin_at(searches[i].starts, number)
-        objectives[i] = quietest(objective, tasks[i].number, loudness_of(validation, i, top, objective))
-    runs = len(accurate) * number * steps * step_runs(tasks, validation.names)
+        begun[i] = choose_quiet_starts(searches[i].starts, number)
+        objectives[i] = build_quiet_objective(
+            objective, tasks[i].number, compute_command_excess(validation, i, top, objective)
+        )
+    runs = len(accurate) * number * steps * count_step_runs(tasks, validation.names)
     validation.work.begin(f"searching for quieter gains, {len(accurate)} of {len(tasks)} mechanisms", runs)
     ended = solve_tasks(tasks, begun, steps, objectives, validation.work)
     for i in accurate:
@@ -144,27 +161,27 @@ def _quieten(
     return {i: (objectives[i], ended[i]) for i in accurate}
 
 
-def _starts_of_batch(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
+def _count_batch_starts(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
     """Return the number of starts of a batch, at least one more than the largest number in `first`."""
     return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
-def expected_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     """Return the simulated runs of a search of like tasks if starts agree and none ends early."""
-    names, lanes = tuned_names(tasks), tasks[0].lanes
-    scanning = settings.scanned * min(SCENARIOS, lanes) if settings.starts > 1 else 0
-    solve = settings.starts * settings.steps * step_runs(tasks, names)
+    names, lanes = list_tuned_gains(tasks), tasks[0].lanes
+    scanning = settings.scanned * min(SCAN_SCENARIOS, lanes) if settings.starts > 1 else 0
+    solve = settings.starts * settings.steps * count_step_runs(tasks, names)
     return len(tasks) * (scanning + solve + settings.polish * len(names) * lanes)
 
 
 def _solve_batches(
-    validation, settings, first, agreed, searches: list[_Search], meanwhile: Callable[[], object]
+    validation, settings, first, agreed, searches: list[_SearchState], meanwhile: Callable[[], object]
 ) -> list[int]:
     """Solve batches of starts; return the tasks whose starts still do not agree."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
-    number = _starts_of_batch(settings, first)
-    chosen = _while_compiling(
+    number = _count_batch_starts(settings, first)
+    chosen = _run_while_compiling(
         validation,
         number,
         objective,
@@ -172,23 +189,23 @@ def _solve_batches(
         meanwhile,
     )
     going = list(range(len(tasks)))
-    for batch in range(BATCHES if number > 1 else 1):
+    for batch in range(MAX_START_BATCHES if number > 1 else 1):
         if batch > 0:
             text = f"batch {batch + 1} of starts, {len(going)} of {len(tasks)} mechanisms"
-            work.begin(text, expected_runs([tasks[i] for i in going], settings))
+            work.begin(text, estimate_search_runs([tasks[i] for i in going], settings))
             seed = settings.seed, batch
             chosen = [np.empty((0, len(validation.names)))] * len(tasks)
-            scans = scan(validation, going, number, seed, objective, settings.scanned)
+            scans = scan_gain_ranges(validation, going, number, seed, objective, settings.scanned)
             for i, points in zip(going, scans, strict=True):
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, settings.steps, objective, work)
         for i in going:
             search = searches[i]
-            search.starts += _exactly(validation, i, ended[i], objective)
+            search.starts += _recompute_exact_values(validation, i, ended[i], objective)
             search.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
             if batch > 0 or number > 1 + numbers[i]:
-                search.evaluations += scan_evaluations(validation, number, settings.scanned)
-        going = [i for i in going if not _agree(searches[i].starts, agreed)]
+                search.evaluations += count_scan_evaluations(validation, number, settings.scanned)
+        going = [i for i in going if not _is_minimum_repeated(searches[i].starts, agreed)]
         if not going:
             break
     return going
@@ -198,7 +215,7 @@ def choose_starts(
     validation: Validation,
     starts: int,
     seed: int,
-    objective: Objectives = RMS,
+    objective: Objectives = RMS_OBJECTIVE,
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     scanned: int = TuneSettings.scanned,
 ) -> list[Float[np.ndarray, "starts gains"]]:
@@ -211,23 +228,25 @@ def choose_starts(
     usual = [max(starts - len(points), 1) for points in prior]
     literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     if max(usual) > 1:
-        further = scan(validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature)
+        further = scan_gain_ranges(
+            validation, list(tasks), max(usual) - 1, seed, objective, scanned, literature
+        )
         literature = [np.concatenate(both) for both in zip(literature, further, strict=True)]
     return [np.concatenate([literature[i][: usual[i]], prior[i]]) for i in tasks]
 
 
-def finish(
+def polish_best_starts(
     validation: Validation,
-    solved: list[list[Start]],
+    solved: list[list[StartResult]],
     evaluations: int,
     seed: int,
-    objective: Objectives = RMS,
-) -> list[Start | None]:
+    objective: Objectives = RMS_OBJECTIVE,
+) -> list[StartResult | None]:
     """Improve the best start of every task without derivatives by so many evaluations; None if all failed.
 
     The search is `tuning.optimisation.derivative_free.polish`.
     """
-    best = [ranked[0] if (ranked := _ranked(starts)) else None for starts in solved]
+    best = [ranked[0] if (ranked := _rank_starts(starts)) else None for starts in solved]
     indices = [i for i, top in enumerate(best) if top]
     if not indices or evaluations == 0:
         return best
@@ -236,13 +255,13 @@ def finish(
         lambda points: validation.losses(objective, indices, points),
         np.stack([top.coordinates for top in tops]),
         evaluations,
-        candidates=CANDIDATES,
-        reach=REACH,
-        covariance=np.stack([inverse_hessian(top.curvature, top.rms) for top in tops]),
+        candidates=CANDIDATES_PER_GENERATION,
+        reach=POLISH_STD,
+        covariance=np.stack([compute_inverse_hessian(top.curvature, top.rms) for top in tops]),
         seed=seed,
     )
     for i, top, point, loss in zip(indices, tops, polished.point, polished.loss, strict=True):
-        best[i] = _moved(validation, i, top, point, loss)
+        best[i] = _move_start(validation, i, top, point, loss)
     return best
 
 
@@ -255,35 +274,44 @@ def _check_function(validation: Validation, objective: Objective) -> None:
     literature = [validation.coordinates(i, [validation.tasks[i].literature]) for i in tasks]
     for value in validation.losses(objective, list(tasks), np.stack(literature))[:, 0]:
         if not np.isfinite(value):
-            raise InputError(f"objective: found {value:g} for the literature's gains, allowed {ALLOWED}")
+            raise InputError(
+                f"objective: found {value:g} for the literature's gains, expected {FUNCTION_REQUIREMENT}"
+            )
 
 
-def _freed(
-    validation: Validation, task: int, starts: list[Start], agreed: float, seed: int, objective: Objectives
-) -> tuple[list[Start], int]:
+def _restart_stuck_starts(
+    validation: Validation,
+    task: int,
+    starts: list[StartResult],
+    agreed: float,
+    seed: int,
+    objective: Objectives,
+) -> tuple[list[StartResult], int]:
     """Search on without derivatives from the starts that ended above the best; return starts and evaluations.
 
     The solver can get stuck at the kink of the objective where the correction's limit begins to bind.
     """
-    ranked = _ranked(starts)
+    ranked = _rank_starts(starts)
     stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
     if not stuck:
         return starts, 0
-    number = CANDIDATES * FREEING
+    number = CANDIDATES_PER_GENERATION * RESTART_GENERATIONS
 
     def losses(points):
         flat = points.reshape(1, -1, points.shape[-1])
         return validation.losses(objective, [task], flat)[0].reshape(points.shape[:-1])
 
     at = np.stack([starts[i].coordinates for i in stuck])
-    polished = polish(losses, at, number, candidates=CANDIDATES, reach=FREEING_REACH, seed=seed)
+    polished = polish(losses, at, number, candidates=CANDIDATES_PER_GENERATION, reach=RESTART_STD, seed=seed)
     freed = list(starts)
     for i, point, loss in zip(stuck, polished.point, polished.loss, strict=True):
-        freed[i] = _moved(validation, task, starts[i], point, loss)
+        freed[i] = _move_start(validation, task, starts[i], point, loss)
     return freed, number * len(stuck)
 
 
-def _exactly(validation: Validation, task: int, starts: list[Start], objective: Objective) -> list[Start]:
+def _recompute_exact_values(
+    validation: Validation, task: int, starts: list[StartResult], objective: Objective
+) -> list[StartResult]:
     """Replace the values of starts by the exact objective, for which the solver minimised a smooth norm."""
     if objective.name == "rms" or not starts:
         return starts
@@ -291,7 +319,7 @@ def _exactly(validation: Validation, task: int, starts: list[Start], objective: 
     return [start._replace(rms=float(value)) for start, value in zip(starts, values, strict=True)]
 
 
-def _while_compiling(
+def _run_while_compiling(
     validation: Validation, number: int, objective: Objective, work: Callable, more: Callable[[], object]
 ):
     """Call `work` and `more` while the solver's program compiles in a thread; return the result of `work`.
@@ -301,20 +329,22 @@ def _while_compiling(
     if program_folder() is None:
         return work()
     with ThreadPoolExecutor(1) as beside:
-        ready = beside.submit(_prepare, validation, number, objective)
+        ready = beside.submit(_compile_in_thread, validation, number, objective)
         result = work()
         more()
         ready.result()
         return result
 
 
-def _prepare(validation: Validation, number: int, objective: Objectives) -> None:
+def _compile_in_thread(validation: Validation, number: int, objective: Objectives) -> None:
     # A new thread has the process's JAX settings, not those of the calling thread.
-    with float64():
-        prepare_solver(validation.tasks, number, objective)
+    with use_float64():
+        compile_solver(validation.tasks, number, objective)
 
 
-def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, loss: float) -> Start:
+def _move_start(
+    validation: Validation, task: int, start: StartResult, point: np.ndarray, loss: float
+) -> StartResult:
     """Return the start moved to `point`; unchanged if the search did not move."""
     if (point == start.coordinates).all():
         return start
@@ -323,11 +353,14 @@ def _moved(validation: Validation, task: int, start: Start, point: np.ndarray, l
     return start._replace(rms=float(loss), gains=gains, coordinates=point, history=history)
 
 
-def _ranked(starts: list[Start]) -> list[Start]:
+def _rank_starts(starts: list[StartResult]) -> list[StartResult]:
     return sorted((start for start in starts if np.isfinite(start.rms)), key=lambda start: start.rms)
 
 
-def _agree(starts: list[Start], agreed: float) -> bool:
-    """Return whether the `SURE` best starts agree within the relative difference `agreed`."""
-    ranked = _ranked(starts)
-    return len(ranked) >= SURE and ranked[SURE - 1].rms <= (1 + agreed) * ranked[0].rms
+def _is_minimum_repeated(starts: list[StartResult], agreed: float) -> bool:
+    """Return whether the `MIN_AGREEING_STARTS` best starts agree within the relative difference `agreed`."""
+    ranked = _rank_starts(starts)
+    return (
+        len(ranked) >= MIN_AGREEING_STARTS
+        and ranked[MIN_AGREEING_STARTS - 1].rms <= (1 + agreed) * ranked[0].rms
+    )

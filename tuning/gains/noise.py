@@ -6,18 +6,18 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Compensator, Constants
+from jaxhil.laws.simulation_base import Compensator, KnownConstants
 
 
-def has_trade_off(compensator: str) -> bool:
+def has_noise_trade_off(compensator: str) -> bool:
     """Return whether a compensator's gains change how much sensor noise it passes on."""
     law = COMPENSATORS.get(compensator)
     return law is not None and type(law).noise_amplification is not Compensator.noise_amplification
 
 
-def amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
+def compute_noise_amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
     """Return A [1] for the nominal mechanism of one axis (`Compensator.noise_amplification`)."""
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
-    constants = Constants(jnp.asarray(period), jnp.asarray(clearance))
+    constants = KnownConstants(jnp.asarray(period), jnp.asarray(clearance))
     values = {name: jnp.asarray(value) for name, value in gains.items()}
     return float(COMPENSATORS[compensator].noise_amplification(values, constants))

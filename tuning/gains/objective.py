@@ -8,9 +8,9 @@ With the error e - e* of every contact, weighted where positive (`Objective`), t
 
 The penalties are for a command that exceeds the ideal contact's peak force, for chatter, and for amplified
 noise of the force sensor. Each penalty is a dimensionless number; its weight is the error, in multiples of
-the limit, that a penalty of 1 equals. `objective_value` computes them exactly.
+the limit, that a penalty of 1 equals. `evaluate_objective` computes them exactly.
 
-Levenberg-Marquardt needs smooth sums of squares. That of `residuals` is the square of the norm
+Levenberg-Marquardt needs smooth sums of squares. That of `compute_residuals` is the square of the norm
 
     (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
 
@@ -32,22 +32,32 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.outcome import Outcome
-from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, scenario_metrics
-from tuning.transparency.probes import are_probes
+from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
+from tuning.transparency.probes import mask_probes
 
-SCALE = 0.01  # error that makes a residual of 1; the solver's first damping is for residuals of order one
-FAILED = 3.0  # error of a contact that does not end or is not reached, as of a strong divergence
-CHUNK = 32  # lanes with probes that are computed together
-TAIL = 20  # cvar: the worst 1/TAIL of the contacts, at least one
-POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norms in the residuals
-OBJECTIVES = tuple(POWERS)
-WEIGHTS = tuple(f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency"))
-IN_LIMITS = ("command_weight", "noise_weight", "chatter_weight")  # weights in multiples of the limit
+RESIDUAL_SCALE = (
+    0.01  # error that makes a residual of 1; the solver's first damping is for residuals of order one
+)
+FAILED_CONTACT_ERROR = (
+    3.0  # error of a contact that does not end or is not reached, as of a strong divergence
+)
+PROBED_LANES_PER_TILE = 32  # lanes with probes that are computed together
+CVAR_TAIL_DIVISOR = 20  # cvar: the worst 1/TAIL of the contacts, at least one
+NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norms in the residuals
+OBJECTIVE_NAMES = tuple(NORM_POWERS)
+WEIGHT_FIELDS = tuple(
+    f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency")
+)
+LIMIT_SCALED_WEIGHTS = (
+    "command_weight",
+    "noise_weight",
+    "chatter_weight",
+)  # weights in multiples of the limit
 # Factor on an error within the tolerance: of equally quiet gains the most accurate are wanted.
-TOLERATED = 0.02
+TOLERATED_ERROR_FACTOR = 0.02
 
 
 @dataclass(frozen=True)
@@ -69,13 +79,13 @@ class Objective:
     sqrt(metric^2 + (w limit X)^2), both evaluated at the gains of the least metric. The cost of a weight is
     thus known in multiples of the limit for every rig.
 
-    With a `tolerance`, max(metric - tolerance, `TOLERATED` metric) replaces the metric, so that the penalties
-    decide between gains whose error is within the tolerance.
+    With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
+    the penalties decide between gains whose error is within the tolerance.
 
     Raise `InputError` for an unknown name or a weight that is negative, not finite, or 0 for divergence.
     """
 
-    name: str = "rms"  # name of the metric, one of `OBJECTIVES`
+    name: str = "rms"  # name of the metric, one of `OBJECTIVE_NAMES`
     # weight of a squared divergence (e > e*) relative to a squared convergence [1]
     divergence_weight: float = 1.0
     command_weight: float = 0.0  # error, in limits, that C = 1 equals [1]
@@ -90,31 +100,37 @@ class Objective:
     tolerance: float | None = None
 
     def __post_init__(self):
-        if self.name not in OBJECTIVES:
-            raise InputError(f"objective: found {shown(self.name)}, allowed {', '.join(OBJECTIVES)}")
-        for name in WEIGHTS:
+        if self.name not in OBJECTIVE_NAMES:
+            raise InputError(
+                f"objective: found {format_value(self.name)}, expected {', '.join(OBJECTIVE_NAMES)}"
+            )
+        for name in WEIGHT_FIELDS:
             weight, may_be_0 = getattr(self, name), name != "divergence_weight"
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
-                allowed = f"allowed finite numbers {'>=' if may_be_0 else '>'} 0"
-                raise InputError(f"objective: {name}: found {shown(weight)}, {allowed}")
+                allowed = f"expected finite numbers {'>=' if may_be_0 else '>'} 0"
+                raise InputError(f"objective: {name}: found {format_value(weight)}, {allowed}")
         if not 0 < self.limit < math.inf:
-            raise InputError(f"objective: limit: found {shown(self.limit)}, allowed finite numbers > 0")
+            raise InputError(
+                f"objective: limit: found {format_value(self.limit)}, expected finite numbers > 0"
+            )
 
     def unit(self, weight: str) -> float:
         """Return the error [1] that a weight of 1 stands for; `weight` is a field's name."""
-        return self.limit if weight in IN_LIMITS else 1.0
+        return self.limit if weight in LIMIT_SCALED_WEIGHTS else 1.0
 
     @property
-    def weights(self) -> "Weights":
+    def weights(self) -> "ObjectiveWeights":
         """Return the weights as scalar arrays, those of penalties in the unit of an error."""
-        numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHTS]
-        return Weights(*map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0)))
+        numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHT_FIELDS]
+        return ObjectiveWeights(
+            *map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0))
+        )
 
 
-RMS = Objective()
+RMS_OBJECTIVE = Objective()
 
 
-class Terms(NamedTuple):
+class ObjectiveTerms(NamedTuple):
     """Static properties of an objective, which determine the compiled program."""
 
     name: str  # name of its metric
@@ -127,7 +143,7 @@ class Terms(NamedTuple):
     tolerance: bool = False  # whether it has a tolerance, which may be 0
 
 
-class Weights(NamedTuple):
+class ObjectiveWeights(NamedTuple):
     """Weights of an `Objective` per problem, which are arguments of the compiled program."""
 
     divergence: Float[Array, "*problems"]  # weight of a squared divergence over a squared convergence [1]
@@ -138,20 +154,20 @@ class Weights(NamedTuple):
     tolerance: Float[Array, "*problems"]  # tolerance of the metric [1]
 
 
-class Problem(NamedTuple):
+class SolverProblem(NamedTuple):
     """Inputs of the solver for one start; for several, every leaf has a leading axis of problems."""
 
     rig: Any  # batch of scenarios, as returned by `RigModel.prepared`
     fixed: dict[str, Array]  # gains that are not tuned
-    weights: Weights  # weights of the objective
+    weights: ObjectiveWeights  # weights of the objective
 
 
-def one_each(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
+def list_objectives(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
     """Return a list with the objective of each of `number` tasks, from one of all or one per task."""
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
-def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> Terms:
+def join_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> ObjectiveTerms:
     """Return the union of the terms of objectives that share name and function; missing terms get weight 0.
 
     `probed` says that the scenarios include probes; with a function all scenarios have `contacts` contacts.
@@ -159,7 +175,7 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
-    return Terms(
+    return ObjectiveTerms(
         name=name,
         # A tolerance serves the search for quieter commands, which weights command and noise.
         command=tolerance or any(objective.command_weight > 0 for objective in objectives),
@@ -172,16 +188,16 @@ def common_terms(objectives: Sequence[Objective], probed: bool = False, contacts
     )
 
 
-def residuals(
-    static: tuple[RigModel, Any, tuple[str, ...], Terms],
+def compute_residuals(
+    static: tuple[RigModel, Any, tuple[str, ...], ObjectiveTerms],
     gains: Float[Array, "problems gains"],
-    problems: Problem,
+    problems: SolverProblem,
 ) -> Float[Array, "problems residuals"]:
-    """Return residuals of every problem whose sum of squares is (J / `SCALE`)^2, J as of `Objective`.
+    """Return residuals of every problem; their sum of squares is (J / `RESIDUAL_SCALE`)^2, J of `Objective`.
 
     There is one residual per contact slot of every scenario for the norm of the errors and, if among the
     terms, as many for the probes, the command and the chatter, and one for the noise. A failed contact has
-    error, excess and chatter `FAILED`.
+    error, excess and chatter `FAILED_CONTACT_ERROR`.
 
     `static` are the rig model, the loop, the names of the tuned gains and the objective's terms. The
     scenarios of all problems are the lanes of one batch.
@@ -190,7 +206,7 @@ def residuals(
     if terms.chatter:
         loop = dataclasses.replace(loop, chatter=True)
     number, lanes = len(gains), jax.tree.leaves(problems.rig)[0].shape[-1]
-    rig = jax.tree.map(_side_by_side, problems.rig)
+    rig = jax.tree.map(_flatten_lanes, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
     values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
 
@@ -198,24 +214,28 @@ def residuals(
         values, rig = arguments
         return model.outcome(loop, values, rig)
 
-    outcome = _in_chunks(run, (values, rig)) if terms.transparency else run((values, rig))
+    outcome = _map_over_tiles(run, (values, rig)) if terms.transparency else run((values, rig))
 
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)
 
-    error, excess, chatter = map(by_problem, contact_terms(outcome))
+    error, excess, chatter = map(by_problem, compute_contact_terms(outcome))
     amplification = jnp.mean(by_problem(model.noise_amplification(loop, values, rig)), axis=1)
-    probes = by_problem(jnp.broadcast_to(are_probes(number * lanes), outcome.wanted.shape))
+    probes = by_problem(jnp.broadcast_to(mask_probes(number * lanes), outcome.wanted.shape))
     wanted = by_problem(outcome.wanted)
     metric = None
     if terms.function is not None:
-        metric = terms.function.values(metrics_of(outcome, number, terms.contacts, terms.transparency))
-    return weigh(terms, problems.weights, error, excess, chatter, wanted, amplification, probes, metric)
+        metric = terms.function.values(
+            extract_scenario_metrics(outcome, number, terms.contacts, terms.transparency)
+        )
+    return weight_residuals(
+        terms, problems.weights, error, excess, chatter, wanted, amplification, probes, metric
+    )
 
 
-def weigh(
-    terms: Terms,
-    weights: Weights,
+def weight_residuals(
+    terms: ObjectiveTerms,
+    weights: ObjectiveWeights,
     error: Float[Array, "problems contacts"],
     excess: Float[Array, "problems contacts"],
     chatter: Float[Array, "problems contacts"],
@@ -224,7 +244,7 @@ def weigh(
     probes: Bool[Array, "problems contacts"] | None = None,
     metric: Float[Array, "problems"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """Return the residuals from the terms of `contact_terms` and the amplification of the noise.
+    """Return the residuals from the terms of `compute_contact_terms` and the amplification of the noise.
 
     `probes` masks the contacts of probes, if the terms have transparency. `metric` is the value of the user's
     function, which replaces the residuals of the errors by one residual.
@@ -237,58 +257,60 @@ def weigh(
     count = plain = counted(wanted)
     transparency = []
     if terms.transparency and probes is not None:
-        probe_errors = _norm(jnp.where(probes, error, 0), counted(wanted & probes), 2)
+        probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(wanted & probes), 2)
         transparency = [weights.transparency[:, None] * probe_errors]
         error, plain = jnp.where(probes, 0, error), counted(wanted & ~probes)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
-    number = {"rms": plain, "cvar": _tail(plain), "worst": jnp.ones_like(plain)}[terms.name]
+    number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[terms.name]
     if metric is None:
-        errors = _norm(jnp.where(error > 0, diverging, error), number, POWERS[terms.name])
+        errors = _compute_norm_residuals(
+            jnp.where(error > 0, diverging, error), number, NORM_POWERS[terms.name]
+        )
     else:
         errors = metric[:, None]
     if terms.tolerance:
-        errors = errors * _untolerated(errors, weights.tolerance[:, None])
+        errors = errors * _compute_untolerated_share(errors, weights.tolerance[:, None])
     parts = [errors, *transparency]
     if terms.command:
-        parts.append(weights.command[:, None] * _norm(excess, count, 2))
+        parts.append(weights.command[:, None] * _compute_norm_residuals(excess, count, 2))
     if terms.chatter:
-        parts.append(weights.chatter[:, None] * _norm(chatter, count, 2))
+        parts.append(weights.chatter[:, None] * _compute_norm_residuals(chatter, count, 2))
     if terms.noise:
         beyond = amplification - 1
         parts.append((weights.noise * jnp.where(beyond > 0, beyond, 0))[:, None])
-    return jnp.concatenate(parts, axis=1) / SCALE
+    return jnp.concatenate(parts, axis=1) / RESIDUAL_SCALE
 
 
-def _untolerated(
+def _compute_untolerated_share(
     terms: Float[Array, "problems terms"], tolerance: Float[Array, "problems 1"]
 ) -> Float[Array, "problems 1"]:
-    """Return the share of the norm of `terms` that counts: max(1 - tolerance / norm, `TOLERATED`)."""
+    """Return the factor max(1 - tolerance / norm, `TOLERATED_ERROR_FACTOR`) for the norm of `terms`."""
     square = jnp.sum(terms**2, axis=1, keepdims=True)
     norm = jnp.sqrt(jnp.where(square > 0, square, 1))
-    return jnp.where(tolerance > 0, jnp.maximum(1 - tolerance / norm, TOLERATED), 1)
+    return jnp.where(tolerance > 0, jnp.maximum(1 - tolerance / norm, TOLERATED_ERROR_FACTOR), 1)
 
 
-def contact_terms(
+def compute_contact_terms(
     outcome: Outcome,
 ) -> tuple[Float[Any, "slots *batch"], Float[Any, "slots *batch"], Float[Any, "slots *batch"]]:
     """Return per contact the restitution error, the command's relative excess and the chatter, all [1].
 
     The excess is that of the command's peak over the ideal contact's peak force. Failed contacts have
-    `FAILED`, contacts that are not wanted 0. NumPy arrays give NumPy arrays.
+    `FAILED_CONTACT_ERROR`, contacts that are not wanted 0. NumPy arrays give NumPy arrays.
     """
     xp = jnp if isinstance(outcome.error, jax.Array) else np
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
     usable = outcome.good & xp.isfinite(outcome.error) & xp.isfinite(outcome.peak_ratio)
     usable = usable & xp.isfinite(outcome.chatter)
-    error = xp.where(usable, outcome.error, FAILED)
-    beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED) - 1
+    error = xp.where(usable, outcome.error, FAILED_CONTACT_ERROR)
+    beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED_CONTACT_ERROR) - 1
     excess = xp.where(beyond > 0, beyond, 0)
-    chatter = xp.where(usable, outcome.chatter, FAILED)
+    chatter = xp.where(usable, outcome.chatter, FAILED_CONTACT_ERROR)
     wanted = outcome.wanted
     return xp.where(wanted, error, 0), xp.where(wanted, excess, 0), xp.where(wanted, chatter, 0)
 
 
-def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
+def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
     """Return the arguments of a user's function, leaves (problems, contacts, scenarios), without probes.
 
     `outcome` holds the scenarios of `number` problems side by side, with their probes if `probed`.
@@ -296,12 +318,12 @@ def metrics_of(outcome: Outcome, number: int, contacts: int, probed: bool) -> Sc
 
     def by_problem(leaf):
         several = leaf[:contacts].reshape(contacts, number, -1)
-        return jnp.moveaxis(several[..., ~(are_probes(several.shape[-1]) & probed)], 1, 0)
+        return jnp.moveaxis(several[..., ~(mask_probes(several.shape[-1]) & probed)], 1, 0)
 
-    return jax.tree.map(by_problem, scenario_metrics(outcome, FAILED))
+    return jax.tree.map(by_problem, build_scenario_metrics(outcome, FAILED_CONTACT_ERROR))
 
 
-def objective_value(
+def evaluate_objective(
     objective: Objective,
     errors: Float[np.ndarray, "*points contacts"],
     excesses: Float[np.ndarray, "*points contacts"] | None = None,
@@ -312,49 +334,52 @@ def objective_value(
 ) -> Float[np.ndarray, "*points"]:
     """Return the exact J [1] of `Objective`.
 
-    `errors`, `excesses` and `chatter` are those of `contact_terms` for the wanted contacts; a term that is
-    None counts as 0. `errors` are without those of the transparency probes, which are `probe_errors`.
-    Non-finite numbers count as `FAILED`. `value`, that of the user's function, replaces the metric.
+    `errors`, `excesses` and `chatter` are those of `compute_contact_terms` for the wanted contacts; a term
+    that is None counts as 0. `errors` are without those of the transparency probes, which are `probe_errors`.
+    Non-finite numbers count as `FAILED_CONTACT_ERROR`. `value`, that of the user's function, replaces the
+    metric.
     """
     terms = errors, excesses, chatter, probe_errors
     error, excess, swings, transparency = (
-        np.where(np.isfinite(term), term, FAILED)
+        np.where(np.isfinite(term), term, FAILED_CONTACT_ERROR)
         for term in (np.zeros(1) if term is None else term for term in terms)
     )
-    metric = _metric(objective, error) if value is None else value
+    metric = _compute_metric(objective, error) if value is None else value
     if objective.tolerance:
-        metric = np.maximum(metric - objective.tolerance, TOLERATED * metric)
+        metric = np.maximum(metric - objective.tolerance, TOLERATED_ERROR_FACTOR * metric)
     parts = (
         metric,
-        objective.limit * objective.command_weight * _rms(excess),
-        objective.limit * objective.chatter_weight * _rms(swings),
+        objective.limit * objective.command_weight * _compute_rms(excess),
+        objective.limit * objective.chatter_weight * _compute_rms(swings),
         objective.limit * objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
-        objective.transparency_weight * _rms(transparency),
+        objective.transparency_weight * _compute_rms(transparency),
     )
     return np.sqrt(sum(part**2 for part in parts))
 
 
-def _metric(
+def _compute_metric(
     objective: Objective, error: Float[np.ndarray, "*points contacts"]
 ) -> Float[np.ndarray, "*points"]:
     """Return the metric of the errors, without penalties."""
     size = np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error))
     if objective.name == "rms":
-        return _rms(size)
+        return _compute_rms(size)
     if objective.name == "worst":
         return np.max(size, axis=-1)
-    return np.mean(np.sort(size, axis=-1)[..., -_tail(size.shape[-1]) :], axis=-1)
+    return np.mean(np.sort(size, axis=-1)[..., -_count_tail_contacts(size.shape[-1]) :], axis=-1)
 
 
-def _rms(term: Float[np.ndarray, "*points contacts"]) -> Float[np.ndarray, "*points"]:
+def _compute_rms(term: Float[np.ndarray, "*points contacts"]) -> Float[np.ndarray, "*points"]:
     return np.sqrt(np.mean(term**2, axis=-1))
 
 
-def _tail(count):
-    return -(-count // TAIL)
+def _count_tail_contacts(count):
+    return -(-count // CVAR_TAIL_DIVISOR)
 
 
-def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int) -> Array:
+def _compute_norm_residuals(
+    error: Float[Array, "problems contacts"], number: Int[Array, "problems 1"], power: int
+) -> Array:
     """Return residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p), whose sum of squares is (sum of |E|^p / m)^(2/p).
 
     They are homogeneous of degree one in the errors, so that Gauss-Newton steps have the right length.
@@ -367,10 +392,10 @@ def _norm(error: Float[Array, "problems contacts"], number: Int[Array, "problems
     return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
 
 
-def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
-    """Apply `function` to `CHUNK` lanes (last axis) at a time, so that slow lanes delay only their chunk."""
+def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
+    """Apply `function` to `PROBED_LANES_PER_TILE` lanes at a time; slow lanes delay only their tile."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
-    size = math.gcd(lanes, CHUNK)
+    size = math.gcd(lanes, PROBED_LANES_PER_TILE)
     chunks = jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
     )
@@ -378,6 +403,6 @@ def _in_chunks(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), results)
 
 
-def _side_by_side(leaf: Array) -> Array:
+def _flatten_lanes(leaf: Array) -> Array:
     """Reshape (problems, ..., scenarios) to (..., lanes)."""
     return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], leaf.shape[0] * leaf.shape[-1])

@@ -13,24 +13,24 @@ import numpy as np
 
 from jaxhil.laws.compensators import COMPENSATORS
 from tuning.gains.multistart import choose_starts
-from tuning.gains.noise import amplification, has_trade_off
-from tuning.gains.objective import FAILED, Objective
-from tuning.gains.rounds import Start, solve_tasks, step_runs
+from tuning.gains.multistart_solver import StartResult, count_step_runs, solve_tasks
+from tuning.gains.noise import compute_noise_amplification, has_noise_trade_off
+from tuning.gains.objective import FAILED_CONTACT_ERROR, Objective
 from tuning.gains.settings import TuneSettings
-from tuning.gains.tasks import TuneTask, tuned_names
+from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
 # Ends of the ladder: the weighted noise of accurate gains over their error. The first ladder reaches further,
 # since the solver does not find quiet, inaccurate starts otherwise.
-ENDS, FIRST_ENDS = (0.5, 10.0), (1.0, 100.0)
-ACCURATE = 1.05  # largest error of accurate gains over the least error found
-LEAST_EXCESS = 0.1  # least amplification beyond 1 for which a ladder is computed
-PASSES = 4  # largest number of passes in which points start at the gains of their neighbours
-IMPROVED = 1e-3  # relative improvement of a point that causes another pass
+LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
+MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains over the least error found
+MIN_NOISE_EXCESS = 0.1  # least amplification beyond 1 for which a ladder is computed
+MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes in which points start at the gains of their neighbours
+MIN_IMPROVEMENT = 1e-3  # relative improvement of a point that causes another pass
 
 
-class Axis(NamedTuple):
+class ParetoCriterion(NamedTuple):
     """Criterion that is traded against the error."""
 
     name: str  # name in commands
@@ -40,27 +40,31 @@ class Axis(NamedTuple):
     least: float  # least value of the criterion for which a ladder of weights is computed
 
 
-NOISE = Axis("noise", "noise_weight", "noise_amplification", "amplification of sensor noise", LEAST_EXCESS)
-PEAK = Axis("peak", "command_weight", "peak_p99", "peak command over the reference's (99th percentile)", 0.1)
-TRANSPARENCY = Axis(
+NOISE_CRITERION = ParetoCriterion(
+    "noise", "noise_weight", "noise_amplification", "amplification of sensor noise", MIN_NOISE_EXCESS
+)
+PEAK_CRITERION = ParetoCriterion(
+    "peak", "command_weight", "peak_p99", "peak command over the reference's (99th percentile)", 0.1
+)
+TRANSPARENCY_CRITERION = ParetoCriterion(
     "honesty", "transparency_weight", "honesty_error", "error under pushes and other damping (rms)", 1e-3
 )
-AXES = {axis.name: axis for axis in (NOISE, PEAK, TRANSPARENCY)}
+PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION, TRANSPARENCY_CRITERION)}
 
 
-def default_axis(compensator: str) -> Axis | None:
+def choose_default_criterion(compensator: str) -> ParetoCriterion | None:
     """Return the default criterion that a compensator's error is traded against, None if there is none."""
-    if has_trade_off(compensator):
-        return NOISE
-    return PEAK if COMPENSATORS[compensator].anticipates else None
+    if has_noise_trade_off(compensator):
+        return NOISE_CRITERION
+    return PEAK_CRITERION if COMPENSATORS[compensator].anticipates else None
 
 
-def ladder(
+def build_weight_ladder(
     number: int,
     error: float,
     excess: float,
-    ends: tuple[float, float] = ENDS,
-    least: float = LEAST_EXCESS,
+    ends: tuple[float, float] = LADDER_ENDS,
+    least: float = MIN_NOISE_EXCESS,
 ) -> np.ndarray:
     """Return weights (number,) in the unit of an error [1]: 0, then evenly spaced logarithms.
 
@@ -72,7 +76,7 @@ def ladder(
     return np.concatenate([[0.0], weights])
 
 
-class _Candidate(NamedTuple):
+class _LadderCandidate(NamedTuple):
     """Gains of a mechanism with their error and excess on its training scenarios."""
 
     gains: dict[str, float]
@@ -84,67 +88,71 @@ class _Candidate(NamedTuple):
         return math.hypot(self.error, weight * self.excess)
 
 
-def solve_ladders(
+def solve_weight_ladders(
     validation: Validation,
     tuned: list[TuneResult],
     number: int,
     settings: TuneSettings,
-    axis: Axis = NOISE,
+    axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
     """Return (weight in the unit of `Objective`, gains) of every point of every task."""
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [
-        _reached(validation, i, axis, settings.objective, weight, result.starts)
+        _collect_candidates(validation, i, axis, settings.objective, weight, result.starts)
         for i, result in enumerate(tuned)
     ]
     ladders = []
-    for turn in range(1 + PASSES):
+    for turn in range(1 + MAX_NEIGHBOUR_SEARCHES):
         # Each pass improves the estimate of the least error and of its excess, which determine the ladder.
-        ends = ENDS if turn > 0 else FIRST_ENDS
-        ladders = [_fitting_ladder(pool, number, ends, axis) for pool in pools]
-        before = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
+        ends = LADDER_ENDS if turn > 0 else FIRST_LADDER_ENDS
+        ladders = [_build_fitting_ladder(pool, number, ends, axis) for pool in pools]
+        before = [_pick_candidates(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
         objectives = [
-            [weighed(settings.objective, axis, weight) for weight in weights] for weights in ladders
+            [replace_weight(settings.objective, axis, weight) for weight in weights] for weights in ladders
         ]
         starts = (
-            _around(validation, before) if turn > 0 else _anywhere(validation, tuned, objectives, settings)
+            _choose_neighbour_starts(validation, before)
+            if turn > 0
+            else _choose_first_starts(validation, tuned, objectives, settings)
         )
-        results = _search(validation, starts, objectives, settings, axis)
+        results = _solve_points(validation, starts, objectives, settings, axis)
         pools = [pool + new for pool, new in zip(pools, results, strict=True)]
-        after = [_picked(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
-        if turn > 0 and not _improved(before, after, ladders):
+        after = [_pick_candidates(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
+        if turn > 0 and not _has_improved(before, after, ladders):
             break
     return [
         [
             (float(weight) / unit, point.gains)
-            for weight, point in zip(weights, _picked(pool, weights), strict=True)
+            for weight, point in zip(weights, _pick_candidates(pool, weights), strict=True)
         ]
         for pool, weights in zip(pools, ladders, strict=True)
     ]
 
 
-def ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
-    """Return the approximate simulated runs of `solve_ladders` if points improve in every pass."""
-    starts = max(settings.starts, 2) + PASSES * 2
-    return len(tasks) * number * starts * settings.steps * step_runs(tasks, tuned_names(tasks))
+def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
+    """Return the approximate simulated runs of `solve_weight_ladders` if points improve in every pass."""
+    starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
+    return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
 
-def _fitting_ladder(pool: list[_Candidate], number: int, ends: tuple[float, float], axis: Axis) -> np.ndarray:
+def _build_fitting_ladder(
+    pool: list[_LadderCandidate], number: int, ends: tuple[float, float], axis: ParetoCriterion
+) -> np.ndarray:
     least = min(candidate.error for candidate in pool)
     accurate = min(
-        (candidate for candidate in pool if candidate.error <= ACCURATE * least),
+        (candidate for candidate in pool if candidate.error <= MAX_ACCURATE_ERROR_RATIO * least),
         key=lambda candidate: candidate.excess,
     )
-    return ladder(number, accurate.error, accurate.excess, ends, axis.least)
+    return build_weight_ladder(number, accurate.error, accurate.excess, ends, axis.least)
 
 
-def weighed(objective: Objective, axis: Axis, weight: float) -> Objective:
+def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -> Objective:
     """Return the objective with another weight of the axis, in the unit of an error."""
     return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 
-def _anywhere(
+def _choose_first_starts(
     validation: Validation, tuned: list[TuneResult], objectives: list[list[Objective]], settings: TuneSettings
 ) -> list[list[np.ndarray]]:
     """Return the starts of every point of each task: the usual ones for its weight, and the tuned gains."""
@@ -156,22 +164,26 @@ def _anywhere(
     return [list(starts) for starts in zip(*by_point, strict=True)]
 
 
-def _around(validation: Validation, picked: list[list[_Candidate]]) -> list[list[np.ndarray]]:
+def _choose_neighbour_starts(
+    validation: Validation, picked: list[list[_LadderCandidate]]
+) -> list[list[np.ndarray]]:
     """Return the starts of every point of each task: the gains of the point and of its neighbours."""
     return [
-        [validation.coordinates(task, gains) for gains in _neighbourhoods(points)]
+        [validation.coordinates(task, gains) for gains in _collect_neighbour_gains(points)]
         for task, points in enumerate(picked)
     ]
 
 
-def _search(validation: Validation, starts, objectives, settings, axis: Axis) -> list[list[_Candidate]]:
+def _solve_points(
+    validation: Validation, starts, objectives, settings, axis: ParetoCriterion
+) -> list[list[_LadderCandidate]]:
     """Solve from all starts of all points; return the candidates of each task."""
     number = len(objectives[0])
     tasks = [task for task in validation.tasks for _ in range(number)]
     flat = list(chain(*objectives))
     solved = solve_tasks(tasks, list(chain(*starts)), settings.steps, flat, validation.work)
     candidates = [
-        _reached(
+        _collect_candidates(
             validation,
             index // number,
             axis,
@@ -184,44 +196,51 @@ def _search(validation: Validation, starts, objectives, settings, axis: Axis) ->
     return [list(chain(*candidates[i : i + number])) for i in range(0, len(candidates), number)]
 
 
-def _reached(
-    validation: Validation, index: int, axis: Axis, objective: Objective, weight: float, starts: list[Start]
-) -> list[_Candidate]:
+def _collect_candidates(
+    validation: Validation,
+    index: int,
+    axis: ParetoCriterion,
+    objective: Objective,
+    weight: float,
+    starts: list[StartResult],
+) -> list[_LadderCandidate]:
     """Return the candidates that the starts of a task ended with under a weight."""
     task = validation.tasks[index]
-    if axis == NOISE:
-        return _reached_noise(task, weight, starts)
+    if axis == NOISE_CRITERION:
+        return _collect_noise_candidates(task, weight, starts)
     solved = [start for start in starts if math.isfinite(start.rms)]
     if not solved:
-        return [_Candidate(task.literature, FAILED, 0.0)]
+        return [_LadderCandidate(task.literature, FAILED_CONTACT_ERROR, 0.0)]
     coordinates = validation.coordinates(index, [start.gains for start in solved])[None]
     without, beside = (
-        validation.losses(weighed(objective, axis, w), [index], coordinates)[0] for w in (0.0, 1.0)
+        validation.losses(replace_weight(objective, axis, w), [index], coordinates)[0] for w in (0.0, 1.0)
     )
     excess = np.sqrt(np.maximum(0, beside**2 - without**2))
     return [
-        _Candidate(start.gains, float(e), float(x))
+        _LadderCandidate(start.gains, float(e), float(x))
         for start, e, x in zip(solved, without, excess, strict=True)
     ]
 
 
-def _reached_noise(task: TuneTask, weight: float, starts: list[Start]) -> list[_Candidate]:
+def _collect_noise_candidates(
+    task: TuneTask, weight: float, starts: list[StartResult]
+) -> list[_LadderCandidate]:
     """Return the candidates of the noise axis, whose excess follows from the gains alone."""
     candidates = []
     for start in starts:
-        excess = max(0.0, amplification(task.mechanism, task.compensator, start.gains) - 1)
+        excess = max(0.0, compute_noise_amplification(task.mechanism, task.compensator, start.gains) - 1)
         if math.isfinite(start.rms) and math.isfinite(excess):
             error = math.sqrt(max(0.0, start.rms**2 - (weight * excess) ** 2))
-            candidates.append(_Candidate(start.gains, error, excess))
-    return candidates or [_Candidate(task.literature, FAILED, 0.0)]
+            candidates.append(_LadderCandidate(start.gains, error, excess))
+    return candidates or [_LadderCandidate(task.literature, FAILED_CONTACT_ERROR, 0.0)]
 
 
-def _picked(pool: list[_Candidate], weights: np.ndarray) -> list[_Candidate]:
+def _pick_candidates(pool: list[_LadderCandidate], weights: np.ndarray) -> list[_LadderCandidate]:
     """Return the best candidate of the pool for each weight."""
     return [min(pool, key=lambda candidate, weight=weight: candidate.value(weight)) for weight in weights]
 
 
-def _neighbourhoods(picked: list[_Candidate]) -> list[list[dict[str, float]]]:
+def _collect_neighbour_gains(picked: list[_LadderCandidate]) -> list[list[dict[str, float]]]:
     """Return for each point its gains and the different ones of its neighbours on the ladder."""
     neighbourhoods = []
     for index, point in enumerate(picked):
@@ -230,11 +249,11 @@ def _neighbourhoods(picked: list[_Candidate]) -> list[list[dict[str, float]]]:
     return neighbourhoods
 
 
-def _improved(
-    before: list[list[_Candidate]], after: list[list[_Candidate]], ladders: list[np.ndarray]
+def _has_improved(
+    before: list[list[_LadderCandidate]], after: list[list[_LadderCandidate]], ladders: list[np.ndarray]
 ) -> bool:
     return any(
-        new.value(weight) < (1 - IMPROVED) * old.value(weight)
+        new.value(weight) < (1 - MIN_IMPROVEMENT) * old.value(weight)
         for olds, news, weights in zip(before, after, ladders, strict=True)
         for old, new, weight in zip(olds, news, weights, strict=True)
     )

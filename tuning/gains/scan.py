@@ -7,18 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.mechanism.structs import Mechanism
-from tuning.gains.objective import Objective, one_each
+from tuning.gains.objective import Objective, list_objectives
 from tuning.gains.tasks import spread_points
 from tuning.gains.validation import Validation
-from tuning.optimisation.derivative_free import apart, far_apart
+from tuning.optimisation.derivative_free import select_distant_points, select_points_at_distance
 
-SCENARIOS = 32  # number of scenarios on which the points of a scan are evaluated
-FEW_SCENARIOS = 8  # number of these that suffice to discard most points
-AT_ONCE = 16  # points of a task that are evaluated together on all `SCENARIOS`
-ROUNDING = 1e-9  # relative rounding error of a value
+SCAN_SCENARIOS = 32  # number of scenarios on which the points of a scan are evaluated
+PRESCREEN_SCENARIOS = 8  # number of these that suffice to discard most points
+POINTS_PER_CALL = 16  # points of a task that are evaluated together on all `SCAN_SCENARIOS`
+ROUNDING_TOLERANCE = 1e-9  # relative rounding error of a value
 
 
-def scan(
+def scan_gain_ranges(
     validation: Validation,
     which: list[int],
     number: int,
@@ -41,57 +41,63 @@ def scan(
                 index, begins = validation.names.index(gain.name), {gain.name: gain.begins(mechanism)}
                 task_points[:, index] = validation.coordinates(i, [{**task.literature, **begins}])[0, index]
     prior = [beside[i] if beside else np.empty((0, len(validation.names))) for i in which]
-    values = _scanned(validation, which, points, prior, number, objective)
+    values = _evaluate_points(validation, which, points, prior, number, objective)
     order = np.argsort(values, axis=1, kind="stable")
     return [
-        apart(task_points[by_value], near, len(near) + number)[len(near) :]
+        select_distant_points(task_points[by_value], near, len(near) + number)[len(near) :]
         for task_points, by_value, near in zip(points, order, prior, strict=True)
     ]
 
 
-def _scanned(validation, which, points, prior, number, objective) -> Float[np.ndarray, "which points"]:
+def _evaluate_points(
+    validation, which, points, prior, number, objective
+) -> Float[np.ndarray, "which points"]:
     """Return the values of a scan's points, infinite if `number` separated points are certainly better.
 
     A sum of squares over some of the scenarios is a lower bound of that over all, by which most points are
     discarded.
     """
-    share = FEW_SCENARIOS / min(SCENARIOS, validation.tasks[0].lanes)
-    if share > 0.5 or not _sums_squares(validation, which, objective):
-        values = validation.losses(objective, which, points, SCENARIOS)
+    share = PRESCREEN_SCENARIOS / min(SCAN_SCENARIOS, validation.tasks[0].lanes)
+    if share > 0.5 or not _is_sum_of_squares(validation, which, objective):
+        values = validation.losses(objective, which, points, SCAN_SCENARIOS)
         return np.where(np.isfinite(values), values, np.inf)
-    least = validation.losses(objective, which, points, FEW_SCENARIOS) * (1 - ROUNDING) * np.sqrt(share)
+    least = (
+        validation.losses(objective, which, points, PRESCREEN_SCENARIOS)
+        * (1 - ROUNDING_TOLERANCE)
+        * np.sqrt(share)
+    )
     promising = np.argsort(least, axis=1, kind="stable")
     values, worst = np.full(least.shape, np.inf), np.full(len(which), np.inf)
-    for begin in range(0, least.shape[1], AT_ONCE):
-        tried = promising[:, begin : begin + AT_ONCE]
+    for begin in range(0, least.shape[1], POINTS_PER_CALL):
+        tried = promising[:, begin : begin + POINTS_PER_CALL]
         going = np.flatnonzero(least[np.arange(len(which)), tried[:, 0]] <= worst)
         if not len(going):
             break
         selected = going[:, None], tried[going]
         tasks = [which[i] for i in going]
-        values[selected] = validation.losses(objective, tasks, points[selected], SCENARIOS)
+        values[selected] = validation.losses(objective, tasks, points[selected], SCAN_SCENARIOS)
         for i in going:
             ranked = points[i][np.argsort(values[i], kind="stable")]
-            chosen = far_apart(ranked, prior[i], len(prior[i]) + number)
+            chosen = select_points_at_distance(ranked, prior[i], len(prior[i]) + number)
             enough = len(chosen) == len(prior[i]) + number
             worst[i] = values[i][(points[i] == chosen[-1]).all(axis=1)].min() if enough else np.inf
     return values
 
 
-def _sums_squares(
+def _is_sum_of_squares(
     validation: Validation, which: list[int], objective: Objective | Sequence[Objective]
 ) -> bool:
     """Return whether the objective on some of the scenarios bounds that on all of them from below."""
     if validation.tasks[0].probed or not isinstance(validation.tasks[0].mechanism, Mechanism):
         return False
-    objectives = one_each(objective, len(validation.tasks))
+    objectives = list_objectives(objective, len(validation.tasks))
     return all(
         o.name == "rms" and o.noise_weight == 0 and not o.tolerance and o.function is None
         for o in (objectives[i] for i in which)
     )
 
 
-def scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
+def count_scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
     """Return the number of evaluations on all scenarios that a scan for `number` starts equals."""
     scenarios = validation.tasks[0].lanes
-    return -(-max(scanned, 2 * number) * min(SCENARIOS, scenarios) // scenarios)
+    return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from tuning.gains.objective import RMS, Objective
+from tuning.gains.objective import RMS_OBJECTIVE, Objective
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class TuneSettings:
     steps: int = 25  # largest number of solver steps from each start
     validation: int = 511  # number of fresh scenarios on which the gains are evaluated
     seed: int = 0  # seed of scenarios and starts
-    objective: Objective = RMS  # objective to minimise
+    objective: Objective = RMS_OBJECTIVE  # objective to minimise
     polish: int = 160  # evaluations of the final search without derivatives, per gain
     # whether to compare the tuned gains with those of a search of the gains' whole ranges
     global_search: bool = False
@@ -26,9 +26,9 @@ class TuneSettings:
     # whether to search for the quietest gains within the objective's limit if sensors are noisy
     quiet: bool = False
     # whether to evaluate transparency even if the objective does not weight it
-    judge_transparency: bool = False
+    evaluate_transparency: bool = False
 
     @property
     def probed(self) -> bool:
         """Return whether every scenario has its transparency probes (`tuning.transparency.probes`)."""
-        return self.judge_transparency or self.objective.transparency_weight > 0
+        return self.evaluate_transparency or self.objective.transparency_weight > 0

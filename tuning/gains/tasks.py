@@ -16,25 +16,28 @@ from jaxtyping import Array, Float
 from scipy.stats import qmc
 
 from jaxhil.contact.laws import ContactLaw
-from jaxhil.laws.compensators import compensator_of, literature_gains
+from jaxhil.laws.compensators import get_compensator, literature_gains
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.mechanism.uncertainty import quasi_random
-from jaxhil.rig_models import rig_model
-from jaxhil.simulation.evaluation import RigModel, lanes_of
+from jaxhil.mechanism.uncertainty import draw_quasi_random
+from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation.evaluation import RigModel, count_lanes
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.watch import LONGEST_FADING
+from jaxhil.simulation.watch import MAX_DECAY_WAIT
 from tuning.gains.common_program import CommonProgram
-from tuning.optimisation.unit_box import Bounds, to_gains
-from tuning.transparency.probes import LANES_PER_SCENARIO, probed_scenarios
+from tuning.optimisation.unit_box import GainBounds, to_gains
+from tuning.transparency.probes import LANES_PER_SCENARIO, build_probed_scenarios
 
 # In training a contact fails if it takes longer than PATIENCE undelayed durations plus SHORTEST_PATIENCE.
-PATIENCE = 2.0
-SHORTEST_PATIENCE = 0.15  # s
+TIME_LIMIT_FACTOR = 2.0
+TIME_LIMIT_OFFSET = 0.15  # s
 
-SCENARIOS, NOISY_SCENARIOS = 32, 128  # default training scenarios without noise; with it, probes included
+DEFAULT_SCENARIOS, DEFAULT_NOISY_SCENARIOS = (
+    32,
+    128,
+)  # default training scenarios without noise; with it, probes included
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class TuneTask:
     @property
     def lanes(self) -> int:
         """Return the number of scenarios with their probes."""
-        return lanes_of(self.scenarios)
+        return count_lanes(self.scenarios)
 
     @property
     def contacts(self) -> int:
@@ -67,13 +70,13 @@ class TuneTask:
     @property
     def model(self) -> RigModel:
         """Return the model of the mechanism's rig."""
-        return rig_model(self.mechanism)
+        return choose_rig_model(self.mechanism)
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
         """Return the gains that are tuned for this mechanism."""
         mechanism: Any = self.mechanism
-        return tuple(gain for gain in compensator_of(self.compensator).gains if gain.tuned(mechanism))
+        return tuple(gain for gain in get_compensator(self.compensator).gains if gain.tuned(mechanism))
 
 
 def build_task(
@@ -93,18 +96,20 @@ def build_task(
     tasks of a `common` program.
     """
     if probed and common is not None:
-        raise ValueError("probed: found True, allowed False for mechanisms that share a program")
+        raise ValueError("probed: found True, expected False for mechanisms that share a program")
     noisy = has_sensor_noise(mechanism)
-    number = scenarios or (NOISY_SCENARIOS // (LANES_PER_SCENARIO if probed else 1) if noisy else SCENARIOS)
-    draws, model = quasi_random(mechanism, number, seed), rig_model(mechanism)
+    number = scenarios or (
+        DEFAULT_NOISY_SCENARIOS // (LANES_PER_SCENARIO if probed else 1) if noisy else DEFAULT_SCENARIOS
+    )
+    draws, model = draw_quasi_random(mechanism, number, seed), choose_rig_model(mechanism)
     if isinstance(mechanism, Mechanism):
         batch: Any = (
-            probed_scenarios(mechanism, draws, seed).scenarios
+            build_probed_scenarios(mechanism, draws, seed).scenarios
             if probed
             else model.scenarios(mechanism, draws, seed)
         )
         loop = model.loop(mechanism, compensator, batch)
-        batch = batch._replace(time_limit=np.asarray(_patience(loop.law, batch)))
+        batch = batch._replace(time_limit=np.asarray(_compute_time_limit(loop.law, batch)))
         if common is not None:
             batch, loop = common.scenarios(mechanism, batch), common.loop(loop)
     else:
@@ -124,7 +129,7 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
     return noisy or any(path in mechanism.uncertainty for path in paths)
 
 
-def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
+def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
     """Group loops that share a compiled program; return lists of indices in order of the first index.
 
     The loops of a group differ only in the length of their delay lines; their scenarios have equal shapes.
@@ -132,31 +137,31 @@ def alike(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
         shapes = tuple(leaf.shape for leaf in jax.tree.leaves(batch))
-        same = dataclasses.replace(loop, **dict.fromkeys(_rings(loop), 0))
+        same = dataclasses.replace(loop, **dict.fromkeys(_list_delay_line_fields(loop), 0))
         groups.setdefault((same, jax.tree.structure(batch), shapes), []).append(index)
     return list(groups.values())
 
 
-def common_loop(loops: list[Any]) -> Any:
+def join_loops(loops: list[Any]) -> Any:
     """Return the loop that serves all `loops` of a group, with the longest of their delay lines."""
-    longest = {name: max(getattr(loop, name) for loop in loops) for name in _rings(loops[0])}
+    longest = {name: max(getattr(loop, name) for loop in loops) for name in _list_delay_line_fields(loops[0])}
     return dataclasses.replace(loops[0], **longest)
 
 
-def _rings(loop: Any) -> list[str]:
+def _list_delay_line_fields(loop: Any) -> list[str]:
     """Return the fields of a loop that are lengths of delay lines."""
     return [name for name in ("ring", "controller_ring") if hasattr(loop, name)]
 
 
-def tuned_names(tasks: list[TuneTask]) -> tuple[str, ...]:
+def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
     """Return the names of all gains that are tuned for at least one of the tasks."""
     tuned = {gain.name for task in tasks for gain in task.tuned}
-    return tuple(gain.name for gain in compensator_of(tasks[0].compensator).gains if gain.name in tuned)
+    return tuple(gain.name for gain in get_compensator(tasks[0].compensator).gains if gain.name in tuned)
 
 
-def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
+def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
     """Return the bounds (gains,) of a task; both are the literature's value for a gain that is not tuned."""
-    gains = {gain.name: gain for gain in compensator_of(task.compensator).gains}
+    gains = {gain.name: gain for gain in get_compensator(task.compensator).gains}
     moved = {gain.name for gain in task.tuned}
 
     def bounds(name: str) -> tuple[float, float, float]:
@@ -166,11 +171,14 @@ def gain_bounds(task: TuneTask, names: tuple[str, ...]) -> Bounds:
             return task.literature[name], task.literature[name], 0.0
         return float(gain.lower(mechanism)), float(gain.upper(mechanism)), float(gain.logarithmic)
 
-    return Bounds(*np.array([bounds(name) for name in names]).reshape(-1, 3).T)
+    return GainBounds(*np.array([bounds(name) for name in names]).reshape(-1, 3).T)
 
 
-def gains_at(
-    task: TuneTask, names: tuple[str, ...], bounds: Bounds, coordinates: Float[np.ndarray, "*points gains"]
+def convert_to_gains(
+    task: TuneTask,
+    names: tuple[str, ...],
+    bounds: GainBounds,
+    coordinates: Float[np.ndarray, "*points gains"],
 ) -> dict[str, Float[np.ndarray, "*points"]]:
     """Return all gains of the compensator at unit coordinates of the gains `names`.
 
@@ -198,14 +206,14 @@ def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -
 
 
 @partial(jax.jit, static_argnums=0)
-def _patience(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
-    """Return the time limit [s] of a contact in training (`PATIENCE`)."""
+def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
+    """Return the time limit [s] of a contact in training (`TIME_LIMIT_FACTOR`)."""
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
-    longest = PATIENCE * jnp.max(reference.duration, axis=0) + SHORTEST_PATIENCE
+    longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
     # A noisy command never dies out, so that every contact ends later; the limit allows for that.
     sensor = scenarios.force_sensor
-    longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), LONGEST_FADING, 0.0)
+    longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), MAX_DECAY_WAIT, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

@@ -1,7 +1,7 @@
 """Transfer of gains tuned for one mechanism, as a start for similar mechanisms.
 
-`distance` measures how different two mechanisms are, `nearest` selects the nearest mechanism already tuned,
-and `carry_over` converts its gains to another mechanism.
+`compute_mechanism_distance` measures how different two mechanisms are, `find_nearest` selects the nearest
+mechanism already tuned, and `transfer_gains` converts its gains to another mechanism.
 """
 
 import functools
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
@@ -20,7 +20,7 @@ from jaxhil.simulation.scenario import build_scenarios
 from tuning.gain_file import validity_envelope
 
 
-class Traits(NamedTuple):
+class MechanismTraits(NamedTuple):
     """Nominal properties that determine a mechanism's restitution without compensation."""
 
     slowest: float  # omega of the slowest contact [rad/s]
@@ -34,7 +34,7 @@ class Traits(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tuned:
+class EarlierGains:
     """Gains of an earlier tuning."""
 
     mechanism: Mechanism  # mechanism they were tuned for
@@ -42,12 +42,12 @@ class Tuned:
     source: str  # origin of the gains, for messages
 
     @functools.cached_property
-    def traits(self) -> Traits:
+    def traits(self) -> MechanismTraits:
         """Return the traits of the mechanism."""
-        return traits(self.mechanism)
+        return compute_traits(self.mechanism)
 
 
-def distance(a: Mechanism, b: Mechanism) -> float:
+def compute_mechanism_distance(a: Mechanism, b: Mechanism) -> float:
     """Return the distance of two mechanisms [1], which is symmetric, and 0 for equal ones.
 
     It is the root of the sum of squares of
@@ -61,10 +61,10 @@ def distance(a: Mechanism, b: Mechanism) -> float:
     so that each term is about its effect on ln e: a delay in the loop multiplies the restitution by about
     exp(pi omega tau / 2), damping by about exp(-pi xi).
     """
-    return _distance(traits(a), traits(b))
+    return _compute_trait_distance(compute_traits(a), compute_traits(b))
 
 
-def traits(mechanism: Mechanism) -> Traits:
+def compute_traits(mechanism: Mechanism) -> MechanismTraits:
     """Return the traits of the nominal run.
 
     The stiffness k of a nonlinear law is that of the linear contact with the same peak force
@@ -83,8 +83,8 @@ def traits(mechanism: Mechanism) -> Traits:
     command_delay = rig.command_latency - (0.5 if rig.command_hold == "zoh" else 0.0)
     damping = float(np.max(nominal.contact.damping))
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
-    law = contact_law(mechanism.contact.law)
-    return Traits(
+    law = find_contact_law(mechanism.contact.law)
+    return MechanismTraits(
         slowest=slowest,
         fastest=fastest,
         force_delay=float(sensor.delay[0] + sensor.time_constant[0]),
@@ -99,20 +99,22 @@ def traits(mechanism: Mechanism) -> Traits:
     )
 
 
-def nearest(mechanism: Mechanism, tuned: Sequence[Tuned]) -> Tuned:
+def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> EarlierGains:
     """Return the tuned mechanism nearest to `mechanism`, the first of equally distant ones."""
-    target = traits(mechanism)
-    return min(tuned, key=lambda candidate: _distance(target, candidate.traits))
+    target = compute_traits(mechanism)
+    return min(tuned, key=lambda candidate: _compute_trait_distance(target, candidate.traits))
 
 
-def near_to(mechanism: AnyMechanism, sources: Sequence[Sequence[Tuned]]) -> list[Tuned]:
+def find_nearest_of_each(
+    mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
+) -> list[EarlierGains]:
     """Return the nearest mechanism of each source; none in six axes, where no distance is defined."""
     if not isinstance(mechanism, Mechanism):
         return []
-    return [nearest(mechanism, tuned) for tuned in sources]
+    return [find_nearest(mechanism, tuned) for tuned in sources]
 
 
-def carry_over(
+def transfer_gains(
     compensator: str, gains: Mapping[str, float], source: Mechanism, target: Any
 ) -> dict[str, float]:
     """Convert gains of `compensator` tuned for `source` to `target`.
@@ -140,7 +142,7 @@ def carry_over(
     return converted
 
 
-def _distance(ours: Traits, theirs: Traits) -> float:
+def _compute_trait_distance(ours: MechanismTraits, theirs: MechanismTraits) -> float:
     omega = ((ours.slowest * ours.fastest) * (theirs.slowest * theirs.fastest)) ** 0.25
     squares = [
         (math.log(ours.slowest) - math.log(theirs.slowest)) ** 2 / 2,

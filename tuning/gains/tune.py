@@ -8,31 +8,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.laws.compensators import compensator_of
+from jaxhil.laws.compensators import get_compensator
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.rig_models import rig_model
+from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation.outcome import Outcome
-from tuning.gains.global_search import FACTOR, GlobalComparison, compare_with_global_search
-from tuning.gains.multistart import MultistartResult, expected_runs, find_gains
-from tuning.gains.objective import SCALE
-from tuning.gains.rounds import Start
+from tuning.gains.global_search import EVALUATION_FACTOR, GlobalComparison, compare_with_global_search
+from tuning.gains.multistart import MultistartResult, estimate_search_runs, find_gains
+from tuning.gains.multistart_solver import StartResult
+from tuning.gains.objective import RESIDUAL_SCALE
+from tuning.gains.search_progress import SearchProgress
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask, has_sensor_noise
-from tuning.gains.transfer import Tuned, carry_over
+from tuning.gains.transfer import EarlierGains, transfer_gains
 from tuning.gains.validation import (
     Validation,
     build_validation,
-    judged_runs,
+    count_evaluated_runs,
     split_nominal,
 )
-from tuning.gains.work import Work
-from tuning.optimisation.sensitivity import sensitivity
-from tuning.statistics.bootstrap import ErrorIntervals, error_intervals
+from tuning.optimisation.sensitivity import compute_gain_tolerance
+from tuning.statistics.bootstrap import ErrorIntervals, compute_error_intervals
 from tuning.statistics.intervals import Estimate
-from tuning.transparency.probes import probe_figures
+from tuning.transparency.probes import compute_probe_metrics
 
 
-class ErrorFigures(NamedTuple):
+class ErrorMetrics(NamedTuple):
     """Metrics of the restitution errors e - e* of all contacts of a batch."""
 
     rms: float  # root mean square of e - e* [1]
@@ -51,7 +51,7 @@ class ErrorFigures(NamedTuple):
     unlike: float = 0.0
 
 
-class Freedom(NamedTuple):
+class GainTolerance(NamedTuple):
     """Tolerance of a gain: the change that raises the loss by 1 %, as a share of the gain's range."""
 
     alone: float  # with all other gains fixed
@@ -66,21 +66,21 @@ class TuneResult:
     mechanism: AnyMechanism  # mechanism it was tuned for
     gains: dict[str, float]  # all tuned gains of the compensator
     literature: dict[str, float]  # gains by the literature's rule
-    figures: dict[str, ErrorFigures]  # of "before", "literature" and "tuned" on the same fresh scenarios
-    nominal: dict[str, ErrorFigures]  # the same of the nominal run
-    starts: list[Start]  # every start of the solver
+    figures: dict[str, ErrorMetrics]  # of "before", "literature" and "tuned" on the same fresh scenarios
+    nominal: dict[str, ErrorMetrics]  # the same of the nominal run
+    starts: list[StartResult]  # every start of the solver
     outcomes: dict[str, Outcome]  # on the fresh scenarios, for plots
     scenarios: Any  # fresh scenarios, for plots
     settings: TuneSettings  # settings of the tuning
     timings: dict[str, float] = field(default_factory=dict)  # duration of each stage [s]
     intervals: ErrorIntervals | None = None  # 95 % intervals of the tuned figures
-    first: tuple[Tuned, ...] = ()  # origins of the gains of the last starts of the first batch
-    freedom: dict[str, Freedom] = field(default_factory=dict)  # tolerance of each tuned gain
+    first: tuple[EarlierGains, ...] = ()  # origins of the gains of the last starts of the first batch
+    freedom: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
     global_comparison: GlobalComparison | None = None  # comparison with a global search, if there was one
     # transparency, slope and peak of "before", "literature" and "tuned", if the scenarios have probes
     transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
     # of the tuned gains on the same fresh scenarios without the sensors' noise; None if there is no noise
-    without_noise: ErrorFigures | None = None
+    without_noise: ErrorMetrics | None = None
     quiet: bool = False  # whether these are the quietest gains within the limit, not those of least error
 
     @property
@@ -89,22 +89,22 @@ class TuneResult:
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
-def tune_block(
-    tasks: list[TuneTask], settings: TuneSettings, work: Work, near: list[list[Tuned]]
+def tune_group(
+    tasks: list[TuneTask], settings: TuneSettings, work: SearchProgress, near: list[list[EarlierGains]]
 ) -> list[TuneResult]:
     """Tune mechanisms of one program and evaluate the gains; `near` holds further starts of each."""
-    clock, validation = _Clock(), build_validation(tasks, settings.validation, settings.seed, work)
-    evaluating, beforehand = _evaluation_runs(tasks, settings), _baseline_runs(tasks, settings)
-    work.later += evaluating - beforehand
+    clock, validation = _StageClock(), build_validation(tasks, settings.validation, settings.seed, work)
+    evaluating, beforehand = _count_evaluation_runs(tasks, settings), _count_baseline_runs(tasks, settings)
+    work.runs_after_group += evaluating - beforehand
     baselines: dict[str, list] = {}
     searched = work.step(
         "search",
         list[MultistartResult],
-        lambda: _search(
+        lambda: _search_gains(
             validation, settings, near, lambda: baselines.update(_evaluate_baselines(validation))
         ),
     )
-    work.later -= evaluating - beforehand
+    work.runs_after_group -= evaluating - beforehand
     clock.lap("tune")
     work.begin(
         f"judging on {settings.validation} fresh scenarios", evaluating - (beforehand if baselines else 0)
@@ -120,7 +120,7 @@ def tune_block(
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
         for i, result in enumerate(searched):
-            left = FACTOR * tasks[0].lanes * sum(later.evaluations for later in searched[i:])
+            left = EVALUATION_FACTOR * tasks[0].lanes * sum(later.evaluations for later in searched[i:])
             work.begin(f"searching everywhere, {i + 1} of {len(searched)}", left)
             comparisons[i] = work.step(
                 "search everywhere",
@@ -137,57 +137,59 @@ def tune_block(
             mechanism=task.mechanism,
             gains=best[i],
             literature=task.literature,
-            figures={key: figures(outcome) for key, outcome in fresh.items()},
-            nominal={key: figures(nominal) for key, (_, nominal) in split.items()},
+            figures={key: compute_error_metrics(outcome) for key, outcome in fresh.items()},
+            nominal={key: compute_error_metrics(nominal) for key, (_, nominal) in split.items()},
             starts=searched[i].starts,
             outcomes=fresh,
             scenarios=validation.fresh[i],
             settings=settings,
             timings=clock.laps,
-            intervals=error_intervals(fresh["tuned"].error, fresh["tuned"].good),
+            intervals=compute_error_intervals(fresh["tuned"].error, fresh["tuned"].good),
             first=tuple(near[i]),
-            freedom=_freedom(task, validation.names, searched[i].best),
+            freedom=_compute_tolerances(task, validation.names, searched[i].best),
             global_comparison=comparisons[i],
-            transparency=_transparency(validation, i, {key: pairs[i][1] for key, pairs in evaluated.items()}),
-            without_noise=figures(split_nominal(noiseless[i][0])[0]) if noisy[i] else None,
+            transparency=_compute_transparency(
+                validation, i, {key: pairs[i][1] for key, pairs in evaluated.items()}
+            ),
+            without_noise=compute_error_metrics(split_nominal(noiseless[i][0])[0]) if noisy[i] else None,
             quiet=searched[i].quiet is not None,
         )
         results.append(result)
     return results
 
 
-def runs_of_block(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Return the approximate number of simulated runs of `tune_block`."""
-    return _search_runs(tasks, settings) + _evaluation_runs(tasks, settings)
+def estimate_group_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
+    """Return the approximate number of simulated runs of `tune_group`."""
+    return _count_search_runs(tasks, settings) + _count_evaluation_runs(tasks, settings)
 
 
-def block_name(tasks: Sequence[TuneTask]) -> str:
+def describe_group(tasks: Sequence[TuneTask]) -> str:
     """Return the name, for messages, of mechanisms that are tuned together."""
     return tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
 
 
-def _search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+def _count_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     searched = settings.setting is None and any(task.tuned for task in tasks)
-    return expected_runs(tasks, settings) if searched else 0
+    return estimate_search_runs(tasks, settings) if searched else 0
 
 
-def _evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
+def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
     """Return the runs of the evaluation and of the global search, if there is one."""
     noisy = any(has_sensor_noise(task.mechanism) for task in tasks)
-    evaluation = (2.0 if noisy else 1.5) * _baseline_runs(tasks, settings)
-    global_search = FACTOR * _search_runs(tasks, settings) if settings.global_search else 0
+    evaluation = (2.0 if noisy else 1.5) * _count_baseline_runs(tasks, settings)
+    global_search = EVALUATION_FACTOR * _count_search_runs(tasks, settings) if settings.global_search else 0
     return evaluation + global_search
 
 
-def _baseline_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
+def _count_baseline_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     """Return the runs to evaluate no compensation and the literature's gains."""
-    return 2 * len(tasks) * judged_runs(settings.validation, tasks[0].probed)
+    return 2 * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 
-def _search(
+def _search_gains(
     validation: Validation,
     settings: TuneSettings,
-    near: list[list[Tuned]],
+    near: list[list[EarlierGains]],
     meanwhile: Callable[[], object],
 ) -> list[MultistartResult]:
     """Search the best gains of every task; the result is empty without gains to tune or with a setting.
@@ -199,9 +201,9 @@ def _search(
         return [MultistartResult(None, [], 0) for _ in tasks]
     compensator = tasks[0].compensator
     text = f"tuning {compensator} on {tasks[0].number} scenarios each"
-    validation.work.begin(text, expected_runs(tasks, settings) + _baseline_runs(tasks, settings))
+    validation.work.begin(text, estimate_search_runs(tasks, settings) + _count_baseline_runs(tasks, settings))
     first = [
-        [carry_over(compensator, tuned.gains, tuned.mechanism, task.mechanism) for tuned in neighbours]
+        [transfer_gains(compensator, tuned.gains, tuned.mechanism, task.mechanism) for tuned in neighbours]
         for task, neighbours in zip(tasks, near, strict=True)
     ]
     return find_gains(validation, settings, first, meanwhile)
@@ -210,46 +212,52 @@ def _search(
 def _evaluate_baselines(validation: Validation) -> dict[str, list]:
     """Evaluate no compensation and the literature's gains, which needs no search."""
     literature = [task.literature for task in validation.tasks]
-    plain = [uncompensated(validation.tasks[0].compensator, gains) for gains in literature]
+    plain = [remove_compensation(validation.tasks[0].compensator, gains) for gains in literature]
     return {
         "before": validation.judge([gains for _, gains in plain], plain[0][0]),
         "literature": validation.judge(literature),
     }
 
 
-def _transparency(
+def _compute_transparency(
     validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
 ) -> dict[str, dict[str, Estimate]]:
     """Return the transparency of a task under several gains; empty if its scenarios have no probes."""
     probed = validation.probed[task]
     if probed is None:
         return {}
-    return {key: probe_figures(probed, outcome) for key, outcome in outcomes.items() if outcome is not None}
+    return {
+        key: compute_probe_metrics(probed, outcome)
+        for key, outcome in outcomes.items()
+        if outcome is not None
+    }
 
 
-def _freedom(task: TuneTask, names: tuple[str, ...], best: Start | None) -> dict[str, Freedom]:
+def _compute_tolerances(
+    task: TuneTask, names: tuple[str, ...], best: StartResult | None
+) -> dict[str, GainTolerance]:
     """Return the tolerances of the gains tuned for the task, from the solver's last J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if best is None or not moved or not np.all(np.isfinite(best.curvature)):
         return {}
     values, vectors = np.linalg.eigh(best.curvature[np.ix_(moved, moved)])
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
-    tolerances = sensitivity(root, (best.rms / SCALE) ** 2 / 2)
+    tolerances = compute_gain_tolerance(root, (best.rms / RESIDUAL_SCALE) ** 2 / 2)
     pairs = zip(tolerances.alone, tolerances.together, strict=True)
-    return {names[i]: Freedom(float(a), float(b)) for i, (a, b) in zip(moved, pairs, strict=True)}
+    return {names[i]: GainTolerance(float(a), float(b)) for i, (a, b) in zip(moved, pairs, strict=True)}
 
 
-def figures(outcome: Outcome) -> ErrorFigures:
+def compute_error_metrics(outcome: Outcome) -> ErrorMetrics:
     """Compute the metrics of a batch, NaN if no contact ended."""
     errors = outcome.error[outcome.good]
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
         nan = float("nan")
-        return ErrorFigures(
+        return ErrorMetrics(
             rms=nan, p99=nan, max=nan, mean=nan, diverging=nan, peak_ratio=nan, chatter=nan, failed=failed
         )
     size = np.abs(errors)
-    return ErrorFigures(
+    return ErrorMetrics(
         rms=float(np.sqrt(np.mean(errors**2))),
         p99=float(np.percentile(size, 99)),
         max=float(np.max(size)),
@@ -258,12 +266,12 @@ def figures(outcome: Outcome) -> ErrorFigures:
         peak_ratio=float(np.max(outcome.peak_ratio[outcome.good])),
         chatter=float(np.sqrt(np.mean(outcome.chatter[outcome.good] ** 2))),
         failed=failed,
-        **_real_contacts(outcome),
+        **_compare_real_contacts(outcome),
     )
 
 
-def _real_contacts(outcome: Outcome) -> dict[str, Any]:
-    """Return the fields of `ErrorFigures` that compare real with ideal contacts."""
+def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
+    """Return the fields of `ErrorMetrics` that compare real with ideal contacts."""
     good = outcome.good
     lowest, highest = np.nanpercentile(outcome.duration_ratio[good], (1, 99))
     return {
@@ -273,37 +281,37 @@ def _real_contacts(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def figures_of_parts(result: TuneResult) -> dict[str, dict[str, ErrorFigures]]:
+def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMetrics]]:
     """Return the metrics of each error by its name; empty if the rig model has only one error."""
-    model = rig_model(result.mechanism)
+    model = choose_rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}
-    parts: dict[str, dict[str, ErrorFigures]] = {}
+    parts: dict[str, dict[str, ErrorMetrics]] = {}
     for key, outcome in result.outcomes.items():
         for name, part in model.by_error(outcome).items():
-            parts.setdefault(name, {})[key] = figures(part)
+            parts.setdefault(name, {})[key] = compute_error_metrics(part)
     return parts
 
 
-def uncompensated(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
+def remove_compensation(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
     """Return the compensator and gains that leave the measured force unchanged, for "before".
 
     Neutral gains need no other program. A compensator without neutral gains is replaced by "none".
     """
-    if all(gain.neutral is None for gain in compensator_of(compensator).gains):
+    if all(gain.neutral is None for gain in get_compensator(compensator).gains):
         return "none", {}
-    return compensator, neutral_gains(compensator, gains)
+    return compensator, neutralise_gains(compensator, gains)
 
 
-def neutral_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
+def neutralise_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
     """Return the gains with neutral values where the compensator defines them."""
     neutral = {
-        gain.name: gain.neutral for gain in compensator_of(compensator).gains if gain.neutral is not None
+        gain.name: gain.neutral for gain in get_compensator(compensator).gains if gain.neutral is not None
     }
     return {**gains, **neutral}
 
 
-class _Clock:
+class _StageClock:
     """Stop watch of named stages [s]."""
 
     def __init__(self):

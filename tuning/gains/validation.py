@@ -12,20 +12,31 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxhil.laws.simulation_base import Constants
+from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
-from jaxhil.simulation.evaluation import Batch, RigModel, lanes_of
+from jaxhil.simulation.evaluation import Batch, RigModel, count_lanes
 from jaxhil.simulation.outcome import Outcome
-from tuning.batches import cut, join
-from tuning.gains.objective import Objective, contact_terms, metrics_of, objective_value, one_each
-from tuning.gains.tasks import TuneTask, common_loop, gain_bounds, gains_at, tuned_names
-from tuning.gains.work import Work
-from tuning.optimisation.unit_box import Bounds, to_coordinates
-from tuning.transparency.probes import LANES_PER_SCENARIO, ProbedScenarios, are_probes, probed_scenarios
+from tuning.batches import join_batches, split_batch
+from tuning.gains.objective import (
+    Objective,
+    compute_contact_terms,
+    evaluate_objective,
+    extract_scenario_metrics,
+    list_objectives,
+)
+from tuning.gains.search_progress import SearchProgress
+from tuning.gains.tasks import TuneTask, build_gain_bounds, convert_to_gains, join_loops, list_tuned_gains
+from tuning.optimisation.unit_box import GainBounds, to_coordinates
+from tuning.transparency.probes import (
+    LANES_PER_SCENARIO,
+    ProbedScenarios,
+    build_probed_scenarios,
+    mask_probes,
+)
 
 # Offset that makes the seed of validation differ from that of training.
-VALIDATION_SEED = 0x5EED
+VALIDATION_SEED_OFFSET = 0x5EED
 
 
 @dataclass(frozen=True)
@@ -38,12 +49,12 @@ class Validation:
     probed: list[ProbedScenarios | None]
     loop: Any  # loop of all tasks
     names: tuple[str, ...]  # names of the gains that are tuned for any of the tasks
-    bounds: list[Bounds]  # bounds of those gains, per task
+    bounds: list[GainBounds]  # bounds of those gains, per task
     # lanes of all tasks: of each task the fresh scenarios, with any probes, then its nominal run
     judged: Any
     training: Any  # training scenarios, (tasks, ..., scenarios)
     lanes: int  # number of lanes of `judged` per task
-    work: Work  # progress report
+    work: SearchProgress  # progress report
 
     def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
@@ -58,9 +69,9 @@ class Validation:
         if compensator is not None:
             loop = model.with_compensator(loop, compensator)
         values = {name: np.repeat([task[name] for task in gains], self.lanes) for name in gains[0]}
-        outcome = model.begin_batch(loop, values, self._judged if noise else self._judged_without_noise)()
-        outcomes = cut(outcome, self.lanes)
-        self.work.ran(self.lanes * len(self.tasks))
+        outcome = model.begin_batch(loop, values, self._evaluated_batch if noise else self._noiseless_batch)()
+        outcomes = split_batch(outcome, self.lanes)
+        self.work.report_runs(self.lanes * len(self.tasks))
         if not self.tasks[0].probed:
             return [(outcome, None) for outcome in outcomes]
 
@@ -80,14 +91,14 @@ class Validation:
         scenarios: int | None = None,
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
-        """Return `objective_value` at points of the unit box on the training scenarios of the tasks `which`.
+        """Return `evaluate_objective` at points of the unit box, on training scenarios of the tasks `which`.
 
         `scenarios` limits these to the first ones of each task, probes counted. `objective` is one of all
         tasks or one per task. At least `lanes` lanes are computed per call.
         """
-        objectives = one_each(objective, len(self.tasks))
+        objectives = list_objectives(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
-        number = lanes_of(self.training)
+        number = count_lanes(self.training)
         number = min(scenarios or number, number)
         points = coordinates.shape[1]
         losses = np.empty((len(which), points))
@@ -102,7 +113,7 @@ class Validation:
             for point in range(0, points, points_per_call)
         ]
         # All calls are queued first, so that the device computes while the results are read.
-        read = _of_terms if objectives[which[0]].function is None else _everything
+        read = _keep_contact_terms if objectives[which[0]].function is None else _keep_outcome
         running = [
             self._begin(noise, which[rows], coordinates[rows, columns], number, lanes, read)
             for rows, columns in calls
@@ -110,16 +121,16 @@ class Validation:
         for (rows, columns), result in zip(calls, running, strict=True):
             outcome, amplification = result()
             shape, pairs = amplification.shape, amplification.size
-            self.work.ran(pairs * number)
+            self.work.report_runs(pairs * number)
             # (slots, tasks, points, scenarios)
-            terms = [term.reshape(-1, *shape, number) for term in contact_terms(outcome)]
+            terms = [term.reshape(-1, *shape, number) for term in compute_contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
-            probes = are_probes(number) & self.tasks[0].probed
-            values = self._values_of(objectives[which[0]], outcome, pairs)
+            probes = mask_probes(number) & self.tasks[0].probed
+            values = self._evaluate_function(objectives[which[0]], outcome, pairs)
             for index, task in enumerate(which[rows]):
                 mask = wanted[:, index, 0]  # the wanted contacts are the same at every point
                 error, excess, chatter = (np.moveaxis(term[:, index], 1, 0) for term in terms)
-                losses[rows.start + index, columns] = objective_value(
+                losses[rows.start + index, columns] = evaluate_objective(
                     objectives[task],
                     error[:, mask & ~probes],
                     excess[:, mask],
@@ -130,14 +141,16 @@ class Validation:
                 )
         return losses
 
-    def _values_of(
+    def _evaluate_function(
         self, objective: Objective, outcome: Outcome, pairs: int
     ) -> Float[np.ndarray, "pairs"] | None:
         """Return the user's function, if there is one, for every pair of task and point."""
         if objective.function is None:
             return None
         task = self.tasks[0]
-        return objective.function.numbers(metrics_of(outcome, pairs, task.contacts, task.probed))
+        return objective.function.numbers(
+            extract_scenario_metrics(outcome, pairs, task.contacts, task.probed)
+        )
 
     def _begin(
         self, noise, which, coordinates, number, lanes, read
@@ -155,7 +168,7 @@ class Validation:
         if not noise:
             return lambda: (ended(), np.ones(shape))
         # The mean over the scenarios, as `tuning.gains.objective.residuals` has it.
-        constants = Constants(
+        constants = KnownConstants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
         arrays: Any = {name: jax.numpy.asarray(value) for name, value in values.items()}
@@ -163,20 +176,20 @@ class Validation:
         return lambda: (ended(), np.mean(amplification.reshape(*shape, number), axis=-1))
 
     @cached_property
-    def _judged(self) -> Batch:
+    def _evaluated_batch(self) -> Batch:
         # Padded to the lanes of the training scenarios, a small batch shares their program.
-        return self.tasks[0].model.place_batch(self.judged, at_least=lanes_of(self.training))
+        return self.tasks[0].model.place_batch(self.judged, at_least=count_lanes(self.training))
 
     @cached_property
-    def _judged_without_noise(self) -> Batch:
+    def _noiseless_batch(self) -> Batch:
         # The noise is multiplied by 0, so that the same program is used.
         model = self.tasks[0].model
-        return model.place_batch(model.without_noise(self.judged), at_least=lanes_of(self.training))
+        return model.place_batch(model.without_noise(self.judged), at_least=count_lanes(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
-        """Return the cached function `_placed`, since a search needs the same scenarios many times."""
-        return lru_cache(maxsize=4)(partial(_placed, self.tasks[0].model, self.training))
+        """Return `_place_training_scenarios`, cached because a search needs the same scenarios many times."""
+        return lru_cache(maxsize=4)(partial(_place_training_scenarios, self.tasks[0].model, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """Return all gains of the compensator at a point of the unit box."""
@@ -185,7 +198,7 @@ class Validation:
     def _gains(
         self, task: int, coordinates: Float[np.ndarray, "*points gains"]
     ) -> dict[str, Float[np.ndarray, "*points"]]:
-        return gains_at(self.tasks[task], self.names, self.bounds[task], coordinates)
+        return convert_to_gains(self.tasks[task], self.names, self.bounds[task], coordinates)
 
     def coordinates(
         self, task: int, several: Sequence[Mapping[str, float]]
@@ -195,16 +208,16 @@ class Validation:
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 
 
-def _everything(outcome: Outcome) -> Outcome:
+def _keep_outcome(outcome: Outcome) -> Outcome:
     return outcome
 
 
-def _of_terms(outcome: Any) -> Any:
-    """Return the outcome with only the fields that `contact_terms` needs."""
+def _keep_contact_terms(outcome: Any) -> Any:
+    """Return the outcome with only the fields that `compute_contact_terms` needs."""
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
-def _placed(
+def _place_training_scenarios(
     model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
     """Return the first `number` training scenarios of tasks, once per point, on the host and the devices."""
@@ -218,30 +231,30 @@ def _placed(
 
 
 def build_validation(
-    tasks: list[TuneTask], scenarios: int, seed: int, work: Work | None = None
+    tasks: list[TuneTask], scenarios: int, seed: int, work: SearchProgress | None = None
 ) -> Validation:
     """Draw `scenarios` fresh scenarios of each of the like tasks (`tuning.gains.tasks.alike`)."""
-    drawn = [_fresh(task, scenarios, seed + VALIDATION_SEED) for task in tasks]
+    drawn = [_draw_evaluation_lanes(task, scenarios, seed + VALIDATION_SEED_OFFSET) for task in tasks]
     fresh, probed, judged, loops = (list(column) for column in zip(*drawn, strict=True))
-    names = tuned_names(tasks)
+    names = list_tuned_gains(tasks)
     return Validation(
         tasks=tasks,
         fresh=fresh,
         probed=probed,
-        loop=common_loop(loops),
+        loop=join_loops(loops),
         names=names,
-        bounds=[gain_bounds(task, names) for task in tasks],
-        judged=join(judged),
+        bounds=[build_gain_bounds(task, names) for task in tasks],
+        judged=join_batches(judged),
         training=jax.tree.map(
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *[task.scenarios for task in tasks],
         ),
-        lanes=judged_runs(scenarios, tasks[0].probed),
-        work=work or Work(),
+        lanes=count_evaluated_runs(scenarios, tasks[0].probed),
+        work=work or SearchProgress(),
     )
 
 
-def judged_runs(scenarios: int, probed: bool) -> int:
+def count_evaluated_runs(scenarios: int, probed: bool) -> int:
     """Return the number of runs of a task under one set of gains, the nominal run included."""
     return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
@@ -255,24 +268,26 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
     return fresh, nominal
 
 
-def fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
+def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
     """Draw scenarios of a task that differ from its training scenarios of the same seed."""
-    seed += VALIDATION_SEED
+    seed += VALIDATION_SEED_OFFSET
     return task.model.scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
 
-def _fresh(task: TuneTask, number: int, seed: int) -> tuple[Any, ProbedScenarios | None, Any, Any]:
+def _draw_evaluation_lanes(
+    task: TuneTask, number: int, seed: int
+) -> tuple[Any, ProbedScenarios | None, Any, Any]:
     """Return a task's fresh scenarios, the same with probes (if any), its lanes to evaluate, and its loop."""
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):
-        probed = probed_scenarios(task.mechanism, drawn, seed)
-        nominal = probed_scenarios(task.mechanism).scenarios
-        judged = join([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
+        probed = build_probed_scenarios(task.mechanism, drawn, seed)
+        nominal = build_probed_scenarios(task.mechanism).scenarios
+        judged = join_batches([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
     else:
-        judged = join([fresh, task.model.scenarios(task.mechanism)])
+        judged = join_batches([fresh, task.model.scenarios(task.mechanism)])
     if task.common is None:
-        both = join([judged, task.scenarios])
+        both = join_batches([judged, task.scenarios])
         return fresh, probed, judged, task.model.loop(task.mechanism, task.compensator, both, chatter=True)
     assert isinstance(task.mechanism, Mechanism)
     loop = task.common.loop(task.model.loop(task.mechanism, task.compensator, judged, chatter=True))

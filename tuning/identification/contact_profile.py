@@ -15,21 +15,26 @@ import numpy as np
 from scipy import special
 from scipy.ndimage import uniform_filter1d
 
-from tuning.identification import press
-from tuning.identification.contact_problem import COARSE, LONGEST, Inner, Problem
-from tuning.identification.normal_draws import factor
+from tuning.identification import press_bias
+from tuning.identification.contact_problem import (
+    COARSE_DELAY_STEP,
+    MAX_FORCE_DELAY,
+    CoefficientFit,
+    ContactProblem,
+)
+from tuning.identification.normal_draws import factorise_covariance
 
-FINE = 2e-5  # s, between the delays of the second grid
-SMOOTHED = 7  # delays of the second grid over which the plane is averaged
-REGION = 30.0  # drop of twice the log posterior below its maximum that the final grid covers
-ROUGH_REGION = 400.0  # the same for the coarse grid, whose log posterior is less accurate near onsets
-FEW_PLANES = 15  # planes of the second grid
-MAX_POSITIONS = 1000  # of cell edges; a surface that nothing determines spans every row of the runs
-ROUGHLY = 2.0  # factor on the plane's standard deviation from the coarse grid
-DELAYS, PLANES = 61, 13  # size of the final grid
-REACH = 0.003  # s, half width of the search about an approximate delay
-PLANE_REACH = 3.2  # half width in standard deviations of the plane at a given delay
-DRAWS = 4000
+FINE_DELAY_STEP = 2e-5  # s, between the delays of the second grid
+SMOOTHING_DELAYS = 7  # delays of the second grid over which the plane is averaged
+FINAL_GRID_DROP = 30.0  # drop of twice the log posterior below its maximum that the final grid covers
+COARSE_GRID_DROP = 400.0  # the same for the coarse grid, whose log posterior is less accurate near onsets
+SECOND_GRID_SURFACES = 15  # planes of the second grid
+MAX_CELL_EDGES = 1000  # of cell edges; a surface that nothing determines spans every row of the runs
+COARSE_STD_FACTOR = 2.0  # factor on the plane's standard deviation from the coarse grid
+FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # size of the final grid
+DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search about an approximate delay
+SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width in standard deviations of the plane at a given delay
+POSTERIOR_DRAWS = 4000
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class Posterior:
     draws: np.ndarray  # (draws, names)
     delays: np.ndarray  # s, the final grid
     log_posterior: np.ndarray  # of the delay at the final grid, minus its maximum
-    best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
+    best: tuple[float, float, CoefficientFit]  # delay, plane and fit of greatest posterior density
     evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
 
     @property
@@ -52,11 +57,11 @@ class Posterior:
         return np.cov(self.draws.T)
 
 
-def profile(
-    problem: Problem,
+def compute_posterior(
+    problem: ContactProblem,
     seed: int = 0,
     near: tuple[float, float] | None = None,
-    size: tuple[int, int] = (DELAYS, PLANES),
+    size: tuple[int, int] = (FINAL_GRID_DELAYS, FINAL_GRID_SURFACES),
 ) -> Posterior:
     """Return the posterior of the force delay, the surface and the coefficients.
 
@@ -67,42 +72,53 @@ def profile(
             delays are searched without it, or if the best delay may lie further away.
         size: Numbers of delays and planes of the final grid.
     """
-    delays, start = np.arange(problem.shortest, LONGEST + COARSE / 2.0, COARSE), 0.0
+    delays, start = (
+        np.arange(problem.min_delay, MAX_FORCE_DELAY + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP),
+        0.0,
+    )
     scanned = None
     if near is not None:
-        close, start = near[0] + np.arange(-REACH, REACH + COARSE / 2.0, COARSE), near[1]
-        close = np.unique(np.clip(close, problem.shortest, LONGEST))
-        scanned = _scan(problem, close, start)
-        is_likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= REGION
-        inner = close[0] > problem.shortest, close[-1] < LONGEST
+        close, start = (
+            near[0]
+            + np.arange(
+                -DELAY_SEARCH_HALF_WIDTH, DELAY_SEARCH_HALF_WIDTH + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP
+            ),
+            near[1],
+        )
+        close = np.unique(np.clip(close, problem.min_delay, MAX_FORCE_DELAY))
+        scanned = _scan_delays(problem, close, start)
+        is_likely = 2.0 * (scanned[2].max() - scanned[2][[0, -1]]) <= FINAL_GRID_DROP
+        inner = close[0] > problem.min_delay, close[-1] < MAX_FORCE_DELAY
         if np.any(is_likely & inner):
             scanned = None
         else:
             delays = close
     elif problem.plane is None:
-        start = first_plane(problem, LONGEST / 4.0)
+        start = estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
     start = start if problem.plane is None else problem.plane
-    planes, stds, heights = scanned or _scan(problem, delays, start)
-    low, high = _region(problem, delays, heights, ROUGH_REGION)
-    finer = np.linspace(low, high, int(np.clip((high - low) / FINE, 21, 151)))
+    planes, stds, heights = scanned or _scan_delays(problem, delays, start)
+    low, high = _find_likely_delays(problem, delays, heights, COARSE_GRID_DROP)
+    finer = np.linspace(low, high, int(np.clip((high - low) / FINE_DELAY_STEP, 21, 151)))
     surface = np.interp(finer, delays, planes), np.interp(finer, delays, stds)
-    places, cells = _grid(problem, finer, (surface[0], ROUGHLY * surface[1]), FEW_PLANES)
-    heights, planes, spreads = _by_delay(places, cells, len(finer))
-    low, high = _region(problem, finer, heights, REGION)
+    places, cells = _fit_grid(
+        problem, finer, (surface[0], COARSE_STD_FACTOR * surface[1]), SECOND_GRID_SURFACES
+    )
+    heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
+    low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
     # If a single cell holds the posterior of a delay, the plane jumps from delay to delay: smooth it.
-    planes = uniform_filter1d(planes, SMOOTHED, mode="nearest")
+    planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
-    places, cells = _grid(problem, delays, surface, size[1])
-    return _sample(problem, places, cells, delays, seed)
+    places, cells = _fit_grid(problem, delays, surface, size[1])
+    return _draw_from_grid(problem, places, cells, delays, seed)
 
 
-def first_plane(problem: Problem, delay: float) -> float:
+def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
     """Return the position [m] at which the force first rises above its noise, the median of the runs."""
     position, _ = problem.motion.at(delay)
     readings = problem.readings
     if readings.bias is not None:
-        crossing = press.first_plane(position, readings.force, readings.counts, readings.bias)
+        crossing = press_bias.find_surface_of_press(position, readings.force, readings.counts, readings.bias)
         if crossing is not None:
             return crossing
     level = np.median(readings.force[readings.counts])
@@ -112,27 +128,31 @@ def first_plane(problem: Problem, delay: float) -> float:
     return float(np.median(crossings)) if crossings else 0.0
 
 
-def _scan(problem: Problem, delays: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scan_delays(
+    problem: ContactProblem, delays: np.ndarray, start: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the best plane, its standard deviation and the marginal log posterior at each delay."""
     planes, stds, heights = [], [], []
     for delay in delays:
-        plane, inner, gain = problem.settled(delay, start)
+        plane, inner, gain = problem.find_best_surface(delay, start)
         stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
         planes.append(plane)
         heights.append(inner.evidence + gain + np.log(stds[-1]))
     return np.array(planes), np.array(stds), np.array(heights)
 
 
-def _region(problem: Problem, delays: np.ndarray, heights: np.ndarray, reach: float) -> tuple[float, float]:
+def _find_likely_delays(
+    problem: ContactProblem, delays: np.ndarray, heights: np.ndarray, reach: float
+) -> tuple[float, float]:
     """Return the range of delays within `reach` of the best posterior, one step wider on each side."""
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
     step = delays[1] - delays[0]
-    return max(problem.shortest, delays[inside[0]] - step), min(LONGEST, delays[inside[-1]] + step)
+    return max(problem.min_delay, delays[inside[0]] - step), min(MAX_FORCE_DELAY, delays[inside[-1]] + step)
 
 
-def _grid(
-    problem: Problem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
-) -> tuple[np.ndarray, list[Inner]]:
+def _fit_grid(
+    problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
+) -> tuple[np.ndarray, list[CoefficientFit]]:
     """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
 
     Damped contacts begin with a jump, so a row on the wrong side of the onset raises the misfit. The
@@ -154,22 +174,22 @@ def _grid(
             cells.append(problem.at(delay, problem.plane))
             places.append((delay, problem.plane, 1.0))
             continue
-        low, high = centre - PLANE_REACH * std, centre + PLANE_REACH * std
-        edges = cut(low, high, problem.onsets_between(delay, low, high), across)
+        low, high = centre - SURFACE_HALF_WIDTH_SIGMAS * std, centre + SURFACE_HALF_WIDTH_SIGMAS * std
+        edges = divide_into_cells(low, high, problem.onsets_between(delay, low, high), across)
         planes = (edges[1:] + edges[:-1]) / 2.0
-        cells += problem.across(delay, planes)
+        cells += problem.fit_surfaces(delay, planes)
         places += [(delay, *cell) for cell in zip(planes, np.diff(edges), strict=True)]
     return np.array(places), cells
 
 
-def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
+def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     """Return the edges of `number` cells from `low` to `high` that include the positions `at`.
 
     Further edges halve the widest cells. If there are too many positions, those that leave the smallest cells
     are dropped.
     """
-    if len(at) > MAX_POSITIONS:
-        at = at[np.linspace(0, len(at) - 1, MAX_POSITIONS).astype(int)]
+    if len(at) > MAX_CELL_EDGES:
+        at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]
     edges = [low, *at, high]
     while len(edges) <= number:
         widest = int(np.argmax(np.diff(edges)))
@@ -179,11 +199,14 @@ def cut(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     return np.array(edges)
 
 
-def _by_delay(
-    places: np.ndarray, cells: list[Inner], count: int
+def _marginalise_over_surface(
+    places: np.ndarray, cells: list[CoefficientFit], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marginal log posterior of each delay, and the plane's mean and standard deviation there."""
-    heights, planes = _heights(places, cells).reshape(count, -1), places[:, 1].reshape(count, -1)
+    heights, planes = (
+        _compute_cell_posteriors(places, cells).reshape(count, -1),
+        places[:, 1].reshape(count, -1),
+    )
     total: Any = special.logsumexp(heights, axis=1)
     share = np.exp(heights - total[:, None])
     mean = np.sum(share * planes, axis=1)
@@ -194,21 +217,23 @@ def _by_delay(
     return total, mean, np.maximum(spread, width / 2.0)
 
 
-def _heights(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
+def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) -> np.ndarray:
     """Return the log posterior of each cell of a grid."""
     return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
 
 
-def _sample(
-    problem: Problem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
+def _draw_from_grid(
+    problem: ContactProblem, places: np.ndarray, cells: list[CoefficientFit], delays: np.ndarray, seed: int
 ) -> Posterior:
     """Return draws from the grid: a cell by its weight, a point in it, and normal coefficients."""
-    heights = _heights(places, cells)
+    heights = _compute_cell_posteriors(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
     rng = np.random.default_rng(seed)
     # Systematic resampling reduces the variance of the draws.
-    picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
+    picked = np.searchsorted(
+        np.cumsum(weights), (np.arange(POSTERIOR_DRAWS) + rng.uniform(size=POSTERIOR_DRAWS)) / POSTERIOR_DRAWS
+    )
     picked = np.minimum(picked, len(cells) - 1)
     step, rows = delays[1] - delays[0], []
     slopes = np.zeros((len(cells), len(cells[0].coefficients)))
@@ -219,12 +244,12 @@ def _sample(
         count = int(np.sum(picked == index))
         delay, plane, width = places[index]
         spread = rng.uniform(-0.5, 0.5, (count, 2)) * [step, width * (problem.plane is None)]
-        values = _coefficients(cells[index], problem.rate_like, count, rng)
-        moved = np.maximum(delay + spread[:, 0], problem.shortest)
+        values = _draw_coefficients(cells[index], problem.damping_indices, count, rng)
+        moved = np.maximum(delay + spread[:, 0], problem.min_delay)
         values = values + (moved - delay)[:, None] * slopes[index]
-        values[:, problem.rate_like] = np.maximum(values[:, problem.rate_like], 0.0)
+        values[:, problem.damping_indices] = np.maximum(values[:, problem.damping_indices], 0.0)
         rows.append(np.column_stack([moved, plane + spread[:, 1], values]))
-    profile = _by_delay(places, cells, len(delays))[0]
+    profile = _marginalise_over_surface(places, cells, len(delays))[0]
     best = int(np.argmax(heights))
     return Posterior(
         ["delay", "plane", *problem.names],
@@ -236,9 +261,9 @@ def _sample(
     )
 
 
-def _coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
+def _draw_coefficients(cell: CoefficientFit, positive: list[int], count: int, rng) -> np.ndarray:
     """Return normal draws of the coefficients; those with a negative damping are drawn again."""
-    root = factor(cell.covariance)
+    root = factorise_covariance(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T
     for _ in range(50):
         bad = np.any(draws[:, positive] < 0.0, axis=1)

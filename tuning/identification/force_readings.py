@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from tuning.identification.records import Run
+from tuning.identification.records import LoggedRun
 
 
 @dataclass(frozen=True)
-class Readings:
+class ForceReadings:
     """Forces of all runs in contact, padded to arrays of shape (rows, lanes)."""
 
     force: np.ndarray  # N, 0 where a reading is missing
@@ -27,7 +27,9 @@ class Readings:
     bias: tuple[float, float] | None = None
 
     @classmethod
-    def of(cls, runs: Sequence[Run], std: float, whitening=(1.0,), threshold: float = 0.0) -> Readings:
+    def of(
+        cls, runs: Sequence[LoggedRun], std: float, whitening=(1.0,), threshold: float = 0.0
+    ) -> ForceReadings:
         """Return the readings of runs, padded to the longest one."""
         rows = max(len(run.tick) for run in runs)
 
@@ -41,7 +43,7 @@ class Readings:
         valid = [run.valid & np.isfinite(force) for run, force in zip(runs, forces, strict=True)]
         counts = padded(valid, False, bool)
         force = padded([np.nan_to_num(force_column) for force_column in forces], 0.0, float)
-        entry = padded([_entries(run) for run in runs], 0, int)
+        entry = padded([_assign_contact_entries(run) for run in runs], 0, int)
         if len(whitening) > 1:
             # A row is used if all rows that the filter needs are there.
             gap: Any = lfilter(np.ones(len(whitening)), [1.0], ~counts, axis=0)
@@ -50,13 +52,13 @@ class Readings:
         entries = tuple(int(number) for number in np.unique(entry[counts])) or (0,)
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
 
-    def of_lanes(self, lanes: np.ndarray) -> Readings:
+    def select_lanes(self, lanes: np.ndarray) -> ForceReadings:
         """Return the readings of the given lanes, each as often as it occurs."""
         force, counts, entry = (array[:, lanes] for array in (self.force, self.counts, self.entry))
         return replace(self, force=force, counts=counts, entry=entry)
 
 
-def _entries(run: Run) -> np.ndarray:
+def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
     """Return the contact's entry for each row; rows out of contact have that of a neighbouring contact."""
     index = np.full(len(run.tick), -1) if run.contact_index is None else run.contact_index
     if not np.any(index >= 0):

@@ -13,38 +13,45 @@ from typing import Any
 import numpy as np
 from scipy import optimize, stats
 
-from tuning.identification.frf import Spectrum, spectrum
-from tuning.identification.order import Candidate, choose, criterion, left
-from tuning.identification.rational import Fit, Lines, Model, fit
-from tuning.identification.records import Run, Timing
+from tuning.identification.frf import Spectrum, compute_spectrum
+from tuning.identification.rational import MotionModel, SpectralLines, SpectrumFit, fit_structure
+from tuning.identification.records import CampaignTiming, LoggedRun
+from tuning.identification.structure_choice import (
+    StructureCandidate,
+    choose_structure,
+    compute_criterion,
+    compute_residual_ratio,
+)
 
-SETTLING = 10.0  # time constants that a transient lasts
-SLOWEST = 0.05  # s, assumed time constant before the fit
-UNEXPLAINED = 1.3  # chi-squared per degree of freedom above which the intervals are widened
-RARE = 1e-6  # p-value below which a model error is added; low, because it widens the intervals a lot
-BANDS = 10  # frequency bands, in each of which the model error is constant
-LARGEST = 10.0  # largest relative model error
-ROUNDS = 3  # iterations of the fit and the model error
+SETTLING_TIME_CONSTANTS = 10.0  # time constants that a transient lasts
+ASSUMED_TIME_CONSTANT = 0.05  # s, assumed time constant before the fit
+MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
+MODEL_ERROR_P_VALUE = (
+    1e-6  # p-value below which a model error is added; low, because it widens the intervals a lot
+)
+MODEL_ERROR_BANDS = 10  # frequency bands, in each of which the model error is constant
+MAX_MODEL_ERROR = 10.0  # largest relative model error
+MODEL_ERROR_ITERATIONS = 3  # iterations of the fit and the model error
 
 
 @dataclass(frozen=True)
 class FreeMotion:
     """Motion simulator fitted to runs without contact."""
 
-    lines: Lines  # with the measured noise
+    lines: SpectralLines  # with the measured noise
     spectra: tuple[Spectrum, ...]  # one per run
-    chosen: Candidate
-    candidates: tuple[Candidate, ...]
+    chosen: StructureCandidate
+    candidates: tuple[StructureCandidate, ...]
     gain: tuple[float, float]  # measured over desired position, and its standard deviation
-    other_hold: float  # decrease of the criterion with the other hold; negative: it rises
+    other_hold_gain: float  # decrease of the criterion with the other hold; negative: it rises
     beyond: float = 0.0  # relative model error at each line in addition to the noise
 
     @property
-    def model(self) -> Model:
+    def model(self) -> MotionModel:
         return self.chosen.fit.model
 
     @property
-    def fit(self) -> Fit:
+    def fit(self) -> SpectrumFit:
         return self.chosen.fit
 
     @property
@@ -57,7 +64,7 @@ class FreeMotion:
     def covariance(self) -> np.ndarray:
         """Return the covariance of the model's parameters, wider if the residual exceeds the noise."""
         unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
-        return self.fit.covariance * (unexplained if unexplained > UNEXPLAINED else 1.0)
+        return self.fit.covariance * (unexplained if unexplained > MAX_REDUCED_CHI_SQUARE else 1.0)
 
     @property
     def noise_std(self) -> float:
@@ -77,30 +84,34 @@ class FreeMotion:
         return (self.lines.output - predicted) / predicted, self.lines.std / np.abs(predicted)
 
 
-def estimate(runs: Sequence[Run], timing: Timing, order: int | None = None) -> FreeMotion | None:
+def fit_free_motion(
+    runs: Sequence[LoggedRun], timing: CampaignTiming, order: int | None = None
+) -> FreeMotion | None:
     """Fit the motion simulator to all free runs together; return None if none is long enough."""
-    spectra = spectra_of(runs, timing)
+    spectra = compute_spectra(runs, timing)
     if not spectra:
         return None
-    lines = join(spectra, timing)
-    chosen, candidates = choose(lines, order)
+    lines = concatenate_lines(spectra, timing)
+    chosen, candidates = choose_structure(lines, order)
     # A model of one order more can compensate a wrong hold.
     highest = chosen.fit.model.structure.order + 1
     other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
-    other_hold = chosen.criterion - criterion(choose(other_lines, order, highest)[0].fit, left(candidates))
+    other_hold = chosen.criterion - compute_criterion(
+        choose_structure(other_lines, order, highest)[0].fit, compute_residual_ratio(candidates)
+    )
     beyond, weighed = 0.0, lines
-    for _ in range(ROUNDS):
-        beyond = erring(chosen.fit.model, lines)
+    for _ in range(MODEL_ERROR_ITERATIONS):
+        beyond = estimate_model_error(chosen.fit.model, lines)
         if beyond == 0.0:
             break
         expected = np.abs(chosen.fit.model.predict(lines))
         weighed = replace(lines, std=np.hypot(lines.std, beyond * expected))
-        chosen = replace(chosen, fit=fit(chosen.fit.model.structure, weighed))
-    gain = gain_of(chosen.fit, weighed)
+        chosen = replace(chosen, fit=fit_structure(chosen.fit.model.structure, weighed))
+    gain = estimate_static_gain(chosen.fit, weighed)
     return FreeMotion(lines, tuple(spectra), chosen, tuple(candidates), gain, other_hold, beyond)
 
 
-def erring(model: Model, lines: Lines) -> float:
+def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
     """Return the relative model error at each line (rms), or 0 if noise explains the residual.
 
     A model error is smooth: all lines of a band share one error. It is therefore estimated from the means
@@ -111,7 +122,7 @@ def erring(model: Model, lines: Lines) -> float:
     expected = model.predict(lines)
     size = np.abs(expected)
     errors, variances, counts = [], [], []
-    for band in np.array_split(np.argsort(lines.frequency), min(BANDS, len(lines))):
+    for band in np.array_split(np.argsort(lines.frequency), min(MODEL_ERROR_BANDS, len(lines))):
         weight = size[band] ** 2 / lines.std[band] ** 2
         relative = (lines.output[band] - expected[band]) / expected[band]
         errors.append(np.abs(np.sum(weight * relative) / weight.sum()))
@@ -119,41 +130,43 @@ def erring(model: Model, lines: Lines) -> float:
         counts.append(len(band))
     power, variance = np.square(errors), np.array(variances)
     freedom = 2 * len(power) - model.structure.size
-    if freedom < 1 or stats.chi2.sf(np.sum(2.0 * power / variance), freedom) > RARE:
+    if freedom < 1 or stats.chi2.sf(np.sum(2.0 * power / variance), freedom) > MODEL_ERROR_P_VALUE:
         return 0.0
 
     def excess(logarithm: float) -> float:
         return float(np.sum(2.0 * power / (variance + np.exp(2.0 * logarithm)))) - freedom
 
-    least, most = np.log(1e-9), np.log(LARGEST)
+    least, most = np.log(1e-9), np.log(MAX_MODEL_ERROR)
     root: Any = optimize.brentq(excess, least, most) if excess(most) < 0.0 else most
     return float(np.exp(root) * np.sqrt(np.mean(counts)))
 
 
-def of_known(runs: Sequence[Run], timing: Timing, model: Model) -> FreeMotion | None:
+def compare_free_motion(
+    runs: Sequence[LoggedRun], timing: CampaignTiming, model: MotionModel
+) -> FreeMotion | None:
     """Compare the free runs with a known model, without fitting; return None if no run is long enough."""
-    spectra = spectra_of(runs, timing)
+    spectra = compute_spectra(runs, timing)
     if not spectra:
         return None
 
-    def held(lines: Lines) -> Fit:
+    def held(lines: SpectralLines) -> SpectrumFit:
         size = len(model.parameters)
-        return Fit(model, np.zeros((size, size)), (model.predict(lines) - lines.output) / lines.std)
+        return SpectrumFit(model, np.zeros((size, size)), (model.predict(lines) - lines.output) / lines.std)
 
-    lines = join(spectra, timing)
+    lines = concatenate_lines(spectra, timing)
     other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).freedom, 1))
-    candidate = Candidate(fit, criterion(fit, inflation), "")
-    gain = candidate.criterion - criterion(held(other_lines), inflation)
-    return FreeMotion(lines, tuple(spectra), candidate, (candidate,), gain_of(fit, lines), gain)
+    candidate = StructureCandidate(fit, compute_criterion(fit, inflation), "")
+    gain = candidate.criterion - compute_criterion(held(other_lines), inflation)
+    return FreeMotion(lines, tuple(spectra), candidate, (candidate,), estimate_static_gain(fit, lines), gain)
 
 
-def spectra_of(runs: Sequence[Run], timing: Timing) -> list[Spectrum]:
+def compute_spectra(runs: Sequence[LoggedRun], timing: CampaignTiming) -> list[Spectrum]:
     """Return the spectra of the runs that are long enough."""
-    rest = round(SETTLING * SLOWEST / timing.control_period)
+    rest = round(SETTLING_TIME_CONSTANTS * ASSUMED_TIME_CONSTANT / timing.control_period)
     spectra = []
     for run in runs:
-        result = spectrum(
+        result = compute_spectrum(
             run.position_desired, run.position_measured, run.valid & np.isfinite(run.position_measured),
             timing.control_period, rest,
         )  # fmt: skip
@@ -162,9 +175,9 @@ def spectra_of(runs: Sequence[Run], timing: Timing) -> list[Spectrum]:
     return spectra
 
 
-def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:
+def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> SpectralLines:
     """Return the lines of several runs, concatenated."""
-    return Lines(
+    return SpectralLines(
         np.concatenate([spectrum.frequency for spectrum in spectra]),
         np.concatenate([spectrum.command for spectrum in spectra]),
         np.concatenate([spectrum.output for spectrum in spectra]),
@@ -176,7 +189,7 @@ def join(spectra: Sequence[Spectrum], timing: Timing) -> Lines:
     )
 
 
-def gain_of(fit: Fit, lines: Lines) -> tuple[float, float]:
+def estimate_static_gain(fit: SpectrumFit, lines: SpectralLines) -> tuple[float, float]:
     """Return the static gain if it were free, and its standard deviation, by one Newton step from 1."""
     s, command = lines.copies
     scale = np.sqrt(2.0) / lines.std

@@ -15,11 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-SMOOTHED = 15  # lines over which the variance of the noise is averaged
-SIDE, DEGREE = 6, 2  # local polynomial method: lines on either side, degree of the polynomials
-UNSURE = 20.0  # ratio of the transient's variance to the noise's variance, above which a line is dropped
-DRIVEN = 3e-3  # share of the largest power, above which a non-periodic command excites a line
-EXCITED = 1e-3  # share of the largest amplitude, above which a periodic command excites a line
+VARIANCE_SMOOTHING_LINES = 15  # lines over which the variance of the noise is averaged
+SIDE_LINES, POLYNOMIAL_DEGREE = (
+    6,
+    2,
+)  # local polynomial method: lines on either side, degree of the polynomials
+MAX_TRANSIENT_VARIANCE_RATIO = (
+    20.0  # ratio of the transient's variance to the noise's variance, above which a line is dropped
+)
+MIN_POWER_SHARE = 3e-3  # share of the largest power, above which a non-periodic command excites a line
+MIN_AMPLITUDE_SHARE = 1e-3  # share of the largest amplitude, above which a periodic command excites a line
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Spectrum:
     periods: int  # number of averaged periods; 0 for a non-periodic command
 
 
-def repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
+def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
     """Return the rows of one period, and the rows at which the command repeats the period before, or None.
 
     A command that differs during its fade-in repeats itself after it.
@@ -56,13 +61,13 @@ def repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> t
     for lag in peaks[(peaks >= shortest) & (likeness[peaks] > 0.5 * likeness[0])]:
         both_valid = valid[lag:] & valid[:-lag]
         same = (np.abs(command[lag:] - command[:-lag]) <= 1e-4 * scale) | ~both_valid
-        first, length = _longest(same)
+        first, length = _find_longest_run(same)
         if length >= lag and np.mean(both_valid[first : first + length]) > 0.5:
             return int(lag), slice(lag + first, lag + first + length)
     return None
 
 
-def _longest(flags: np.ndarray) -> tuple[int, int]:
+def _find_longest_run(flags: np.ndarray) -> tuple[int, int]:
     """Return the start and the length of the longest sequence of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     if not len(edges):
@@ -72,37 +77,37 @@ def _longest(flags: np.ndarray) -> tuple[int, int]:
     return int(edges[2 * best]), int(lengths[best])
 
 
-def spectrum(
+def compute_spectrum(
     command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float, rest: int
 ) -> Spectrum | None:
     """Return the spectra of one run, by periods if the command repeats itself, else by local polynomials.
 
     `rest` is the number of rows that a transient lasts after a gap. Returns None if the run is too short.
     """
-    result = repetition(command, valid)
+    result = find_repetition(command, valid)
     if result is not None:
         size, rows = result
         count = (rows.stop - rows.start) // size
         if count >= 2:
             rows = slice(rows.stop - count * size, rows.stop)
             shape = (count, size)
-            return periodic(
+            return average_periods(
                 command[rows].reshape(shape), output[rows].reshape(shape), valid[rows].reshape(shape), period
             )
-    quiet = valid & ~_after_gaps(valid, rest)
-    first, length = _longest(quiet)
-    if length < 50 * SIDE:
+    quiet = valid & ~_flag_rows_after_gaps(valid, rest)
+    first, length = _find_longest_run(quiet)
+    if length < 50 * SIDE_LINES:
         return None
-    return aperiodic(command[first : first + length], output[first : first + length], period)
+    return fit_local_polynomials(command[first : first + length], output[first : first + length], period)
 
 
-def _after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
+def _flag_rows_after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
     """Return flags of the rows within `rest` rows after a lost one."""
     last = np.maximum.accumulate(np.where(~valid, np.arange(len(valid)), -rest - 1))
     return np.arange(len(valid)) - last <= rest
 
 
-def periodic(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float) -> Spectrum:
+def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float) -> Spectrum:
     """Return the spectra from arrays of shape (periods, rows) [m].
 
     Every row of the period must be available in at least two periods.
@@ -121,12 +126,12 @@ def periodic(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period:
     variance = spread / max(freedom / size, 1e-9) * np.mean(1.0 / counted)
     variance = _smooth(variance)
     number = np.arange(len(U))
-    excited = (np.abs(U) > EXCITED * np.abs(U[1:]).max()) & (number > 0)
+    excited = (np.abs(U) > MIN_AMPLITUDE_SHARE * np.abs(U[1:]).max()) & (number > 0)
     excited[len(U) - (size % 2 == 0) :] = False
-    return _with_distortion(U, Y, variance, excited, number / (size * period), noise, count)
+    return _add_distortion(U, Y, variance, excited, number / (size * period), noise, count)
 
 
-def _with_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
+def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
     """Return the spectrum with the distortion at lines without excitation."""
     number = np.arange(len(U))
     last = number[excited].max()
@@ -154,47 +159,47 @@ def _with_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectr
 
 
 def _smooth(variance: np.ndarray) -> np.ndarray:
-    """Return the running mean over `SMOOTHED` lines, without the line at 0 Hz."""
-    window = min(SMOOTHED, len(variance) - 1)
+    """Return the running mean over `VARIANCE_SMOOTHING_LINES` lines, without the line at 0 Hz."""
+    window = min(VARIANCE_SMOOTHING_LINES, len(variance) - 1)
     half = window // 2
     padded = np.concatenate([variance[1 : half + 1][::-1], variance[1:], variance[-half:][::-1]])
     kernel = np.ones(window) / window
     return np.concatenate([[variance[0]], np.convolve(padded, kernel, "valid")[: len(variance) - 1]])
 
 
-def aperiodic(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum:
+def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum:
     """Return the spectra by the local polynomial method: output without transient, and its noise."""
     size = len(command)
     level = command[0]
     U, Y = np.fft.rfft(command - level) / size, np.fft.rfft(output - level) / size
     power = _smooth(np.abs(U) ** 2)
-    middle = np.arange(SIDE, len(U) - SIDE)
-    middle = middle[power[middle] > DRIVEN * power[1:].max()]
+    middle = np.arange(SIDE_LINES, len(U) - SIDE_LINES)
+    middle = middle[power[middle] > MIN_POWER_SHARE * power[1:].max()]
     # A periodic command with too few periods to average leaves every other line without power.
-    middle = middle[np.abs(U[middle]) ** 2 > DRIVEN * power[middle]]
-    width = 2 * SIDE + 1
-    r = np.arange(-SIDE, SIDE + 1) / SIDE
-    powers = r[:, None] ** np.arange(DEGREE + 1)
-    windows = sliding_window_view(U, width)[middle - SIDE]
+    middle = middle[np.abs(U[middle]) ** 2 > MIN_POWER_SHARE * power[middle]]
+    width = 2 * SIDE_LINES + 1
+    r = np.arange(-SIDE_LINES, SIDE_LINES + 1) / SIDE_LINES
+    powers = r[:, None] ** np.arange(POLYNOMIAL_DEGREE + 1)
+    windows = sliding_window_view(U, width)[middle - SIDE_LINES]
     basis = np.concatenate(
         [windows[:, :, None] * powers, np.broadcast_to(powers, (len(middle), *powers.shape))], axis=2
     )
-    right = sliding_window_view(Y, width)[middle - SIDE]
+    right = sliding_window_view(Y, width)[middle - SIDE_LINES]
     q, triangle = np.linalg.qr(basis)
     projected = np.einsum("lij,li->lj", q.conj(), right)
     solved = np.linalg.solve(triangle, projected[:, :, None])[:, :, 0]
     left = right - np.einsum("lij,lj->li", q, projected)
-    variance = np.sum(np.abs(left) ** 2, axis=1) / (width - 2 * (DEGREE + 1))
-    output_line = Y[middle] - solved[:, DEGREE + 1]
+    variance = np.sum(np.abs(left) ** 2, axis=1) / (width - 2 * (POLYNOMIAL_DEGREE + 1))
+    output_line = Y[middle] - solved[:, POLYNOMIAL_DEGREE + 1]
     # If the command's spectrum is smooth as well, transient and response cannot be separated.
     row = np.zeros(basis.shape[2])
-    row[DEGREE + 1] = 1.0
+    row[POLYNOMIAL_DEGREE + 1] = 1.0
     unsure = np.sum(
         np.abs(np.linalg.solve(triangle.conj().swapaxes(1, 2), row[:, None])[:, :, 0]) ** 2, axis=1
     )
     signal = np.abs(output_line) ** 2
     coherent = signal / (signal + variance * (1.0 + unsure))
-    keep = (coherent > 0.5) & (unsure < UNSURE)
+    keep = (coherent > 0.5) & (unsure < MAX_TRANSIENT_VARIANCE_RATIO)
     smoothed = np.maximum(_smooth(variance), 1e-300) * (1.0 + unsure)
     return Spectrum(
         frequency=middle[keep] / (size * period),

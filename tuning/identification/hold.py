@@ -14,15 +14,17 @@ the tick rate.
 
 import numpy as np
 
-COPIES = 3  # on either side of the base band
+SPECTRAL_COPIES = 3  # on either side of the base band
 
 
-def frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
+def compute_copy_frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
     """Return the frequency f + m / T [Hz] of every copy m, shape (copies, lines)."""
-    return frequency + np.arange(-COPIES, COPIES + 1)[:, None] / period
+    return frequency + np.arange(-SPECTRAL_COPIES, SPECTRAL_COPIES + 1)[:, None] / period
 
 
-def response(frequency: np.ndarray, period: float, hold: str, latency: int, shift: int = 0) -> np.ndarray:
+def compute_hold_response(
+    frequency: np.ndarray, period: float, hold: str, latency: int, shift: int = 0
+) -> np.ndarray:
     """Return the complex response h from the logged command to the drives' input at each frequency [Hz].
 
     It includes the `shift` [periods] by which the readings of a row lag its command.

@@ -11,25 +11,25 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from tuning.identification.contact_problem import Problem
-from tuning.identification.contact_profile import DRAWS, Posterior
-from tuning.identification.normal_draws import factor
+from tuning.identification.contact_problem import ContactProblem
+from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
+from tuning.identification.normal_draws import factorise_covariance
 
-WIDEST = 0.01  # m, largest standard deviation of the surface
-ATTEMPTS = 50  # at drawing damping coefficients >= 0
+MAX_SURFACE_STD = 0.01  # m, largest standard deviation of the surface
+MAX_REDRAWS = 50  # at drawing damping coefficients >= 0
 
 
-def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
+def compute_posterior_near(problem: ContactProblem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
     """Return the posterior over evenly spaced delays [s], near a surface [m]."""
     step, free = delays[1] - delays[0], problem.plane is None
     surfaces, fits, deviations, changes, heights = [], [], [], [], []
     for delay in delays:
-        surface, fit, gain = problem.settled(float(delay), plane)
-        deviation = min(1.0 / np.sqrt(max(fit.curvature, 1e-300)), WIDEST) if free else 0.0
+        surface, fit, gain = problem.find_best_surface(float(delay), plane)
+        deviation = min(1.0 / np.sqrt(max(fit.curvature, 1e-300)), MAX_SURFACE_STD) if free else 0.0
         change = np.zeros(len(fit.coefficients)) if fit.by_plane is None else fit.by_plane
         mean = fit.coefficients + change * (surface - fit.plane)
         spread = np.sqrt(np.diag(fit.covariance) + (change * deviation) ** 2)
-        allowed = sum(special.log_ndtr(mean[i] / spread[i]) for i in problem.rate_like)
+        allowed = sum(special.log_ndtr(mean[i] / spread[i]) for i in problem.damping_indices)
         volume = 0.5 * np.linalg.slogdet(fit.covariance)[1] + np.log(np.sqrt(2.0 * np.pi) * deviation or 1.0)
         heights.append(gain - 0.5 * fit.misfit + volume + allowed)
         for values, value in ((surfaces, surface), (fits, fit), (deviations, deviation), (changes, change)):
@@ -38,24 +38,26 @@ def around(problem: Problem, delays: np.ndarray, plane: float, seed: int) -> Pos
     weights = np.exp(np.array(heights) - total)
     rng = np.random.default_rng(seed)
     # Systematic resampling reduces the variance of the draws.
-    picked = np.searchsorted(np.cumsum(weights), (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS)
+    picked = np.searchsorted(
+        np.cumsum(weights), (np.arange(POSTERIOR_DRAWS) + rng.uniform(size=POSTERIOR_DRAWS)) / POSTERIOR_DRAWS
+    )
     picked = np.minimum(picked, len(delays) - 1)
     means = np.array([fit.coefficients for fit in fits]) + np.array(changes) * (
         np.array(surfaces) - [fit.plane for fit in fits]
     ).reshape(-1, 1)
-    moved = np.maximum(delays[picked] + rng.uniform(-0.5, 0.5, DRAWS) * step, problem.shortest)
+    moved = np.maximum(delays[picked] + rng.uniform(-0.5, 0.5, POSTERIOR_DRAWS) * step, problem.min_delay)
     at = np.column_stack([np.interp(moved, delays, values) for values in (surfaces, *means.T)])
-    factors = factor(np.array([fit.covariance for fit in fits]))
-    off, values, left = np.empty(DRAWS), at[:, 1:].copy(), np.arange(DRAWS)
-    for _ in range(ATTEMPTS):
+    factors = factorise_covariance(np.array([fit.covariance for fit in fits]))
+    off, values, left = np.empty(POSTERIOR_DRAWS), at[:, 1:].copy(), np.arange(POSTERIOR_DRAWS)
+    for _ in range(MAX_REDRAWS):
         cell, noise = picked[left], rng.standard_normal((len(left), means.shape[1] + 1))
         off[left] = np.array(deviations)[cell] * noise[:, 0]
         along = off[left, None] * np.array(changes)[cell]
         values[left] = at[left, 1:] + along + np.einsum("nij,nj->ni", factors[cell], noise[:, 1:])
-        left = np.flatnonzero(np.any(values[:, problem.rate_like] < 0.0, axis=1))
+        left = np.flatnonzero(np.any(values[:, problem.damping_indices] < 0.0, axis=1))
         if not len(left):
             break
-    values[:, problem.rate_like] = np.maximum(values[:, problem.rate_like], 0.0)
+    values[:, problem.damping_indices] = np.maximum(values[:, problem.damping_indices], 0.0)
     best = int(np.argmax(heights))
     return Posterior(
         ["delay", "plane", *problem.names],

@@ -20,22 +20,24 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from jaxhil.contact.laws import LAWS
-from jaxhil.contact.regression import Family
+from jaxhil.contact.laws import CONTACT_LAWS
+from jaxhil.contact.regression import RegressionFamily
 from tuning.identification.contact_laws import Law, kelvin_voigt
-from tuning.identification.contact_problem import COARSE, LONGEST, Problem
-from tuning.identification.contact_profile import first_plane
-from tuning.identification.force_readings import Readings
-from tuning.identification.motion import Motion
+from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
+from tuning.identification.contact_profile import estimate_surface_from_onset
+from tuning.identification.force_readings import ForceReadings
+from tuning.identification.motion import MotionResponse
 
-FEWEST = 4  # contacts that cross-validation needs
-ERRORS = 2.0  # standard errors of the likelihood difference, within which laws are equally good
-CLEAR = 4.0  # standard errors beyond which damping at the onset is excluded
-ONSET = 1e-3  # s, time on either side of an onset or a release that the evaluation omits
+MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # contacts that cross-validation needs
+MAX_LIKELIHOOD_DEFICIT_ERRORS = (
+    2.0  # standard errors of the likelihood difference, within which laws are equally good
+)
+ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # standard errors beyond which damping at the onset is excluded
+ONSET_MARGIN = 1e-3  # s, time on either side of an onset or a release that the evaluation omits
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedLaw:
     """Contact law with its fit and its evaluation."""
 
     law: Law
@@ -43,62 +45,81 @@ class Judged:
     plane: float  # m
     misfit: float  # chi-squared over all contacts
     likelihood: np.ndarray  # log likelihood of each contact under the fit to the others
-    short: tuple[float, float]  # deficit of the total log likelihood to the best law, and its standard error
+    likelihood_deficit: tuple[
+        float, float
+    ]  # deficit of the total log likelihood to the best law, and its standard error
 
 
-def judge(motion: Motion, readings: Readings, plane: float | None, names=None) -> list[Judged]:
+def choose_contact_law(
+    motion: MotionResponse, readings: ForceReadings, plane: float | None, names=None
+) -> list[EvaluatedLaw]:
     """Fit and evaluate all laws, or those named; return them with the chosen one first."""
     judged = []
-    _, plane_there, _ = guess = _fit(motion, readings, kelvin_voigt(), plane, None)
-    judging = replace(readings, counts=readings.counts & ~at_onset(motion, readings, guess))
+    _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
+    judging = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
-    for family in families(deepest, len(readings.entries), names):
-        law, result = _search(family, lambda candidate: _fit(motion, readings, candidate, plane, guess))
-        judged.append((law, result, _by_others(motion, readings, judging, law, plane, result)))
+    for family in list_law_families(deepest, len(readings.entries), names):
+        law, result = _fit_shape(
+            family, lambda candidate: _fit_coarsely(motion, readings, candidate, plane, guess)
+        )
+        judged.append((law, result, _cross_validate(motion, readings, judging, law, plane, result)))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
     results = []
     for law, (delay, at, misfit), likelihood in judged:
         behind = best - likelihood
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
-        results.append(Judged(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
+        results.append(EvaluatedLaw(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
     rows = np.log(max(readings.counts.sum(), 2))
     preferred = min(results, key=lambda fit: fit.misfit + rows * fit.law.complexity)
     # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
     damped = [fit for fit in results if "damping" in fit.law.names] or results
     # The delay also absorbs damping at the onset if the law's damping starts at zero depth with zero.
     least = min(fit.misfit for fit in results)
-    at_once = [fit for fit in damped if acts_at_onset(fit.law)]
-    if any(fit.short[0] <= CLEAR * fit.short[1] + 1e-9 and fit.misfit <= least + CLEAR**2 for fit in at_once):
+    at_once = [fit for fit in damped if has_onset_damping(fit.law)]
+    if any(
+        fit.likelihood_deficit[0] <= ONSET_DAMPING_EXCLUSION_ERRORS * fit.likelihood_deficit[1] + 1e-9
+        and fit.misfit <= least + ONSET_DAMPING_EXCLUSION_ERRORS**2
+        for fit in at_once
+    ):
         damped = at_once
-    good = [fit for fit in damped if fit is preferred or fit.short[0] <= ERRORS * fit.short[1] + 1e-9]
-    good = good or [min(damped, key=lambda fit: fit.short[0])]
+    good = [
+        fit
+        for fit in damped
+        if fit is preferred
+        or fit.likelihood_deficit[0] <= MAX_LIKELIHOOD_DEFICIT_ERRORS * fit.likelihood_deficit[1] + 1e-9
+    ]
+    good = good or [min(damped, key=lambda fit: fit.likelihood_deficit[0])]
     # Among laws of equal complexity the first one in the list wins: with the misfit, noise would decide.
     taken = min(good, key=lambda fit: fit.law.complexity)
     return [
         taken,
-        *(fit for fit in sorted(results, key=lambda fit: fit.short[0]) if fit is not taken),
+        *(fit for fit in sorted(results, key=lambda fit: fit.likelihood_deficit[0]) if fit is not taken),
     ]
 
 
-def acts_at_onset(law: Law) -> bool:
+def has_onset_damping(law: Law) -> bool:
     """Return whether the law has a force at the surface that is proportional to the rate."""
     surface, rate = np.zeros(1), np.ones(1)
-    return any(np.any(value != 0.0) for value in (*law.own(surface, rate), *law.shared(surface, rate)))
+    return any(
+        np.any(value != 0.0) for value in (*law.entry_functions(surface, rate), *law.shared(surface, rate))
+    )
 
 
-Fitted = tuple[float, float, float]  # delay, plane, misfit
-# Names of the laws that can be fitted, in the order of `families`.
-NAMES = tuple(name for name, law in LAWS.items() if law.families(1.0, 1))
+CoarseFit = tuple[float, float, float]  # delay, plane, misfit
+# Names of the laws that can be fitted, in the order of `list_law_families`.
+FITTABLE_LAW_NAMES = tuple(name for name, law in CONTACT_LAWS.items() if law.families(1.0, 1))
 
 
-def families(deepest: float, entries: int, names: Sequence[str] | None = None) -> list[Family]:
+def list_law_families(
+    deepest: float, entries: int, names: Sequence[str] | None = None
+) -> list[RegressionFamily]:
     """Return the families of all laws, or of those named; `deepest`: greatest depth of all contacts [m]."""
-    laws = [LAWS[name] for name in NAMES if names is None or name in names]
+    laws = [CONTACT_LAWS[name] for name in FITTABLE_LAW_NAMES if names is None or name in names]
     return [family for law in laws for family in law.families(deepest, entries)]
 
 
-def _search(family: Family, fit: Callable[[Law], Fitted]) -> tuple[Law, Fitted]:
+def _fit_shape(family: RegressionFamily, fit: Callable[[Law], CoarseFit]) -> tuple[Law, CoarseFit]:
     """Return the law of the family that fits best, and its fit."""
     if family.low == family.high:
         law = family.make(family.low)
@@ -110,71 +131,79 @@ def _search(family: Family, fit: Callable[[Law], Fitted]) -> tuple[Law, Fitted]:
         options={"xatol": 0.001 * (family.high - family.low)},
     )
     # A common value of the exponent or shape is preferred if it fits nearly as well.
-    as_good = (value for value in family.usual if fit(family.make(value))[2] - optimum.fun < 4.0)
+    as_good = (value for value in family.preferred if fit(family.make(value))[2] - optimum.fun < 4.0)
     law = family.make(next(as_good, float(optimum.x)))
     return law, fit(law)
 
 
-def _fit(motion, readings, law, plane, guess: Fitted | None) -> Fitted:
+def _fit_coarsely(motion, readings, law, plane, guess: CoarseFit | None) -> CoarseFit:
     """Return delay [s], surface [m] and misfit of the best fit, without the posterior."""
-    problem = Problem(motion, readings, law, plane)
-    return quick(problem, guess)
+    problem = ContactProblem(motion, readings, law, plane)
+    return search_coarsely(problem, guess)
 
 
-def quick(problem: Problem, guess: Fitted | None = None, reach: int = 4) -> Fitted:
+def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, reach: int = 4) -> CoarseFit:
     """Return the best delay and surface from a coarse search.
 
     The search covers `reach` coarse steps on either side of a guess, or all delays without a guess.
     """
     if guess is None:
-        start = problem.plane if problem.plane is not None else first_plane(problem, LONGEST / 4.0)
-        delays = np.arange(problem.shortest, LONGEST, 2.0 * COARSE)
+        start = (
+            problem.plane
+            if problem.plane is not None
+            else estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
+        )
+        delays = np.arange(problem.min_delay, MAX_FORCE_DELAY, 2.0 * COARSE_DELAY_STEP)
     else:
         steps = np.array([step for step in (-4, -2, -1, 0, 1, 2, 4) if abs(step) <= reach])
         start = guess[1]
-        delays = np.clip(guess[0] + COARSE * steps, problem.shortest, LONGEST)
+        delays = np.clip(guess[0] + COARSE_DELAY_STEP * steps, problem.min_delay, MAX_FORCE_DELAY)
     best = (0.0, start, np.inf)
-    for width in (0.0, COARSE, COARSE / 4.0):
+    for width in (0.0, COARSE_DELAY_STEP, COARSE_DELAY_STEP / 4.0):
         if width:
             delays = best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0])
-            delays = np.clip(delays, problem.shortest, LONGEST)
+            delays = np.clip(delays, problem.min_delay, MAX_FORCE_DELAY)
         for delay in delays:
-            plane, inner, gain = problem.settled(float(delay), best[1])
+            plane, inner, gain = problem.find_best_surface(float(delay), best[1])
             if inner.misfit - 2.0 * gain < best[2]:
                 best = (float(delay), plane, inner.misfit - 2.0 * gain)
     return best
 
 
-def at_onset(motion: Motion, readings: Readings, guess: Fitted) -> np.ndarray:
-    """Return a flag for each row within `ONSET` of an onset or a release, shape (rows, lanes).
+def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess: CoarseFit) -> np.ndarray:
+    """Return a flag for each row within `ONSET_MARGIN` of an onset or a release, shape (rows, lanes).
 
     The force of a damped contact jumps there; the side on which a row falls carries no information on the
     law.
     """
     delay, plane, _ = guess
     shortest = -max(motion.delay, 0.0)
-    flags = [motion.at(max(d, shortest))[0] > plane for d in (delay - ONSET, delay, delay + ONSET)]
+    flags = [
+        motion.at(max(d, shortest))[0] > plane for d in (delay - ONSET_MARGIN, delay, delay + ONSET_MARGIN)
+    ]
     return np.any(flags, axis=0) & ~np.all(flags, axis=0)
 
 
-def _by_others(motion, readings, judging: Readings, law, plane, start: Fitted) -> np.ndarray:
+def _cross_validate(motion, readings, judging: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
     """Return the log likelihood of each contact under the fit to the contacts of the other parity."""
     lanes = readings.force.shape[1]
-    if lanes < FEWEST:
+    if lanes < MIN_CONTACTS_FOR_CROSS_VALIDATION:
         size = law.complexity * np.log(max(readings.counts.sum(), 2)) / 2.0
         return np.array([-0.5 * start[2] - size])
     likelihood = np.empty(lanes)
     for parity in (0, 1):
         mine = np.arange(lanes) % 2 == parity
         taught = replace(readings, counts=readings.counts & ~mine)
-        problem = Problem(motion, taught, law, plane)
-        delay, at, _ = quick(problem, start, 1)
+        problem = ContactProblem(motion, taught, law, plane)
+        delay, at, _ = search_coarsely(problem, start, 1)
         coefficients = problem.at(delay, at).coefficients
-        likelihood[mine] = -0.5 * misfits(problem, judging, delay, at, coefficients)[mine]
+        likelihood[mine] = -0.5 * compute_contact_misfits(problem, judging, delay, at, coefficients)[mine]
     return likelihood
 
 
-def misfits(problem: Problem, readings: Readings, delay, plane, coefficients) -> np.ndarray:
+def compute_contact_misfits(
+    problem: ContactProblem, readings: ForceReadings, delay, plane, coefficients
+) -> np.ndarray:
     """Return the sum of squared whitened residuals of each contact."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-LEAST_EIGENVALUE = 1e-6  # of the written correlation, which rounding must not make singular
-FEW_DIGITS = 12  # significant digits of numbers in the file
+MIN_CORRELATION_EIGENVALUE = 1e-6  # of the written correlation, which rounding must not make singular
+FILE_DIGITS = 12  # significant digits of numbers in the file
 
 
-def uncertainty_tables(
+def make_uncertainty_tables(
     keys: list[str], draws: np.ndarray, floors: np.ndarray, off: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Return `[uncertainty]` and `[correlation]` from draws.
@@ -31,8 +31,8 @@ def uncertainty_tables(
     covariance = covariance if off is None else covariance + np.outer(off, off)
     short = np.maximum(floors**2 - np.diag(covariance), 0.0)
     covariance = covariance + np.diag(short)
-    names = list(dict.fromkeys(_path(key) for key in keys))
-    groups = [[i for i, key in enumerate(keys) if _path(key) == name] for name in names]
+    names = list(dict.fromkeys(_strip_index(key) for key in keys))
+    groups = [[i for i, key in enumerate(keys) if _strip_index(key) == name] for name in names]
     std = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(std, std)
     # The correlation of a list is the mean over its entries.
@@ -41,8 +41,8 @@ def uncertainty_tables(
     )
     np.fill_diagonal(joined, 1.0)
     values, vectors = np.linalg.eigh(joined)
-    if values.min() < LEAST_EIGENVALUE:
-        joined = vectors @ np.diag(np.maximum(values, LEAST_EIGENVALUE)) @ vectors.T
+    if values.min() < MIN_CORRELATION_EIGENVALUE:
+        joined = vectors @ np.diag(np.maximum(values, MIN_CORRELATION_EIGENVALUE)) @ vectors.T
         scale = np.sqrt(np.diag(joined))
         joined = joined / np.outer(scale, scale)
     uncertainty = {}
@@ -58,7 +58,7 @@ def uncertainty_tables(
     return tables
 
 
-def _path(key: str) -> str:
+def _strip_index(key: str) -> str:
     """Return the key without the index of a list's entry."""
     parts = key.split(".")
     while parts[-1].isdigit():
@@ -66,7 +66,7 @@ def _path(key: str) -> str:
     return ".".join(parts)
 
 
-def put(document: dict[str, Any], key: str, value: float) -> None:
+def set_value(document: dict[str, Any], key: str, value: float) -> None:
     """Set the value of a dotted key, with indices for list entries, in a mechanism in form of tables."""
     *path, last = [int(part) if part.isdigit() else part for part in key.split(".")]
     table: Any = document
@@ -90,31 +90,31 @@ def to_toml(document: dict[str, Any], comment: str = "") -> str:
 
     inline = {name: document[name] for name in ("uncertainty",) if document.get(name)}
     rest = {key: value for key, value in document.items() if key not in ("uncertainty",)}
-    lines += [f"{key} = {_value(value)}" for key, value in rest.items() if not isinstance(value, dict)]
+    lines += [f"{key} = {_format_value(value)}" for key, value in rest.items() if not isinstance(value, dict)]
     collect("", rest)
     for path, table in tables:
         lines += ["", f"[{path}]"]
-        lines += [f"{key} = {_value(value)}" for key, value in table.items() if value is not None]
+        lines += [f"{key} = {_format_value(value)}" for key, value in table.items() if value is not None]
     for path, table in inline.items():
         lines += ["", f"[{path}]"]
         for key, entry in table.items():
             parts = ", ".join(
-                f"{name} = {_value(value)}" for name, value in entry.items() if value is not None
+                f"{name} = {_format_value(value)}" for name, value in entry.items() if value is not None
             )
             lines.append(f"{json.dumps(key)} = {{ {parts} }}")
     return "\n".join(lines) + "\n"
 
 
-def _value(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(_format_value(item) for item in value) + "]"
     if isinstance(value, int):
         return str(value)
     if math.isinf(value):
         return "inf" if value > 0 else "-inf"
-    text = f"{value:.{FEW_DIGITS}g}"
+    text = f"{value:.{FILE_DIGITS}g}"
     return text if any(mark in text for mark in ".en") else text + ".0"

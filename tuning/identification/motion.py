@@ -2,9 +2,9 @@
 
 The response of a linear motion simulator to held or linearly interpolated commands is known exactly at any
 time. A delay of any fraction of a period is therefore one row of coefficients times the state and the
-commands at both ends of a period (Van Loan 1978), as in `jaxhil.simulation.motion` within the loop. All runs
-advance together, one per lane; before its first row, the command of a run moved uniformly. The resulting
-position and velocity have no noise.
+commands at both ends of a period (Van Loan 1978), as in `jaxhil.simulation.motion_curves` within the loop.
+All runs advance together, one per lane; before its first row, the command of a run moved uniformly. The
+resulting position and velocity have no noise.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from copy import copy
 
 import numpy as np
 
-from tuning.identification.rational import Model
-from tuning.identification.records import Run, Timing
+from tuning.identification.rational import MotionModel
+from tuning.identification.records import CampaignTiming, LoggedRun
 
-TOLERANCE = 1e-9  # periods, distance within which a time counts as a tick
+TICK_TOLERANCE = 1e-9  # periods, distance within which a time counts as a tick
 
 
-class Motion:
+class MotionResponse:
     """Response of one model to the commands of several runs."""
 
     def __init__(
         self,
-        model: Model,
-        runs: Sequence[Run],
-        timing: Timing,
+        model: MotionModel,
+        runs: Sequence[LoggedRun],
+        timing: CampaignTiming,
         longest: float,
         late: np.ndarray | None = None,
     ):
@@ -50,7 +50,7 @@ class Motion:
         self.rows = max(len(run.tick) for run in runs)
         numerator, denominator = model.fraction
         self.order = len(denominator) - 1
-        self.A, self.B, self.C = _companion(numerator, denominator, self.period)
+        self.A, self.B, self.C = _make_companion_form(numerator, denominator, self.period)
         longest = max(self.delay, 0.0) + longest + most
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
         # Rows with readings of later ticks, and negative delays, need the commands of later ticks.
@@ -72,7 +72,7 @@ class Motion:
 
     def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
         lag = (self.delay + delay) / self.period + self.shift
-        whole_periods = int(np.floor(lag + TOLERANCE))
+        whole_periods = int(np.floor(lag + TICK_TOLERANCE))
         fraction = min(1.0, 1.0 - (lag - whole_periods))
         first = self.offset - 1 - whole_periods
         if first < 0:
@@ -95,13 +95,13 @@ class Motion:
         )
         return x, v
 
-    def of_positions(self) -> Motion:
+    def at_row_times(self) -> MotionResponse:
         """Return the same motion at the times of the rows, without the times of the force readings."""
         rows = copy(self)
         rows.late = None
         return rows
 
-    def of(self, lanes: np.ndarray) -> Motion:
+    def of(self, lanes: np.ndarray) -> MotionResponse:
         """Return the motion of the given lanes, each as often as it occurs."""
         result = copy(self)
         result.start, result.end = self.start[:, lanes], self.end[:, lanes]
@@ -109,7 +109,7 @@ class Motion:
         result.late = None if self.late is None else self.late[lanes]
         return result
 
-    def _commands(self, runs: Sequence[Run], ahead: int) -> np.ndarray:
+    def _commands(self, runs: Sequence[LoggedRun], ahead: int) -> np.ndarray:
         """Return the commands with history and continuation, (history + rows + ahead, lanes).
 
         The last command of a run is held.
@@ -132,7 +132,7 @@ class Motion:
         n = self.order
         system = np.zeros((n + 2, n + 2))
         system[:n, :n], system[:n, n], system[n, n + 1] = self.A, self.B, 1.0
-        full = exponential(system * fraction)[:n]
+        full = compute_matrix_exponential(system * fraction)[:n]
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def _advance(self, hold: str) -> np.ndarray:
@@ -156,7 +156,7 @@ class Motion:
         return states
 
 
-def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
+def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period: float):
     """Return (A, B, C) with time in periods, from descending powers of s; empty for order 0."""
     order = len(denominator) - 1
     scale = period ** np.arange(order, -1.0, -1.0)
@@ -171,7 +171,7 @@ def _companion(numerator: np.ndarray, denominator: np.ndarray, period: float):
     return A, B, C
 
 
-def exponential(matrix: np.ndarray) -> np.ndarray:
+def compute_matrix_exponential(matrix: np.ndarray) -> np.ndarray:
     """Return the matrix exponential by scaling, Taylor series and squaring, accurate to rounding.
 
     There are hundreds of small matrices; the general routine's choice of a method would take longer than the

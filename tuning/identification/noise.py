@@ -14,16 +14,16 @@ import numpy as np
 from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
-HIGHEST = 8  # highest order of the autoregression
-FEWEST_BEYOND = 20  # readings beyond a dead zone that an estimate needs
-REPEATED = 0.2  # ratio of distinct values to readings, below which the readings may be rounded
-ROUNDED_TO_0 = 0.02  # share of exact zeros beyond those of rounding that indicates a dead zone
-GAP = 0.3  # largest ratio of least to mean reading of this kind of dead zone
-SILENT = 0.5  # share of exact zeros that indicates a dead zone without further tests
+MAX_AUTOREGRESSION_ORDER = 8  # highest order of the autoregression
+MIN_READINGS_BEYOND_DEAD_ZONE = 20  # readings beyond a dead zone that an estimate needs
+MAX_DISTINCT_SHARE = 0.2  # ratio of distinct values to readings, below which the readings may be rounded
+MIN_EXCESS_ZERO_SHARE = 0.02  # share of exact zeros beyond those of rounding that indicates a dead zone
+MAX_LEAST_TO_MEAN_RATIO = 0.3  # largest ratio of least to mean reading of this kind of dead zone
+MIN_ZERO_SHARE = 0.5  # share of exact zeros that indicates a dead zone without further tests
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """Noise of one sensor while nothing moves."""
 
     mean: float  # of the readings, in their unit
@@ -45,27 +45,27 @@ class Noise:
     @property
     def innovation(self) -> float:
         """Return the standard deviation of the whitened noise, in the unit of the readings."""
-        return self.std * float(np.sqrt(whitened_share(self.filter)))
+        return self.std * float(np.sqrt(compute_whitened_share(self.filter)))
 
 
-def at_rest(readings: np.ndarray) -> Noise:
+def estimate_noise(readings: np.ndarray) -> SensorNoise:
     """Return the noise of at least 20 finite readings on successive ticks."""
-    quantum = steps(readings)
+    quantum = detect_quantum(readings)
     number = len(readings)
-    if _is_hidden(readings, quantum):
-        std, dead_zone = _beyond(readings)
-        return Noise(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
-    drift = _drift(readings)
+    if _has_excess_zeros(readings, quantum):
+        std, dead_zone = _fit_dead_zone(readings)
+        return SensorNoise(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
+    drift = _estimate_drift(readings)
     readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
     rounded = quantum and not drift
-    mean, std = _binned(readings, quantum) if rounded else (readings.mean(), readings.std(ddof=1))
-    colour = autoregression(readings - mean)
+    mean, std = _fit_rounded_normal(readings, quantum) if rounded else (readings.mean(), readings.std(ddof=1))
+    colour = fit_whitening_filter(readings - mean)
     # The standard error of correlated readings follows from the noise spectrum at 0 Hz.
-    at_zero = np.sqrt(whitened_share(colour)) / abs(np.sum(colour))
-    effective = 1.0 + 2.0 * np.sum(_correlations(colour) ** 2)
+    at_zero = np.sqrt(compute_whitened_share(colour)) / abs(np.sum(colour))
+    effective = 1.0 + 2.0 * np.sum(_autocorrelate(colour) ** 2)
     # Rounding adds to the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
-    return Noise(
+    return SensorNoise(
         float(mean),
         float(std),
         float(width * at_zero / np.sqrt(number)),
@@ -78,17 +78,17 @@ def at_rest(readings: np.ndarray) -> Noise:
     )
 
 
-def _is_hidden(readings: np.ndarray, quantum: float) -> bool:
+def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
     """Return whether more readings are exactly 0 than noise and rounding explain."""
     zero = readings == 0.0
-    if np.mean(zero) > SILENT and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
+    if np.mean(zero) > MIN_ZERO_SHARE and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return True
     size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
     # Rounding turns at most a share of 0.4 quantum / std of normal readings into 0.
-    return size > 0.0 and float(np.mean(zero)) > ROUNDED_TO_0 + quantum / size
+    return size > 0.0 and float(np.mean(zero)) > MIN_EXCESS_ZERO_SHARE + quantum / size
 
 
-def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
+def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
     """Return the noise's standard deviation, and the dead zone with its standard error.
 
     A normal value n is read as sign(n) max(|n| - D, 0). Dead zone D and standard deviation maximize the
@@ -96,7 +96,7 @@ def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
     """
     size = np.abs(readings[readings != 0.0])
     zeros, number = len(readings) - len(size), len(size)
-    if number < FEWEST_BEYOND or size.min() > GAP * size.mean():
+    if number < MIN_READINGS_BEYOND_DEAD_ZONE or size.min() > MAX_LEAST_TO_MEAN_RATIO * size.mean():
         return 0.0, None
 
     def cost(parameters):
@@ -120,17 +120,17 @@ def _beyond(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
     return float(std), (float(dead_zone), float(dead_zone * np.sqrt(variance)))
 
 
-def _drift(readings: np.ndarray) -> float:
+def _estimate_drift(readings: np.ndarray) -> float:
     """Return the linear drift from the first to the last reading, or 0 if the scatter is larger."""
     time = np.linspace(-0.5, 0.5, len(readings))
     drift = float(time @ (readings - readings.mean()) / (time @ time))
     return drift if abs(drift) > np.std(readings - drift * time) else 0.0
 
 
-def steps(readings: np.ndarray) -> float:
+def detect_quantum(readings: np.ndarray) -> float:
     """Return the quantum to which readings are rounded, or 0 if they are not."""
     values = np.unique(readings[np.isfinite(readings)])
-    if len(values) < 2 or len(values) > REPEATED * len(readings):
+    if len(values) < 2 or len(values) > MAX_DISTINCT_SHARE * len(readings):
         return 0.0
     scale = np.abs(values).max()
     # A dead zone shifts the multiples on either side of 0 apart.
@@ -145,7 +145,7 @@ def steps(readings: np.ndarray) -> float:
     return float(quantum) if np.all(np.abs(gaps / quantum - multiples) < 0.02) else 0.0
 
 
-def _binned(readings: np.ndarray, quantum: float) -> tuple[float, float]:
+def _fit_rounded_normal(readings: np.ndarray, quantum: float) -> tuple[float, float]:
     """Return the maximum likelihood mean and standard deviation of rounded normal readings."""
     values, counts = np.unique(np.round(readings / quantum), return_counts=True)
     middle, spread = np.average(values, weights=counts), readings.std() / quantum
@@ -166,16 +166,16 @@ def _binned(readings: np.ndarray, quantum: float) -> tuple[float, float]:
     return float(optimum.x[0] * quantum), float(np.exp(optimum.x[1]) * quantum)
 
 
-def autoregression(values: np.ndarray) -> tuple[float, ...]:
+def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
     """Return the coefficients (1, -a1, -a2, ...) of the filter that whitens the values."""
     number = len(values)
     size = 1 << int(np.ceil(np.log2(2 * number)))
     power = np.abs(np.fft.rfft(values, size)) ** 2
-    covariance = np.fft.irfft(power, size)[: HIGHEST + 1] / number
+    covariance = np.fft.irfft(power, size)[: MAX_AUTOREGRESSION_ORDER + 1] / number
     if covariance[0] <= 0.0:
         return (1.0,)
     best, chosen = 0.0, (1.0,)
-    for order in range(1, HIGHEST + 1):
+    for order in range(1, MAX_AUTOREGRESSION_ORDER + 1):
         coefficients = linalg.solve_toeplitz(covariance[:order], covariance[1 : order + 1])
         variance = 1.0 - coefficients @ covariance[1 : order + 1] / covariance[0]
         criterion = number * np.log(max(variance, 1e-12)) + order * np.log(number)
@@ -184,7 +184,7 @@ def autoregression(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in chosen)
 
 
-def _correlations(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
+def _autocorrelate(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
     """Return the autocorrelation of the noise at lags 1, 2, ... ."""
     if len(colour) == 1:
         return np.zeros(1)
@@ -196,9 +196,9 @@ def _correlations(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
     return correlation[1 : longest + 1] / correlation[0]
 
 
-def whitened_share(colour: tuple[float, ...]) -> float:
+def compute_whitened_share(colour: tuple[float, ...]) -> float:
     """Return the variance after the whitening filter over the variance before it."""
     if len(colour) == 1:
         return 1.0
-    rho = np.concatenate([[1.0], _correlations(colour)])[: len(colour)]
+    rho = np.concatenate([[1.0], _autocorrelate(colour)])[: len(colour)]
     return float(1.0 + np.asarray(colour[1:]) @ rho[1:])

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def factor(covariance: np.ndarray) -> np.ndarray:
+def factorise_covariance(covariance: np.ndarray) -> np.ndarray:
     """Return L with L L' the covariance, (..., n, n); negative eigenvalues of its correlation become 0."""
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.where(deviation > 0.0, deviation, 1.0)

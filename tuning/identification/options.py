@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.structs import Mechanism
-from tuning.caches.pieces import NOTHING_KEPT, Pieces
-from tuning.identification.law_choice import NAMES
+from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints
+from tuning.identification.law_choice import FITTABLE_LAW_NAMES
 from tuning.identification.rational import STRUCTURES
 
 
 @dataclass(frozen=True)
-class Options:
+class IdentificationOptions:
     """Options of an identification that the caller sets."""
 
     order: int | None = None  # of the motion simulator; None: the smallest order that explains the lines
@@ -28,24 +28,27 @@ class Options:
     clock: float = 2e-5  # s, least uncertainty of a delay: no log shows an error of the clock
     seed: int = 0
     scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
-    kept: Pieces = NOTHING_KEPT  # checkpoints of the bootstrap
+    kept: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap
 
 
-FEWEST_FITS = 20  # bootstrap fits that an estimate of the scatter needs
-FIRST = ("rig.contact_plane", "rig.position_sensor.delay")  # values that are used before the first fit
+MIN_BOOTSTRAP_FITS = 20  # bootstrap fits that an estimate of the scatter needs
+KEYS_FIXED_BEFORE_FIT = (
+    "rig.contact_plane",
+    "rig.position_sensor.delay",
+)  # values that are used before the first fit
 
 
-def check(options: Options, prior: Mechanism | None) -> None:
+def check_options(options: IdentificationOptions, prior: Mechanism | None) -> None:
     """Raise `InputError` if the options are invalid."""
-    for key in FIRST:
+    for key in KEYS_FIXED_BEFORE_FIT:
         if not isinstance(options.fixed.get(key, 0.0), (int, float)):
-            raise InputError(f"fix: {key}: found {shown(options.fixed[key])}, allowed a number")
+            raise InputError(f"fix: {key}: found {format_value(options.fixed[key])}, expected a number")
     if options.bayes and prior is None:
-        raise InputError("bayes: found no prior, allowed a mechanism with [uncertainty]")
-    if options.law is not None and options.law not in NAMES:
-        raise InputError(f"law: found {shown(options.law)}, allowed {', '.join(NAMES)}")
-    if 0 < options.bootstrap < FEWEST_FITS:
-        raise InputError(f"bootstrap: found {options.bootstrap}, allowed 0, or {FEWEST_FITS} or more")
+        raise InputError("bayes: found no prior, expected a mechanism with [uncertainty]")
+    if options.law is not None and options.law not in FITTABLE_LAW_NAMES:
+        raise InputError(f"law: found {format_value(options.law)}, expected {', '.join(FITTABLE_LAW_NAMES)}")
+    if 0 < options.bootstrap < MIN_BOOTSTRAP_FITS:
+        raise InputError(f"bootstrap: found {options.bootstrap}, expected 0, or {MIN_BOOTSTRAP_FITS} or more")
     orders = sorted({structure.order for structure in STRUCTURES})
     if options.order is not None and options.order not in orders:
-        raise InputError(f"order: found {options.order}, allowed {', '.join(map(str, orders))}")
+        raise InputError(f"order: found {options.order}, expected {', '.join(map(str, orders))}")

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.contact.laws import KEYS, contact_law
-from tuning.identification.contact import ContactFit
+from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
+from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_laws import Law
-from tuning.identification.normal_draws import factor
-from tuning.identification.rational import Model
+from tuning.identification.normal_draws import factorise_covariance
+from tuning.identification.rational import MotionModel
 
-SIMULATOR = "rig.simulator."
+SIMULATOR_PREFIX = "rig.simulator."
 
 
-def simulator_section(model: Model) -> dict[str, Any]:
+def make_simulator_section(model: MotionModel) -> dict[str, Any]:
     """Return the section `rig.simulator` of a mechanism file."""
     many, values = model.structure, np.exp(model.parameters[: model.structure.order])
     delay = {"delay": float(max(model.delay, 0.0))}
@@ -42,32 +42,35 @@ def simulator_section(model: Model) -> dict[str, Any]:
     }
 
 
-def simulator_draws(model: Model, covariance: np.ndarray, frequency: float, count: int, rng) -> tuple[
-    dict[str, np.ndarray], np.ndarray
-]:  # fmt: skip
+def draw_simulator_parameters(
+    model: MotionModel, covariance: np.ndarray, frequency: float, count: int, rng
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return draws by key, and the deviation of the lag at a frequency [Hz] in each draw [s].
 
     First- and second-order models have keys for all their parameters. For other models only the delay is
     uncertain: it takes the deviation of the lag at the contact frequency.
     """
-    deviations = rng.standard_normal((count, len(covariance))) @ factor(covariance).T
+    deviations = rng.standard_normal((count, len(covariance))) @ factorise_covariance(covariance).T
     s = np.array([2j * np.pi * frequency])
     slopes = -np.imag(model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
     lag = deviations @ slopes
     values = model.parameters + deviations
     name = model.structure.name
     if name == "first_order":
-        return {SIMULATOR + "time_constant": np.exp(values[:, 0]), SIMULATOR + "delay": values[:, 1]}, lag
+        return {
+            SIMULATOR_PREFIX + "time_constant": np.exp(values[:, 0]),
+            SIMULATOR_PREFIX + "delay": values[:, 1],
+        }, lag
     if name == "second_order":
         return {
-            SIMULATOR + "natural_frequency": np.exp(values[:, 0]) / (2.0 * np.pi),
-            SIMULATOR + "damping_ratio": np.exp(values[:, 1]),
-            SIMULATOR + "delay": values[:, 2],
+            SIMULATOR_PREFIX + "natural_frequency": np.exp(values[:, 0]) / (2.0 * np.pi),
+            SIMULATOR_PREFIX + "damping_ratio": np.exp(values[:, 1]),
+            SIMULATOR_PREFIX + "delay": values[:, 2],
         }, lag
-    return {SIMULATOR + "delay": model.delay + lag}, lag
+    return {SIMULATOR_PREFIX + "delay": model.delay + lag}, lag
 
 
-def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
+def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     """Return draws by key; the key of an entry of a list ends in its index."""
     draws = contact.draws()
     draws_by_name = dict(zip(contact.posterior.names, draws.T, strict=True))
@@ -76,7 +79,7 @@ def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
         result["rig.force_sensor.time_constant"] = draws_by_name["time_constant"]
     if contact.problem.plane is None:
         result["rig.contact_plane"] = draws_by_name["plane"]
-    law = contact_law(contact.law.name)
+    law = find_contact_law(contact.law.name)
     for i in contact.readings.entries:
         fitted = {
             name: draws_by_name[f"{name}.{i}"] for name in contact.law.names if f"{name}.{i}" in draws_by_name
@@ -89,18 +92,18 @@ def contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     return result
 
 
-def contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
+def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
     """Return the section `contact` of a mechanism file from values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
-    stiffness = _entries(values, "contact.stiffness.")
-    segmented = contact_law(law.name).segmented
+    stiffness = _collect_entries(values, "contact.stiffness.")
+    segmented = find_contact_law(law.name).segmented
     section["stiffness"] = stiffness if segmented else [value for (value,) in stiffness]
-    if damping := _entries(values, "contact.damping."):
+    if damping := _collect_entries(values, "contact.damping."):
         section["damping"] = [max(value, 0.0) for (value,) in damping]
-    return section | {key: values[f"contact.{key}"] for key in KEYS if f"contact.{key}" in values}
+    return section | {key: values[f"contact.{key}"] for key in CONTACT_KEYS if f"contact.{key}" in values}
 
 
-def _entries(values: dict[str, float], prefix: str) -> list[list[float]]:
+def _collect_entries(values: dict[str, float], prefix: str) -> list[list[float]]:
     """Return the values of a list's entries in order; a missing entry repeats the one before it."""
     entries: dict[int, list[float]] = {}
     for key in sorted(key for key in values if key.startswith(prefix)):

@@ -21,11 +21,11 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
-SHORTEST = 1e-6  # s, least time constant
+MIN_TIME_CONSTANT = 1e-6  # s, least time constant
 
 
 @dataclass(frozen=True)
-class Structure:
+class SimulatorStructure:
     """Numbers of sections of each kind in a model."""
 
     name: str
@@ -44,18 +44,18 @@ class Structure:
 
 
 STRUCTURES = (
-    Structure("ideal", 0, 0, 0),
-    Structure("first_order", 1, 0, 0),
-    Structure("second_order", 0, 1, 0),
-    Structure("second_order_zero", 0, 1, 1),
-    Structure("third_order", 1, 1, 0),
-    Structure("fourth_order", 0, 2, 0),
-    Structure("resonance", 0, 2, 2),
+    SimulatorStructure("ideal", 0, 0, 0),
+    SimulatorStructure("first_order", 1, 0, 0),
+    SimulatorStructure("second_order", 0, 1, 0),
+    SimulatorStructure("second_order_zero", 0, 1, 1),
+    SimulatorStructure("third_order", 1, 1, 0),
+    SimulatorStructure("fourth_order", 0, 2, 0),
+    SimulatorStructure("resonance", 0, 2, 2),
 )
 
 
 @dataclass(frozen=True)
-class Lines:
+class SpectralLines:
     """Spectra at the excited lines, and the conversion of the command to the drives' input."""
 
     frequency: np.ndarray  # Hz
@@ -70,8 +70,8 @@ class Lines:
     @cached_property
     def copies(self) -> tuple[np.ndarray, np.ndarray]:
         """Return s of every copy of each line, and the command there after the hold."""
-        frequencies = holds.frequencies(self.frequency, self.period)
-        return 2j * np.pi * frequencies, self.command * holds.response(
+        frequencies = holds.compute_copy_frequencies(self.frequency, self.period)
+        return 2j * np.pi * frequencies, self.command * holds.compute_hold_response(
             frequencies, self.period, self.hold, self.latency, self.shift
         )
 
@@ -80,10 +80,10 @@ class Lines:
 
 
 @dataclass(frozen=True)
-class Model:
+class MotionModel:
     """Structure with its parameters: [log T ..., log w, log zeta ..., c ..., delay]."""
 
-    structure: Structure
+    structure: SimulatorStructure
     parameters: np.ndarray
 
     @property
@@ -135,7 +135,7 @@ class Model:
         rows += [s**power / above for power in range(1, many.zeros + 1)]
         return np.array([*rows, -s])
 
-    def predict(self, lines: Lines) -> np.ndarray:
+    def predict(self, lines: SpectralLines) -> np.ndarray:
         """Return the spectrum of the output."""
         s, command = lines.copies
         return np.sum(self.response(s) * command, axis=0)
@@ -158,10 +158,10 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Fit:
+class SpectrumFit:
     """Model fitted to lines."""
 
-    model: Model
+    model: MotionModel
     covariance: np.ndarray  # of the parameters, from the curvature at the stated noise
     residual: np.ndarray  # complex, whitened: E|r|^2 = 1
 
@@ -179,19 +179,21 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
 
-def fit(structure: Structure, lines: Lines) -> Fit:
+def fit_structure(structure: SimulatorStructure, lines: SpectralLines) -> SpectrumFit:
     """Return the maximum likelihood fit, by Levenberg-Marquardt from the best linear start."""
-    candidates = sorted((_start(structure, lines, delay) for delay in _delays(lines)), key=lambda c: c[0])
+    candidates = sorted(
+        (_fit_linear_start(structure, lines, delay) for delay in _make_delay_grid(lines)), key=lambda c: c[0]
+    )
     # Neighbouring starts converge to the same minimum; the best start with a distant delay may not.
-    tried = [_refine(structure, candidates[0][1], lines)]
+    tried = [_refine_fit(structure, candidates[0][1], lines)]
     for _, start in candidates[1:]:
         if structure.order > 1 and abs(start[-1] - candidates[0][1][-1]) > 2.0 * lines.period:
-            tried.append(_refine(structure, start, lines))
+            tried.append(_refine_fit(structure, start, lines))
             break
     return min(tried, key=lambda candidate: candidate.chi2)
 
 
-def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
+def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: SpectralLines) -> SpectrumFit:
     """Return the fit that Levenberg-Marquardt reaches from a start."""
     s, command = lines.copies
     scale = np.sqrt(2.0) / lines.std
@@ -200,10 +202,10 @@ def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
         return np.concatenate([values.real, values.imag], axis=-1)
 
     def residual(parameters):
-        return split((Model(structure, parameters).predict(lines) - lines.output) * scale)
+        return split((MotionModel(structure, parameters).predict(lines) - lines.output) * scale)
 
     def jacobian(parameters):
-        model = Model(structure, parameters)
+        model = MotionModel(structure, parameters)
         slopes = np.sum(model.slopes(s) * model.response(s) * command, axis=1) * scale
         return split(slopes).T
 
@@ -215,17 +217,19 @@ def _refine(structure: Structure, start: np.ndarray, lines: Lines) -> Fit:
     covariance = np.linalg.pinv(curvature / np.outer(scales, scales), hermitian=True) / np.outer(
         scales, scales
     )
-    half, parameters = len(lines), _with_slow_poles(structure, result.x)
+    half, parameters = len(lines), _limit_fast_poles(structure, result.x)
     left = residual(parameters)
-    return Fit(Model(structure, parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0))
+    return SpectrumFit(
+        MotionModel(structure, parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0)
+    )
 
 
-def _with_slow_poles(structure: Structure, parameters: np.ndarray) -> np.ndarray:
+def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> np.ndarray:
     """Return the parameters with unresolvable poles, those beyond 1/SHORTEST, moved there."""
     first, order = structure.first, structure.order
-    times = np.maximum(parameters[:first], np.log(SHORTEST))
+    times = np.maximum(parameters[:first], np.log(MIN_TIME_CONSTANT))
     sections = []
-    fastest = -np.log(SHORTEST)
+    fastest = -np.log(MIN_TIME_CONSTANT)
     for frequency, ratio in parameters[first:order].reshape(-1, 2):
         if ratio > 0.0:  # two real poles, here by their logarithms
             slower = frequency - ratio - np.log1p(np.sqrt(1.0 - np.exp(-2.0 * ratio)))
@@ -237,7 +241,7 @@ def _with_slow_poles(structure: Structure, parameters: np.ndarray) -> np.ndarray
     return np.array([*times, *sections, *parameters[order:]])
 
 
-def _delays(lines: Lines) -> np.ndarray:
+def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
     """Return a grid of delays [s] from 0 to the largest one that the phase of the lowest lines allows."""
     s, command = lines.copies
     middle = len(s) // 2
@@ -250,7 +254,9 @@ def _delays(lines: Lines) -> np.ndarray:
     return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
 
 
-def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.ndarray]:
+def _fit_linear_start(
+    structure: SimulatorStructure, lines: SpectralLines, delay: float
+) -> tuple[float, np.ndarray]:
     """Return chi-squared and parameters of the linear fit with a given delay, without the copies."""
     s, command = lines.copies
     s, command = s[len(s) // 2], command[len(s) // 2]
@@ -275,16 +281,18 @@ def _start(structure: Structure, lines: Lines, delay: float) -> tuple[float, np.
             below = 1.0 + sum(solved[zeros + i - 1] * p**i for i in range(1, order + 1))
         above = solved[:zeros] * unit ** np.arange(1, zeros + 1)
         polynomial_below = np.array([1.0, *solved[zeros:]])
-        parameters = np.array([*_sections(structure, polynomial_below, unit), *above, delay])
-    misfit = np.abs(Model(structure, parameters).predict(lines) - lines.output) / lines.std
+        parameters = np.array([*_convert_sections(structure, polynomial_below, unit), *above, delay])
+    misfit = np.abs(MotionModel(structure, parameters).predict(lines) - lines.output) / lines.std
     return float(np.sum(misfit**2)), parameters
 
 
-def _sections(structure: Structure, denominator: np.ndarray, unit: float) -> list[float]:
+def _convert_sections(structure: SimulatorStructure, denominator: np.ndarray, unit: float) -> list[float]:
     """Return the logarithms of the sections' parameters, from a denominator in rising powers of s `unit`."""
     roots = polynomial.polyroots(denominator)
     poles = np.where(roots.real > 0.0, -roots.conj(), roots) / unit
-    poles = np.where(np.abs(poles) > 1.0 / SHORTEST, poles / np.abs(poles) / SHORTEST, poles)
+    poles = np.where(
+        np.abs(poles) > 1.0 / MIN_TIME_CONSTANT, poles / np.abs(poles) / MIN_TIME_CONSTANT, poles
+    )
     real = sorted((-pole.real for pole in poles if abs(pole.imag) <= 1e-9 * abs(pole)), reverse=True)
     complex_ones = sorted((pole for pole in poles if pole.imag > 1e-9 * abs(pole)), key=abs)
     values = []

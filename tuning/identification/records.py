@@ -11,17 +11,17 @@ from typing import Literal
 
 import numpy as np
 
-Kind = Literal["free", "press", "tap", "contact", "rest"]
-Hold = Literal["zoh", "linear"]
-Row = Literal["tick", "sent", "after"]
-UNNAMED = "identified"  # name of an identified mechanism without a prior
+RunKind = Literal["free", "press", "tap", "contact", "rest"]
+CommandHold = Literal["zoh", "linear"]
+RowConvention = Literal["tick", "sent", "after"]
+DEFAULT_MECHANISM_NAME = "identified"  # name of an identified mechanism without a prior
 # Ticks by which the readings of a row lag its command: a "sent" row holds the command of the next tick, an
 # "after" row the readings of the next tick.
 ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 
 
 @dataclass(frozen=True)
-class Clock:
+class StampClock:
     """Clock of a run's time stamps; a log without stamps has a perfect clock."""
 
     period: float  # s, control period measured by the stamps
@@ -31,10 +31,10 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Run:
+class LoggedRun:
     """Segment of a log; every array has one entry per row, lost rows included."""
 
-    kind: Kind  # kind of experiment
+    kind: RunKind  # kind of experiment
     source: str  # name of the log file
     tick: np.ndarray  # int64, control period in which the row was written
     time_stamp_error: float  # s, standard deviation of the stamps about the ticks
@@ -51,14 +51,15 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Timing:
+class CampaignTiming:
     """Timing of commands and readings; it is specified by the user, never estimated."""
 
     control_period: float  # s
-    command_hold: Hold  # motion of the drives' input between ticks
+    command_hold: CommandHold  # motion of the drives' input between ticks
     command_latency: int  # periods until a command takes effect
-    row: Row  # convention; "sent": with the next tick's command, "after": with the next tick's readings
-    clock: Clock | None = None  # clock of the run with the largest jitter
+    # convention; "sent": with the next tick's command, "after": with the next tick's readings
+    row: RowConvention
+    clock: StampClock | None = None  # clock of the run with the largest jitter
     computing_delay: int = 0  # periods from a reading to the command that depends on it
     two_clocks: bool = False  # whether the forces were logged with a separate clock
 
@@ -75,8 +76,8 @@ class Timing:
 class Campaign:
     """All runs of a rig."""
 
-    runs: tuple[Run, ...]
-    timing: Timing
+    runs: tuple[LoggedRun, ...]
+    timing: CampaignTiming
     equivalent_mass: float  # kg, equivalent mass of the numerical model
     sources: dict[str, str] = field(default_factory=dict)  # SHA-256 of each file by its name, in hex
     notes: tuple[str, ...] = ()  # remarks about the logs, from reading them

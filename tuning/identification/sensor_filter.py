@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
+def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
     """Return the pole of a sampled first-order lag and the weights of the force in a period.
 
     The weights are exact if the force is a parabola.
@@ -32,7 +32,7 @@ def lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
     return pole, (float(now), float(half), float(last))
 
 
-def onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the force just after an onset and at the end of the period.
 
     The force is 0 before the onset and linear in time after it.
@@ -46,7 +46,9 @@ def onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return total - end, end
 
 
-def onsets(last: np.ndarray, half: np.ndarray, now: np.ndarray, plane: np.ndarray) -> np.ndarray:
+def compute_onset_shares(
+    last: np.ndarray, half: np.ndarray, now: np.ndarray, plane: np.ndarray
+) -> np.ndarray:
     """Return the share of the period after the position crosses the surface; 0 without a crossing.
 
     `last`, `half` and `now` are positions [m] at the beginning, in the middle and at the end of the period,

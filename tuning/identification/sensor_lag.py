@@ -16,24 +16,32 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from tuning.identification.contact_problem import LONGEST, Problem
-from tuning.identification.contact_profile import DRAWS, Posterior
-from tuning.identification.lag_profile import around
-from tuning.identification.law_choice import Fitted, quick
+from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
+from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
+from tuning.identification.lag_profile import compute_posterior_near
+from tuning.identification.law_choice import CoarseFit, search_coarsely
 
-LARGEST = 0.005  # s, longest time constant
-TRIED = 0.0005, 0.0015, 0.004  # s, time constants of a first search
-GAIN = 6.0  # of the Bayesian information criterion, required for a lag
-NODES, WIDEST = 9, 3.5  # lags of the grid, and its half width in standard deviations of the lag
-DELAYS, REACH = 21, 5.0  # delays at each lag, and half width in standard deviations of the delay
-NARROWEST = 5e-5  # s, lower bound of that standard deviation
-FEWER_NODES, FEWER_DELAYS = 7, 15  # size of the grid if a lag is not required
-LIKELY = 0.8  # prior probability of a lag: nearly every amplifier has a filter
-RULED_OUT = 8.0  # drop of the log likelihood below its maximum, beyond which a lag is excluded
+MAX_TIME_CONSTANT = 0.005  # s, longest time constant
+TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # s, time constants of a first search
+MIN_CRITERION_GAIN = 6.0  # of the Bayesian information criterion, required for a lag
+LAG_GRID_SIZE, LAG_HALF_WIDTH_SIGMAS = (
+    9,
+    3.5,
+)  # lags of the grid, and its half width in standard deviations of the lag
+DELAY_GRID_SIZE, DELAY_HALF_WIDTH_SIGMAS = (
+    21,
+    5.0,
+)  # delays at each lag, and half width in standard deviations of the delay
+MIN_DELAY_STD = 5e-5  # s, lower bound of that standard deviation
+SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # size of the grid if a lag is not required
+PRIOR_LAG_PROBABILITY = 0.8  # prior probability of a lag: nearly every amplifier has a filter
+EXCLUSION_LIKELIHOOD_DROP = (
+    8.0  # drop of the log likelihood below its maximum, beyond which a lag is excluded
+)
 
 
 @dataclass(frozen=True)
-class Lag:
+class SensorLag:
     """Time constant of the force sensor, with the posterior of all parameters."""
 
     value: float  # s, at the greatest posterior density; 0 if the lag remains part of the delay
@@ -41,100 +49,105 @@ class Lag:
     evidence: float  # log evidence of both models together, as `Posterior.evidence`
 
 
-def sensor_lag(problem: Problem, posterior: Posterior, seed: int = 0) -> Lag | None:
+def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> SensorLag | None:
     """Estimate the time constant if the readings require a lag; return None if they exclude one."""
     delay, plane, inner = posterior.best
-    fits: dict[float, Fitted] = {}
+    fits: dict[float, CoarseFit] = {}
 
-    def fit(value: float) -> Fitted:
+    def fit(value: float) -> CoarseFit:
         if value not in fits:
-            start = (max(delay - value, problem.shortest), plane, inner.misfit)
-            fits[value] = quick(_lagging(problem, value), start, 2)
+            start = (max(delay - value, problem.min_delay), plane, inner.misfit)
+            fits[value] = search_coarsely(_add_lag(problem, value), start, 2)
         return fits[value]
 
-    needed = GAIN + np.log(len(problem.kept))
-    if inner.misfit - min(fit(value)[2] for value in TRIED) < 0.5 * needed:
-        return _averaged(problem, posterior, fit, seed)
+    needed = MIN_CRITERION_GAIN + np.log(len(problem.kept))
+    if inner.misfit - min(fit(value)[2] for value in TRIAL_TIME_CONSTANTS) < 0.5 * needed:
+        return _average_over_lag(problem, posterior, fit, seed)
     period = problem.motion.period
     optimum: Any = optimize.minimize_scalar(
-        lambda value: fit(value)[2], bounds=(0.1 * period, LARGEST), method="bounded",
+        lambda value: fit(value)[2], bounds=(0.1 * period, MAX_TIME_CONSTANT), method="bounded",
         options={"xatol": 0.1 * period},
     )  # fmt: skip
     if inner.misfit - float(optimum.fun) < needed:
-        return _averaged(problem, posterior, fit, seed)
+        return _average_over_lag(problem, posterior, fit, seed)
     value, step = float(optimum.x), 0.1 * float(optimum.x)
     for _ in range(2):
         rise = np.mean([fit(value + side * step)[2] for side in (-1.0, 1.0)]) - optimum.fun
         std = step / np.sqrt(max(rise, 0.1))
         step = min(2.0 * std, 0.5 * value)
-    nodes = value + std * np.linspace(-WIDEST, WIDEST, NODES)
+    nodes = value + std * np.linspace(-LAG_HALF_WIDTH_SIGMAS, LAG_HALF_WIDTH_SIGMAS, LAG_GRID_SIZE)
     nodes = nodes[nodes > 0.1 * period]
-    posteriors = _each(problem, posterior, fit, nodes, DELAYS, seed)
-    draws, picked = _joined(nodes, posteriors, seed)
+    posteriors = _compute_posteriors(problem, posterior, fit, nodes, DELAY_GRID_SIZE, seed)
+    draws, picked = _draw_between_lags(nodes, posteriors, seed)
     best = int(np.argmax([node.evidence for node in posteriors]))
     names = [*posteriors[best].names, "time_constant"]
     joined = replace(posteriors[best], names=names, draws=np.column_stack([draws, picked]))
-    return Lag(float(nodes[best]), joined, _weighed(posterior, posteriors, nodes[1] - nodes[0])[1])
+    return SensorLag(float(nodes[best]), joined, _weigh_lag(posterior, posteriors, nodes[1] - nodes[0])[1])
 
 
-def _averaged(
-    problem: Problem, posterior: Posterior, fit: Callable[[float], Fitted], seed: int
-) -> Lag | None:
+def _average_over_lag(
+    problem: ContactProblem, posterior: Posterior, fit: Callable[[float], CoarseFit], seed: int
+) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
-    The lag has a uniform prior up to `LARGEST` and is added to the delay.
+    The lag has a uniform prior up to `MAX_TIME_CONSTANT` and is added to the delay.
     """
-    heights = np.array([posterior.best[2].misfit, *(fit(value)[2] for value in TRIED)]) / -2.0
-    inside = np.flatnonzero(heights[1:] > heights.max() - RULED_OUT)
+    heights = np.array([posterior.best[2].misfit, *(fit(value)[2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
+    inside = np.flatnonzero(heights[1:] > heights.max() - EXCLUSION_LIKELIHOOD_DROP)
     if not len(inside):
         return None
-    highest = (*TRIED, LARGEST)[inside[-1] + 1]
-    step = highest / FEWER_NODES
-    nodes = step * (np.arange(FEWER_NODES) + 0.5)
-    posteriors = _each(problem, posterior, fit, nodes, FEWER_DELAYS, seed)
-    share, evidence = _weighed(posterior, posteriors, step)
-    draws, picked = _joined(nodes, posteriors, seed)
+    highest = (*TRIAL_TIME_CONSTANTS, MAX_TIME_CONSTANT)[inside[-1] + 1]
+    step = highest / SMALL_LAG_GRID_SIZE
+    nodes = step * (np.arange(SMALL_LAG_GRID_SIZE) + 0.5)
+    posteriors = _compute_posteriors(problem, posterior, fit, nodes, SMALL_DELAY_GRID_SIZE, seed)
+    share, evidence = _weigh_lag(posterior, posteriors, step)
+    draws, picked = _draw_between_lags(nodes, posteriors, seed)
     draws[:, 0] += picked
-    count = round(share * DRAWS)
+    count = round(share * POSTERIOR_DRAWS)
     mixed = np.random.default_rng([seed, 4]).permutation(
         np.concatenate([draws[:count], posterior.draws[count:]])
     )
-    return Lag(0.0, replace(posterior, draws=mixed), evidence)
+    return SensorLag(0.0, replace(posterior, draws=mixed), evidence)
 
 
-def _weighed(posterior: Posterior, posteriors: list[Posterior], step: float) -> tuple[float, float]:
+def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -> tuple[float, float]:
     """Return the posterior probability of a lag and the evidence of both models; `step` between lags [s]."""
     integral: Any = special.logsumexp([node.evidence for node in posteriors])
-    with_lag = float(integral) + np.log(LIKELY * step / LARGEST)
-    without = posterior.evidence + np.log(1.0 - LIKELY)
+    with_lag = float(integral) + np.log(PRIOR_LAG_PROBABILITY * step / MAX_TIME_CONSTANT)
+    without = posterior.evidence + np.log(1.0 - PRIOR_LAG_PROBABILITY)
     return float(special.expit(with_lag - without)), float(np.logaddexp(with_lag, without))
 
 
-def _each(
-    problem: Problem,
+def _compute_posteriors(
+    problem: ContactProblem,
     posterior: Posterior,
-    fit: Callable[[float], Fitted],
+    fit: Callable[[float], CoarseFit],
     nodes: np.ndarray,
     count: int,
     seed: int,
 ) -> list[Posterior]:
     """Return the posterior at each lag, over `count` delays."""
-    return [with_lag(_lagging(problem, lag), fit(lag), posterior, seed, count) for lag in nodes]
+    return [
+        compute_posterior_at_lag(_add_lag(problem, lag), fit(lag), posterior, seed, count) for lag in nodes
+    ]
 
 
-def with_lag(
-    problem: Problem, best: Fitted, like: Posterior, seed: int, count: int = FEWER_DELAYS
+def compute_posterior_at_lag(
+    problem: ContactProblem, best: CoarseFit, like: Posterior, seed: int, count: int = SMALL_DELAY_GRID_SIZE
 ) -> Posterior:
     """Return the posterior at the problem's lag about the best fit, over `count` delays.
 
-    The half width of the grid is `REACH` standard deviations of the delay in the posterior `like`.
+    The half width of the grid is `DELAY_HALF_WIDTH_SIGMAS` standard deviations of the delay in the posterior
+    `like`.
     """
-    reach = REACH * max(float(like.draws[:, 0].std()), NARROWEST)
-    low, high = np.clip([best[0] - reach, best[0] + reach], problem.shortest, LONGEST)
-    return around(problem, np.linspace(low, high, count), best[1], seed)
+    reach = DELAY_HALF_WIDTH_SIGMAS * max(float(like.draws[:, 0].std()), MIN_DELAY_STD)
+    low, high = np.clip([best[0] - reach, best[0] + reach], problem.min_delay, MAX_FORCE_DELAY)
+    return compute_posterior_near(problem, np.linspace(low, high, count), best[1], seed)
 
 
-def _joined(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _draw_between_lags(
+    nodes: np.ndarray, posteriors: list[Posterior], seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return draws over evenly spaced lags, and the lag [s] of each draw.
 
     Each lag contributes draws by its weight; they are interpolated between the lags.
@@ -142,18 +155,20 @@ def _joined(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -> tuple[
     evidence = np.array([node.evidence for node in posteriors])
     weights = np.exp(evidence - evidence.max())
     rng = np.random.default_rng([seed, 2])
-    places = (np.arange(DRAWS) + rng.uniform(size=DRAWS)) / DRAWS * weights.sum()
+    places = (
+        (np.arange(POSTERIOR_DRAWS) + rng.uniform(size=POSTERIOR_DRAWS)) / POSTERIOR_DRAWS * weights.sum()
+    )
     picked = np.minimum(np.searchsorted(np.cumsum(weights), places), len(nodes) - 1)
     step, means = nodes[1] - nodes[0], np.array([node_posterior.mean for node_posterior in posteriors])
     slopes = np.gradient(means, step, axis=0)
-    shift = rng.uniform(-0.5, 0.5, DRAWS) * step
+    shift = rng.uniform(-0.5, 0.5, POSTERIOR_DRAWS) * step
     draws = (
         np.array([posteriors[node].draws[i] for i, node in enumerate(picked)])
         + shift[:, None] * slopes[picked]
     )
-    order = rng.permutation(DRAWS)
+    order = rng.permutation(POSTERIOR_DRAWS)
     return draws[order], (nodes[picked] + shift)[order]
 
 
-def _lagging(problem: Problem, value: float) -> Problem:
-    return Problem(problem.motion, problem.readings, problem.law, problem.plane, value)
+def _add_lag(problem: ContactProblem, value: float) -> ContactProblem:
+    return ContactProblem(problem.motion, problem.readings, problem.law, problem.plane, value)

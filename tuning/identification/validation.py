@@ -14,27 +14,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special, stats
 
-from tuning.identification.contact import ContactFit
-from tuning.identification.contact_problem import LONGEST
+from tuning.identification.clock_drift import estimate_residual_delays, fit_weighted_slope
+from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_problem import MAX_FORCE_DELAY
 from tuning.identification.free_motion import FreeMotion
-from tuning.identification.law_choice import misfits
-from tuning.identification.records import Run
-from tuning.identification.two_clocks import differences, slope
+from tuning.identification.law_choice import compute_contact_misfits
+from tuning.identification.records import LoggedRun
 
-OTHER_HOLD = 2.0  # gain of the information criterion that shows a wrong hold
-RARE = 1e-3  # p-value below which a defect is present
-HARMONICS = 4.0  # multiple of the contact frequency, up to which the motion affects a contact
-CERTAIN_DRAWS = 40  # posterior draws that must agree on whether a row is in contact
-AT_THE_END = 0.93  # share of the longest force delay in the search
-FEW_TOUCHES = 5  # contacts that a check of small readings needs
-MOSTLY = 0.8  # share of readings other than 0, above which there is no dead zone
-CUT = 0.01  # p-value below which a dead zone without offset is present
-SEEN = 3.0  # standard deviations of the noise; smaller readings exclude such a dead zone
-NEIGHBOURS = 5  # lines over which the motion's misfit is averaged
+MIN_HOLD_CRITERION_GAIN = 2.0  # gain of the information criterion that shows a wrong hold
+DEFECT_P_VALUE = 1e-3  # p-value below which a defect is present
+MAX_FREQUENCY_RATIO = 4.0  # multiple of the contact frequency, up to which the motion affects a contact
+CONTACT_STATE_DRAWS = 40  # posterior draws that must agree on whether a row is in contact
+MAX_DELAY_SHARE = 0.93  # share of the longest force delay in the search
+MIN_CONTACTS_FOR_DEAD_ZONE = 5  # contacts that a check of small readings needs
+MAX_NONZERO_SHARE = 0.8  # share of readings other than 0, above which there is no dead zone
+CUTTING_DEAD_ZONE_P_VALUE = 0.01  # p-value below which a dead zone without offset is present
+MIN_SMALL_READING_SIGMAS = 3.0  # standard deviations of the noise; smaller readings exclude such a dead zone
+MISFIT_SMOOTHING_LINES = 5  # lines over which the motion's misfit is averaged
 
 
 @dataclass(frozen=True)
-class Line:
+class CheckResult:
     """Result of one check."""
 
     name: str
@@ -57,38 +57,42 @@ class Line:
         return effect if self.there and self.counts else 0.0
 
 
-def of_motion(motion: FreeMotion, frequency: float) -> list[Line]:
+def check_motion_model(motion: FreeMotion, frequency: float) -> list[CheckResult]:
     """Check the model of the motion simulator at a contact frequency [Hz]."""
-    lines = [_misfit(motion, frequency), _gain(motion), _hold(motion, frequency)]
-    return [*lines, *_distortion(motion)]
+    lines = [
+        _check_motion_misfit(motion, frequency),
+        _check_position_gain(motion),
+        _check_command_hold(motion, frequency),
+    ]
+    return [*lines, *_check_distortion(motion)]
 
 
-def _misfit(motion: FreeMotion, frequency: float) -> Line:
+def _check_motion_misfit(motion: FreeMotion, frequency: float) -> CheckResult:
     error, noise = motion.misfit()
     order = np.argsort(motion.lines.frequency)
     at, error, noise = motion.lines.frequency[order], error[order], noise[order]
-    width = min(NEIGHBOURS, len(at))
+    width = min(MISFIT_SMOOTHING_LINES, len(at))
     kernel = np.ones(width) / width
     smooth = np.abs(np.convolve(error, kernel, "valid"))
     chance = np.sqrt(np.convolve(noise**2, kernel, "valid") / width)
     beyond = np.sqrt(np.maximum(smooth**2 - chance**2, 0.0))
     middle = np.convolve(at, kernel, "valid")
-    near = middle <= max(HARMONICS * frequency, middle[0])
+    near = middle <= max(MAX_FREQUENCY_RATIO * frequency, middle[0])
     worst = int(np.argmax(beyond * near))
     freedom = max(motion.fit.freedom, 1)
     probability = stats.chi2.sf(motion.left * freedom, freedom)
-    return Line(
+    return CheckResult(
         "motion model",
         f"leaves {motion.left:.3g} times the noise's power, {beyond[worst]:.2g} of the motion near contacts",
-        bool(probability < RARE),
+        bool(probability < DEFECT_P_VALUE),
         float(np.pi / 2.0 * beyond[worst]),
         f"{middle[worst]:.3g} Hz",
     )
 
 
-def _gain(motion: FreeMotion) -> Line:
+def _check_position_gain(motion: FreeMotion) -> CheckResult:
     gain, std = motion.gain
-    return Line(
+    return CheckResult(
         "scale of the measured position",
         f"{gain:.5f} +- {std:.2g} of the desired one",
         bool(abs(gain - 1.0) > max(4.0 * std, 0.005)),
@@ -96,22 +100,22 @@ def _gain(motion: FreeMotion) -> Line:
     )
 
 
-def _hold(motion: FreeMotion, frequency: float) -> Line:
+def _check_command_hold(motion: FreeMotion, frequency: float) -> CheckResult:
     other_hold = "linear" if motion.lines.hold == "zoh" else "zoh"
     half = 0.5 * motion.lines.period
-    return Line(
+    return CheckResult(
         "command hold",
-        f"the information criterion is {abs(motion.other_hold):.3g} "
-        f"{'less' if motion.other_hold > 0 else 'more'} with {other_hold}",
-        motion.other_hold > OTHER_HOLD,
+        f"the information criterion is {abs(motion.other_hold_gain):.3g} "
+        f"{'less' if motion.other_hold_gain > 0 else 'more'} with {other_hold}",
+        motion.other_hold_gain > MIN_HOLD_CRITERION_GAIN,
         float(np.pi**2 * frequency * half),
     )
 
 
-def sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
+def check_delay_sign(motion: FreeMotion, frequency: float) -> CheckResult:
     """Check that a fitted delay of the motion is not negative."""
     delay, std = motion.model.delay, float(np.sqrt(motion.covariance[-1, -1]))
-    return Line(
+    return CheckResult(
         "sign of the motion's delay",
         f"{1e3 * delay:.4f} +- {1e3 * std:.2g} ms: negative where latency, hold or row are told wrongly",
         delay < -4.0 * std - 1e-6,
@@ -119,14 +123,14 @@ def sign_of_delay(motion: FreeMotion, frequency: float) -> Line:
     )
 
 
-def _distortion(motion: FreeMotion) -> list[Line]:
+def _check_distortion(motion: FreeMotion) -> list[CheckResult]:
     lines = []
     for parity, name in ((0, "odd"), (1, "even")):
         levels = [level for run in motion.spectra if (level := (run.odd, run.even)[parity]) is not None]
         if levels:
             excess = max(run.excess[parity] for run in motion.spectra)
             lines.append(
-                Line(
+                CheckResult(
                     f"{name} nonlinearity of the motion",
                     f"{-20 * np.log10(max(levels)):.0f} dB below the motion, {excess:.2g} times the noise",
                     excess > 2.0,
@@ -136,57 +140,63 @@ def _distortion(motion: FreeMotion) -> list[Line]:
     return lines
 
 
-def of_contact(
-    contact: ContactFit, runs: list[Run], mass: float, frequency: float, lag: float, held: np.ndarray
-) -> list[Line]:
+def check_contact_model(
+    contact: ContactFit, runs: list[LoggedRun], mass: float, frequency: float, lag: float, held: np.ndarray
+) -> list[CheckResult]:
     """Check the contact model on the contacts flagged in `held`."""
-    lines = [_left(contact, runs, held), *_at_the_end(contact), *_dead_zone(contact, runs)]
+    lines = [
+        _check_law_residual(contact, runs, held),
+        *_check_delay_in_search_range(contact),
+        *_check_cutting_dead_zone(contact, runs),
+    ]
     if contact.drift is None:
-        errors, stds = restitution_errors(contact, runs, mass)
+        errors, stds = estimate_restitution_errors(contact, runs, mass)
         usable = held & np.isfinite(errors)
         if usable.any():
-            lines.append(_restitution(contact, runs, errors, stds, usable))
-    return [*lines, *_trends(contact, len(runs), frequency, lag)]
+            lines.append(_check_restitution(contact, runs, errors, stds, usable))
+    return [*lines, *_check_trends(contact, len(runs), frequency, lag)]
 
 
-def of_touches_left_out(contact: ContactFit, runs: list[Run], mass: float, held: np.ndarray) -> list[Line]:
+def check_held_out_contacts(
+    contact: ContactFit, runs: list[LoggedRun], mass: float, held: np.ndarray
+) -> list[CheckResult]:
     """Check the fit on the contacts flagged in `held`, which it did not use.
 
     The verdict excludes these lines, because the written file uses all contacts.
     """
-    left = _left(contact, runs, held)
+    left = _check_law_residual(contact, runs, held)
     lines = [replace(left, name="contact law, touches not fitted", counts=False)]
-    errors, stds = restitution_errors(contact, runs, mass)
+    errors, stds = estimate_restitution_errors(contact, runs, mass)
     usable = held & np.isfinite(errors)
     if contact.drift is None and usable.any():
-        line = _restitution(contact, runs, errors, stds, usable)
+        line = _check_restitution(contact, runs, errors, stds, usable)
         lines.append(replace(line, name="restitution of touches not fitted", counts=False))
     return lines
 
 
-def _left(contact: ContactFit, runs: list[Run], chosen: np.ndarray) -> Line:
+def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray) -> CheckResult:
     delay, plane, inner = contact.posterior.best
     readings = contact.readings
-    readings = replace(readings, counts=readings.counts & certain_rows(contact))
-    misfit = misfits(contact.problem, readings, delay, plane, inner.coefficients)[chosen]
+    readings = replace(readings, counts=readings.counts & flag_certain_rows(contact))
+    misfit = compute_contact_misfits(contact.problem, readings, delay, plane, inner.coefficients)[chosen]
     count = np.maximum(readings.counts.sum(axis=0)[chosen], 1)
     ratio = float(misfit.sum() / count.sum())
     # The effect on e is at most the rms error of the force over its rms.
     force = np.where(readings.counts, readings.force, 0.0)[:, chosen]
     beyond = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
-    return Line(
+    return CheckResult(
         "contact law",
         f"leaves {ratio:.3g} times the noise's power",
         bool(
             special.ndtr(-(ratio - 1.0) / np.hypot(np.sqrt(2.0 / count.sum()), 2.0 * contact.noise_error))
-            < RARE
+            < DEFECT_P_VALUE
         ),
         float(np.sqrt(beyond)),
-        _place(contact, runs, chosen, misfit / count),
+        _locate_worst(contact, runs, chosen, misfit / count),
     )
 
 
-def certain_rows(contact: ContactFit) -> np.ndarray:
+def flag_certain_rows(contact: ContactFit) -> np.ndarray:
     """Return the rows whose contact state is the same for all delays and surfaces within their uncertainty.
 
     The force of damped contact jumps at the onset; a row on its other side carries no information on the law.
@@ -194,18 +204,18 @@ def certain_rows(contact: ContactFit) -> np.ndarray:
     count = len(contact.problem.names)
     flags = [
         contact.problem.touching(draw[0], draw[1], draw[2 : 2 + count])
-        for draw in contact.posterior.draws[:CERTAIN_DRAWS]
+        for draw in contact.posterior.draws[:CONTACT_STATE_DRAWS]
     ]
     return np.all(flags, axis=0) | ~np.any(flags, axis=0)
 
 
-def sign_of_force(contact: ContactFit) -> Line:
+def check_stiffness_sign(contact: ContactFit) -> CheckResult:
     """Check that no stiffness is negative."""
     names = contact.posterior.names
     values = [
         contact.posterior.mean[i] for i, name in enumerate(names) if name.startswith(("stiffness", "slope"))
     ]
-    return Line(
+    return CheckResult(
         "sign of the force",
         f"least stiffness {min(values):.4g}: negative where the force's sign is told wrongly",
         min(values) <= 0.0,
@@ -213,16 +223,16 @@ def sign_of_force(contact: ContactFit) -> Line:
     )
 
 
-def _at_the_end(contact: ContactFit) -> list[Line]:
+def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
     """Return a failed check if the delay is at the upper end of the search."""
     delay = contact.posterior.mean[0]
-    if delay < AT_THE_END * LONGEST:
+    if delay < MAX_DELAY_SHARE * MAX_FORCE_DELAY:
         return []
     finding = f"{1e3 * delay:.4g} ms, the longest that was looked for"
-    return [Line("force delay", finding, True, 1.0)]
+    return [CheckResult("force delay", finding, True, 1.0)]
 
 
-def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
+def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
     """Check that the readings of contacts that are 0 out of contact begin and end near 0.
 
     If no reading is small, a dead zone suppresses small forces and passes the others unchanged. The dead zone
@@ -232,23 +242,25 @@ def _dead_zone(contact: ContactFit, runs: list[Run]) -> list[Line]:
     for lane, run in enumerate(runs):
         force = np.abs(contact.readings.force[: len(run.tick), lane])
         (felt,) = np.nonzero(force)
-        if run.kind == "contact" and len(felt) > 1 and len(felt) < MOSTLY * len(force):
+        if run.kind == "contact" and len(felt) > 1 and len(felt) < MAX_NONZERO_SHARE * len(force):
             smallest.append(force[felt].min())
             steps.append(abs(force[felt[-1]] - force[felt[-2]]))
             peaks.append(force.max())
-    if len(smallest) < FEW_TOUCHES:
+    if len(smallest) < MIN_CONTACTS_FOR_DEAD_ZONE:
         return []
     least, std = min(smallest), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
     # The last reading of a smooth release is uniform between 0 and the last step.
     probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
-    if least <= max(SEEN * std, 2.5 * quantum) or probability > CUT:
+    if least <= max(MIN_SMALL_READING_SIGMAS * std, 2.5 * quantum) or probability > CUTTING_DEAD_ZONE_P_VALUE:
         return []
     finding = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
-    return [Line("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
+    return [CheckResult("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
 
 
-def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tuple[np.ndarray, np.ndarray]:
+def estimate_restitution_errors(
+    contact: ContactFit, runs: list[LoggedRun], mass: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the change of e by the unexplained force in each contact, and its standard deviation by noise.
 
     Both are NaN if the numerical model was not a free body, did not rebound, or the log is incomplete.
@@ -280,28 +292,28 @@ def restitution_errors(contact: ContactFit, runs: list[Run], mass: float) -> tup
     return errors, stds
 
 
-def _restitution(
-    contact: ContactFit, runs: list[Run], errors: np.ndarray, stds: np.ndarray, usable: np.ndarray
-) -> Line:
+def _check_restitution(
+    contact: ContactFit, runs: list[LoggedRun], errors: np.ndarray, stds: np.ndarray, usable: np.ndarray
+) -> CheckResult:
     z, errors = errors[usable] / stds[usable], errors[usable]
     mean = float(errors.mean())
-    return Line(
+    return CheckResult(
         "restitution of touches",
         f"off by {mean:+.2g} on the mean, rms z {np.sqrt(np.mean(z**2)):.2f}",
-        bool(stats.chi2.sf(float(np.sum(z**2)), len(z)) < RARE),
+        bool(stats.chi2.sf(float(np.sum(z**2)), len(z)) < DEFECT_P_VALUE),
         float(np.sqrt(np.mean(errors**2))),
-        _place(contact, runs, usable, np.abs(z)),
+        _locate_worst(contact, runs, usable, np.abs(z)),
     )
 
 
-def _place(contact: ContactFit, runs: list[Run], chosen: np.ndarray, values: np.ndarray) -> str:
+def _locate_worst(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray, values: np.ndarray) -> str:
     """Return file and time of the run with the largest of the values, which are those of the chosen runs."""
     run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
     first = run.tick[int(np.argmax(run.valid))]
     return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"
 
 
-def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[Line]:
+def _check_trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[CheckResult]:
     """Check that neither the scale of the force nor its delay changes from contact to contact."""
     delay, plane, inner = contact.posterior.best
     problem, std = contact.problem, contact.readings.std
@@ -314,26 +326,26 @@ def _trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> 
         return []
     number = np.flatnonzero(used) / max(touches - 1, 1)
     share = np.sum(predicted * force, axis=0)[used] / power[used]
-    grown, grown_std = slope(share, power[used] / std**2, number)
-    delay_changes, variance = differences(problem, delay, plane, inner.coefficients)
-    later, later_std = slope(delay_changes[used], 1.0 / variance[used], number)
+    grown, grown_std = fit_weighted_slope(share, power[used] / std**2, number)
+    delay_changes, variance = estimate_residual_delays(problem, delay, plane, inner.coefficients)
+    later, later_std = fit_weighted_slope(delay_changes[used], 1.0 / variance[used], number)
     angle = 2.0 * np.pi * frequency
     first = "from the first touch to the last"
     return [
-        Line(
+        CheckResult(
             "drift from touch to touch",
             f"force {100 * grown:+.2g} +- {100 * grown_std:.2g} % {first}",
-            _is_there(grown, grown_std),
+            _is_significant(grown, grown_std),
             float(np.pi / 4.0 * angle * lag * abs(grown)),
         ),
-        Line(
+        CheckResult(
             "drift of the force delay",
             f"{1e3 * later:+.2g} +- {1e3 * later_std:.2g} ms {first}",
-            _is_there(later, later_std),
+            _is_significant(later, later_std),
             float(np.pi / 4.0 * angle * abs(later)),
         ),
     ]
 
 
-def _is_there(value: float, std: float) -> bool:
-    return bool(2.0 * special.ndtr(-abs(value) / std) < RARE)
+def _is_significant(value: float, std: float) -> bool:
+    return bool(2.0 * special.ndtr(-abs(value) / std) < DEFECT_P_VALUE)

@@ -12,16 +12,22 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import qmc
 
-CANDIDATES = 16  # candidates in a generation of `polish`
-PER_BASIN = 32  # candidates in a generation of `search_globally`, for each basin of the first round
-BASINS = 8  # basins that `search_globally` searches simultaneously
-SCAN = 8  # the scan of `search_globally` uses 1/SCAN of the budget
-APART = 0.1  # minimum distance of starts, relative to the box's diagonal
-REACHES = 0.1, 0.2, 0.01  # `reach` of the first, the intermediate and the last round of `search_globally`
+POLISH_CANDIDATES = 16  # candidates in a generation of `polish`
+CANDIDATES_PER_BASIN = (
+    32  # candidates in a generation of `search_globally`, for each basin of the first round
+)
+SIMULTANEOUS_BASINS = 8  # basins that `search_globally` searches simultaneously
+SCAN_BUDGET_DIVISOR = 8  # the scan of `search_globally` uses 1/SCAN of the budget
+MIN_START_DISTANCE = 0.1  # minimum distance of starts, relative to the box's diagonal
+INITIAL_STD_BY_ROUND = (
+    0.1,
+    0.2,
+    0.01,
+)  # `reach` of the first, the intermediate and the last round of `search_globally`
 # Loss of a failed evaluation, which is worse than all others but finite.
-WORST = np.finfo(float).max
+FAILED_LOSS = np.finfo(float).max
 
-Losses = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
+LossFunction = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
 
 
 class SearchResult(NamedTuple):
@@ -39,7 +45,7 @@ def polish(
     start: Float[np.ndarray, "*starts gains"],
     evaluations: int,
     *,
-    candidates: int = CANDIDATES,
+    candidates: int = POLISH_CANDIDATES,
     reach: float = 0.1,
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
@@ -62,20 +68,20 @@ def polish(
         seed: seed of the random numbers.
     """
     start = np.clip(np.asarray(start, float), 0, 1)
-    state = _first_generation(start, reach, covariance)
-    constants = _constants(start.shape[-1], candidates)
+    state = _make_first_generation(start, reach, covariance)
+    constants = _compute_constants(start.shape[-1], candidates)
     generator = np.random.default_rng(seed)
     best, best_loss = start, np.full(start.shape[:-1], np.inf)
     generations = max(1, evaluations // candidates)
     for generation in range(generations):
         # All starts use the same random numbers, so that a result does not depend on the other starts.
         normal = generator.standard_normal((candidates, start.shape[-1]))
-        points = mirror(
-            state.mean[..., None, :] + state.step[..., None, None] * (normal @ _transposed(state.root))
+        points = reflect_into_box(
+            state.mean[..., None, :] + state.step[..., None, None] * (normal @ _transpose(state.root))
         )
         if generation == 0:
             points[..., 0, :] = start
-        values = _finite(losses(points))
+        values = _replace_nonfinite(losses(points))
         order = np.argsort(values, axis=-1, kind="stable")
         values = np.take_along_axis(values, order, axis=-1)
         points = np.take_along_axis(points, order[..., None], axis=-2)
@@ -87,12 +93,12 @@ def polish(
 
 
 def search_globally(
-    losses: Losses,
+    losses: LossFunction,
     gains: int,
     budget: int,
     *,
-    candidates: int = PER_BASIN,
-    basins: int = BASINS,
+    candidates: int = CANDIDATES_PER_BASIN,
+    basins: int = SIMULTANEOUS_BASINS,
     seed: int = 0,
 ) -> SearchResult:
     """Find the best point of the whole box within `budget` evaluations, by a scan and restarts of CMA-ES.
@@ -107,14 +113,14 @@ def search_globally(
     increasing population size" (2005); halving, Jamieson and Talwalkar (2016).
     """
     together = basins * candidates
-    scan = max(1, budget // (SCAN * together))
+    scan = max(1, budget // (SCAN_BUDGET_DIVISOR * together))
     sequence = qmc.Sobol(gains, rng=np.random.default_rng(seed))
     # A Sobol sequence is drawn in a power of two; its first points are used, in order.
     points = sequence.random(1 << (scan * together - 1).bit_length())[: scan * together]
     points = points.reshape(scan, together, gains)
-    scanned = np.concatenate([_finite(losses(batch)) for batch in points])
+    scanned = np.concatenate([_replace_nonfinite(losses(batch)) for batch in points])
     points = points.reshape(-1, gains)
-    starts = apart(points[np.argsort(scanned, kind="stable")], None, basins)
+    starts = select_distant_points(points[np.argsort(scanned, kind="stable")], None, basins)
 
     used = scan * together
     rounds = [basins >> turn for turn in range(basins.bit_length())] + [1]
@@ -130,7 +136,7 @@ def search_globally(
             starts,
             generations * together // number,
             candidates=together // number,
-            reach=REACHES[0 if turn == 0 else 2 if turn == len(rounds) - 1 else 1],
+            reach=INITIAL_STD_BY_ROUND[0 if turn == 0 else 2 if turn == len(rounds) - 1 else 1],
             seed=seed + turn,
         )
         used += generations * together
@@ -142,7 +148,7 @@ def search_globally(
     return SearchResult(minima[0], minimum_losses[0], used)
 
 
-def mirror(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:
+def reflect_into_box(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:
     """Reflect coordinates outside [0, 1] at its ends."""
     folded = np.mod(points, 2)
     return np.where(folded > 1, 2 - folded, folded)
@@ -160,7 +166,7 @@ class _Generation(NamedTuple):
     shape_path: np.ndarray  # evolution path of C
 
 
-class _Constants(NamedTuple):
+class _CmaConstants(NamedTuple):
     """Constants of CMA-ES; the tutorial's names are in brackets."""
 
     weights: np.ndarray  # weights of the better half of the candidates
@@ -173,7 +179,7 @@ class _Constants(NamedTuple):
     length: float  # expected length of a path of random steps (E|N(0, I)|)
 
 
-def _constants(gains: int, candidates: int) -> _Constants:
+def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
     """Return the tutorial's default constants."""
     half = candidates // 2
     weights = np.log(candidates / 2 + 0.5) - np.log(np.arange(1, half + 1))
@@ -182,7 +188,7 @@ def _constants(gains: int, candidates: int) -> _Constants:
     step_rate = (effective + 2) / (gains + effective + 5)
     rank_one = 2 / ((gains + 1.3) ** 2 + effective)
     rank_mu = min(1 - rank_one, 2 * (effective - 2 + 1 / effective) / ((gains + 2) ** 2 + effective))
-    return _Constants(
+    return _CmaConstants(
         weights=weights,
         step_rate=step_rate,
         damping=1 + 2 * max(0.0, np.sqrt((effective - 1) / (gains + 1)) - 1) + step_rate,
@@ -194,7 +200,7 @@ def _constants(gains: int, candidates: int) -> _Constants:
     )
 
 
-def _first_generation(start, reach, covariance) -> _Generation:
+def _make_first_generation(start, reach, covariance) -> _Generation:
     """Return the initial distribution of every start."""
     gains = start.shape[-1]
     shape = np.broadcast_to(np.eye(gains), (*start.shape[:-1], gains, gains))
@@ -202,7 +208,7 @@ def _first_generation(start, reach, covariance) -> _Generation:
         # The mean variance is scaled to 1, so that the spread is `reach` on average over the gains.
         average = np.trace(covariance, axis1=-2, axis2=-1) / gains
         shape = np.broadcast_to(covariance / average[..., None, None], shape.shape)
-    root, inverse_root = _roots(shape)
+    root, inverse_root = _compute_square_roots(shape)
     step = np.full(start.shape[:-1], reach)
     still = np.zeros_like(start)
     return _Generation(start, step, shape, root, inverse_root, still, still)
@@ -234,46 +240,46 @@ def _evolve(state, points, constants, generation) -> _Generation:
     growth = constants.step_rate / constants.damping * (size / constants.length - 1)
     # If the distribution is wider than the box, mirrored points are uniform and carry no information.
     step = np.clip(state.step * np.exp(np.minimum(growth, 1)), 1e-12, 0.5)
-    root, inverse_root = _roots(covariance)
+    root, inverse_root = _compute_square_roots(covariance)
     return _Generation(
         state.mean + state.step[..., None] * move, step, covariance, root, inverse_root, step_path, shape_path
     )
 
 
-def _roots(covariance):
+def _compute_square_roots(covariance):
     """Return the symmetric square root of a covariance and its inverse."""
     values, vectors = np.linalg.eigh(covariance)
     roots = np.sqrt(np.maximum(values, 1e-20 * np.max(values, axis=-1, keepdims=True)))
-    root = (vectors * roots[..., None, :]) @ _transposed(vectors)
-    return root, (vectors / roots[..., None, :]) @ _transposed(vectors)
+    root = (vectors * roots[..., None, :]) @ _transpose(vectors)
+    return root, (vectors / roots[..., None, :]) @ _transpose(vectors)
 
 
-def _transposed(matrix):
+def _transpose(matrix):
     return np.swapaxes(matrix, -1, -2)
 
 
-def _finite(losses):
+def _replace_nonfinite(losses):
     losses = np.asarray(losses, float)
-    return np.where(np.isfinite(losses), losses, WORST)
+    return np.where(np.isfinite(losses), losses, FAILED_LOSS)
 
 
-def apart(ranked, known, number):
+def select_distant_points(ranked, known, number):
     """Return `number` points: the `known` ones, then the best `ranked` ones at a distance from all others.
 
     The distance is a tenth of the box's diagonal, or less if there are not enough such points.
     """
     known = np.zeros((0, ranked.shape[-1])) if known is None else known
-    distance = APART * np.sqrt(ranked.shape[-1])
+    distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1])
     while True:
-        chosen = far_apart(ranked, known, number, distance)
+        chosen = select_points_at_distance(ranked, known, number, distance)
         if len(chosen) == number:
             return chosen
         distance = distance / 2 if len(ranked) > number and distance > 1e-9 else 0.0
 
 
-def far_apart(ranked, known, number, distance=None):
-    """Return points as `apart` does, but fewer if not enough have the `distance`, by default a tenth."""
-    distance = APART * np.sqrt(ranked.shape[-1]) if distance is None else distance
+def select_points_at_distance(ranked, known, number, distance=None):
+    """Return points as `select_distant_points` does, or fewer if not enough have the `distance`."""
+    distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(known[:number], 0, 1))
     for point in ranked:
         if len(chosen) == number:

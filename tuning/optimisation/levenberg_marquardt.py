@@ -19,32 +19,35 @@ from jax.scipy.linalg import cho_solve
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from tuning.optimisation.solution import Solution
-from tuning.optimisation.unit_box import Bounds, to_gains
+from tuning.optimisation.solution import SolverResult
+from tuning.optimisation.unit_box import GainBounds, to_gains
 
-DAMPING = 0.1  # damping of the first step, relative to the mean diagonal of J^T J
-STANDSTILL = 1e-6  # a step shorter than this, relative to the box, means convergence
-PATIENCE, PROGRESS = 5, 1e-3  # number of steps, and relative decrease of the loss required within them
+INITIAL_DAMPING = 0.1  # damping of the first step, relative to the mean diagonal of J^T J
+MIN_STEP_LENGTH = 1e-6  # a step shorter than this, relative to the box, means convergence
+PROGRESS_STEPS, MIN_LOSS_DECREASE = (
+    5,
+    1e-3,
+)  # number of steps, and relative decrease of the loss required within them
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
-def solve(
+def solve_least_squares(
     residuals: Callable[..., Float[Array, "problems residuals"]],
     static: Any,
     arguments: Any,
-    bounds: Bounds,
+    bounds: GainBounds,
     starts: Float[Array, "problems gains"],
     steps: Int[Array, ""],
     longest: int = 32,
     tile: int | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
-) -> Solution:
+) -> SolverResult:
     """Minimise sum(residuals(static, gains, arguments)^2) / 2 for many problems, sharded over the devices.
 
     A problem has converged when residuals and coordinates have settled (`rtol`, `atol`), when a step is
-    shorter than `STANDSTILL`, or when the relative decrease of the loss in `PATIENCE` steps is below
-    `PROGRESS`.
+    shorter than `MIN_STEP_LENGTH`, or when the relative decrease of the loss in `PROGRESS_STEPS` steps is
+    below `MIN_LOSS_DECREASE`.
 
     Args:
         residuals: function of `static`, gains and arguments with a leading axis of problems, which it must
@@ -64,7 +67,7 @@ def solve(
         bounds, arguments = arguments
         return residuals(static, to_gains(coordinates, bounds), arguments)
 
-    solver = _Recording(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
+    solver = _LossRecordingSolver(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
 
     def one_device(starts, bounds, arguments):
         function = _with_jacobian(of_coordinates, starts, (bounds, arguments), tile)
@@ -82,14 +85,14 @@ def solve(
         )
         stats = solution.stats
         loss = jnp.min(stats["history"])
-        status = _status(solution.result, stats["converged"], loss)
+        status = _find_status(solution.result, stats["converged"], loss)
         steps = stats["num_steps"].astype(jnp.int32)
-        return Solution(solution.value, stats["curvature"], loss, stats["history"], steps, status)
+        return SolverResult(solution.value, stats["curvature"], loss, stats["history"], steps, status)
 
-    return Solution(*_sharded(one_device, starts, bounds, arguments))
+    return SolverResult(*_shard_over_devices(one_device, starts, bounds, arguments))
 
 
-def _sharded(one_device: Callable[..., Solution], *arguments: Any) -> tuple[Array, ...]:
+def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any) -> tuple[Array, ...]:
     """Call `one_device` on each device with its share of the arguments' leading axis."""
     leaves, structure = jax.tree.flatten(arguments)
     devices = math.gcd(jax.device_count(), len(leaves[0]))
@@ -163,7 +166,7 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     return with_loss
 
 
-class _Model(NamedTuple):
+class _LinearModel(NamedTuple):
     """Linear model of the residuals at the start of a step."""
 
     coordinates: Float[Array, "gains"]  # start of the step
@@ -174,21 +177,22 @@ class _Model(NamedTuple):
 class _BoxedDescent(optx.AbstractDescent):
     """Step d in the unit box from the damped linear model.
 
-    It solves (J^T J + D) d = -J^T r for the gains that are free, D = `DAMPING` mean(diag(J^T J)) / step_size.
+    It solves (J^T J + D) d = -J^T r for the gains that are free, D = `INITIAL_DAMPING` mean(diag(J^T J)) /
+    step_size.
     """
 
     def init(self, y, f_info_struct):
-        return _Model(y, jnp.zeros((len(y), len(y)), y.dtype), jnp.zeros_like(y))
+        return _LinearModel(y, jnp.zeros((len(y), len(y)), y.dtype), jnp.zeros_like(y))
 
     def query(self, y, f_info, state):
         basis = jnp.eye(len(y), dtype=y.dtype)
         jacobian = jax.vmap(f_info.jac.mv, out_axes=-1)(basis)
-        return _Model(y, jacobian.T @ jacobian, jacobian.T @ f_info.residual)
+        return _LinearModel(y, jacobian.T @ jacobian, jacobian.T @ f_info.residual)
 
     def step(self, step_size, state):
         coordinates, curvature, gradient = state
         number, dtype = len(coordinates), coordinates.dtype
-        damping = DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
+        damping = INITIAL_DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
         identity = jnp.eye(number, dtype=dtype)
         # The small number keeps gains in place on which no residual depends, since their curvature is 0.
         damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
@@ -228,7 +232,7 @@ class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
         self.verbose = lambda **_: None
 
 
-class _Recording(optx.AbstractLeastSquaresSolver):
+class _LossRecordingSolver(optx.AbstractLeastSquaresSolver):
     """Solver that records the loss of every accepted iterate."""
 
     rtol: float
@@ -262,9 +266,9 @@ class _Recording(optx.AbstractLeastSquaresSolver):
     def _converged(self, fn, y, args, options, state, tags):
         inner, history, count = state
         converged, result = self.inner.terminate(fn, y, args, options, inner, tags)
-        still = jnp.max(jnp.abs(inner.y_eval - y)) < STANDSTILL
-        before = history[jnp.maximum(count - 1 - PATIENCE, 0)]
-        slow = (count > PATIENCE) & (history[count - 1] > (1 - PROGRESS) * before)
+        still = jnp.max(jnp.abs(inner.y_eval - y)) < MIN_STEP_LENGTH
+        before = history[jnp.maximum(count - 1 - PROGRESS_STEPS, 0)]
+        slow = (count > PROGRESS_STEPS) & (history[count - 1] > (1 - MIN_LOSS_DECREASE) * before)
         return converged | ((count > 0) & (still | slow)), result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
@@ -274,7 +278,7 @@ class _Recording(optx.AbstractLeastSquaresSolver):
         return y, aux, {**stats, "history": state[1], "converged": converged, "curvature": curvature}
 
 
-def _status(result, converged, loss):
+def _find_status(result, converged, loss):
     """Return the index into `STATUSES` for a result of optimistix."""
     ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
     status = jnp.where(ended, jnp.where(converged, 0, 1), 3)

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float, Int
 
-STATUSES = ("converged", "step limit", "not finite", "failed")
+SOLVER_STATUSES = ("converged", "step limit", "not finite", "failed")
 
 
-class Solution(NamedTuple):
+class SolverResult(NamedTuple):
     """Result of the solver for each start."""
 
     coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
@@ -15,4 +15,4 @@ class Solution(NamedTuple):
     loss: Float[Array, "starts"]  # half the sum of squared residuals
     history: Float[Array, "starts steps"]  # loss after every step; the last one repeats
     steps: Int[Array, "starts"]  # number of steps
-    status: Int[Array, "starts"]  # index into `STATUSES`
+    status: Int[Array, "starts"]  # index into `SOLVER_STATUSES`

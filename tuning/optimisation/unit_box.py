@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-class Bounds(NamedTuple):
+class GainBounds(NamedTuple):
     """Range of each gain."""
 
     lower: Float[Array | np.ndarray, "*problems gains"]  # lower bound
@@ -16,7 +16,7 @@ class Bounds(NamedTuple):
     logarithmic: Float[Array | np.ndarray, "*problems gains"]  # 1 for a logarithmic scale, else 0
 
 
-def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[Any, "*points gains"]:
+def to_gains(coordinates: Float[Any, "*points gains"], bounds: GainBounds) -> Float[Any, "*points gains"]:
     """Return the gains at unit `coordinates`, as NumPy or JAX arrays like the input.
 
     A coordinate outside [0, 1] is clipped, but keeps the derivative of one inside.
@@ -32,7 +32,7 @@ def to_gains(coordinates: Float[Any, "*points gains"], bounds: Bounds) -> Float[
 
 
 def to_coordinates(
-    gains: Float[np.ndarray, "*points gains"], bounds: Bounds
+    gains: Float[np.ndarray, "*points gains"], bounds: GainBounds
 ) -> Float[np.ndarray, "*points gains"]:
     """Return the unit coordinates of gains, clipped to [0, 1]; 0 if both bounds are equal."""
     lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)

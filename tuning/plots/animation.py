@@ -12,15 +12,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from jaxhil.files import write_whole
-from jaxhil.simulation.contact_plot import BLUE, new_figure
+from jaxhil.files import write_atomically
+from jaxhil.simulation.contact_plot import BLUE, create_figure
 from jaxhil.sixdof.recording import Recorded
-from tuning.plots.outlines import Line, outlines, rotation_matrix
-from tuning.plots.six_axes import AXES, VIEWS, origin_of, rotation_of, window
+from tuning.plots.outlines import Polyline, outlines, rotation_matrix
+from tuning.plots.six_axes import AXIS_NAMES, VIEWS, find_shown_ticks, find_time_origin, quaternion_of
 
-FRAMES, RATE = 60, 12  # number of frames, and frames per second
-ROUND = 3.0  # margin around the contact, relative to the motion
-COLUMNS = ("in space", "on the rig")
+FRAME_COUNT, FRAME_RATE = 60, 12  # number of frames, and frames per second
+MARGIN_FACTOR = 3.0  # margin around the contact, relative to the motion
+COLUMN_TITLES = ("in space", "on the rig")
 
 
 @matplotlib.style.context("default")
@@ -28,35 +28,37 @@ def animate(recorded: Recorded, title: str, path: str | Path) -> None:
     """Write an animation of both mechanisms near the contact, in two views. Raise OSError if this fails."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    ticks_shown = window(recorded)
-    ticks = np.unique(np.linspace(ticks_shown.start, ticks_shown.stop - 1, FRAMES).astype(int))
-    figure = new_figure((7.6, 8), title, above=0.9, below=0.6)
+    ticks_shown = find_shown_ticks(recorded)
+    ticks = np.unique(np.linspace(ticks_shown.start, ticks_shown.stop - 1, FRAME_COUNT).astype(int))
+    figure = create_figure((7.6, 8), title, above=0.9, below=0.6)
     FigureCanvasAgg(figure)
     figure.subplots_adjust(hspace=0.28, wspace=0.28)
-    moving = _scene(figure, recorded)
+    moving = _draw_scene(figure, recorded)
     clock = figure.text(0.5, 0.925, "", ha="center", fontsize=10)
-    origin, since = origin_of(recorded)
-    writer = _writer(target)
+    origin, since = find_time_origin(recorded)
+    writer = _select_writer(target)
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / f"film{target.suffix.lower()}"
         with writer.saving(figure, str(film), 64):
             for tick in ticks:
                 clock.set_text(f"{1e3 * (recorded.time[tick] - recorded.time[origin]):.0f} ms {since}")
                 for lines, chaser, poses, view in moving:
-                    lines.set_segments(_seen(chaser, poses[tick], view))
+                    lines.set_segments(_project_outline(chaser, poses[tick], view))
                 writer.grab_frame()
-        write_whole(target, film.read_bytes())
+        write_atomically(target, film.read_bytes())
 
 
-def _writer(target: Path) -> AbstractMovieWriter:
+def _select_writer(target: Path) -> AbstractMovieWriter:
     """Return the writer for a file's format."""
-    return PillowWriter(fps=RATE) if target.suffix.lower() == ".gif" else FFMpegWriter(fps=RATE)
+    return PillowWriter(fps=FRAME_RATE) if target.suffix.lower() == ".gif" else FFMpegWriter(fps=FRAME_RATE)
 
 
-def _scene(figure: Figure, recorded: Recorded) -> list[tuple[LineCollection, list[Line], np.ndarray, Any]]:
+def _draw_scene(
+    figure: Figure, recorded: Recorded
+) -> list[tuple[LineCollection, list[Polyline], np.ndarray, Any]]:
     """Draw the target in every axes; return each axes' chaser lines, chaser outline in C, poses and view."""
     target, chaser = outlines(recorded.groups)
-    middle, half = _region(recorded)
+    middle, half = _shown_region(recorded)
     moving = []
     for row, view in enumerate(VIEWS):
         for column, poses in enumerate((recorded.in_space, recorded.actual)):
@@ -65,31 +67,31 @@ def _scene(figure: Figure, recorded: Recorded) -> list[tuple[LineCollection, lis
             axes.add_collection(LineCollection(fixed, colors="0.55", linewidths=1.2))
             lines = LineCollection([], colors=BLUE, linewidths=1.2)
             axes.add_collection(lines)
-            _frame(axes, middle[list(view)], half, view)
-            axes.set_title(COLUMNS[column], fontsize=10)
+            _format_axes(axes, middle[list(view)], half, view)
+            axes.set_title(COLUMN_TITLES[column], fontsize=10)
             moving.append((lines, chaser, poses, view))
     return moving
 
 
-def _region(recorded: Recorded) -> tuple[np.ndarray, float]:
+def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
     """Return middle and half width [m] of the region shown: the points of contact, and a margin."""
     touching = recorded.depth > 0
     points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]
-    ticks = window(recorded)
+    ticks = find_shown_ticks(recorded)
     moved = np.ptp(recorded.desired[ticks, :3], axis=0).max()
     low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, float(np.max(high - low) / 2 + ROUND * moved + 0.01)
+    return (low + high) / 2, float(np.max(high - low) / 2 + MARGIN_FACTOR * moved + 0.01)
 
 
-def _frame(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
+def _format_axes(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
     """Set limits, labels and grid of an axes."""
     across, up = (1e3 * (centre + half * np.array([-1, 1])) for centre in middle)
     axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
-    axes.set(xlabel=f"{AXES[view[0]]} of T [mm]", ylabel=f"{AXES[view[1]]} of T [mm]")
+    axes.set(xlabel=f"{AXIS_NAMES[view[0]]} of T [mm]", ylabel=f"{AXIS_NAMES[view[1]]} of T [mm]")
     axes.grid(True, color="0.9", linewidth=0.6)
 
 
-def _seen(chaser: list[Line], pose: np.ndarray, view: tuple[int, int]) -> Any:
+def _project_outline(chaser: list[Polyline], pose: np.ndarray, view: tuple[int, int]) -> Any:
     """Return the chaser's outline at a pose in a view, in mm."""
-    rotation = rotation_matrix(rotation_of(pose[3:]))
+    rotation = rotation_matrix(quaternion_of(pose[3:]))
     return [1e3 * (line @ rotation.T + pose[:3])[:, list(view)] for line in chaser]

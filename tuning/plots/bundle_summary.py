@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxhil.errors import one_line
-from jaxhil.simulation.contact_plot import BLACK, BLUE, LABELS, ORANGE, VERMILION, finish
+from jaxhil.errors import to_one_line
+from jaxhil.simulation.contact_plot import BLACK, BLUE, CURVE_LABELS, ORANGE, VERMILION, finish_axes
 
 COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
 HATCHES = {"before": "///", "literature": "...", "tuned": ""}
-KEYS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # statistics of |e - e*|
-QUANTITIES = {
+ERROR_STATISTICS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # statistics of |e - e*|
+ENVELOPE_QUANTITIES = {
     "contact_frequency": ("contact frequency", "Hz", 1.0),
     "delay": ("delay", "ms", 1e3),
     "approach_velocity": ("approach velocity", "mm/s", 1e3),
@@ -29,19 +29,19 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
     figure = Figure(figsize=(9.3, 3.1))
     FigureCanvasAgg(figure)
     left = figure.add_axes((0.075, 0.2, 0.48, 0.6))
-    _errors(left, document)
-    spans = [(key, span) for key, span in document["envelope"].items() if _is_span(span)][:4]
+    _draw_errors(left, document)
+    spans = [(key, span) for key, span in document["envelope"].items() if _is_range(span)][:4]
     figure.text(0.61, 0.93, "Tuned over (the gains hold there)", fontsize=10, va="center")
     if not spans:
         figure.text(0.61, 0.5, "the gain file does not say", fontsize=9)
     for number, (key, span) in enumerate(spans):
-        _strip(figure.add_axes((0.63, 0.72 - 0.2 * number, 0.34, 0.06)), key, span)
+        _draw_range(figure.add_axes((0.63, 0.72 - 0.2 * number, 0.34, 0.06)), key, span)
     file = io.BytesIO()
     figure.savefig(file, dpi=160, format="png", metadata={"Software": None})
     return file.getvalue()
 
 
-def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
+def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
     """Draw groups of bars: errors of the nominal run and of fresh scenarios, by gains."""
     groups = _error_groups(document["figures"])
     series = [name for name in COLOURS if any(name in values for _, values in groups)]
@@ -52,13 +52,13 @@ def _errors(axes: Axes, document: Mapping[str, Any]) -> None:
         centres = [i + (index - (len(series) - 1) / 2) * width for i, _ in heights]
         bars = axes.bar(
             centres, [value for _, value in heights], width * 0.92, color=COLOURS[name], hatch=HATCHES[name],
-            edgecolor="white", linewidth=0.4, label=LABELS[name].partition(":")[0],
+            edgecolor="white", linewidth=0.4, label=CURVE_LABELS[name].partition(":")[0],
         )  # fmt: skip
         axes.bar_label(bars, [f"{value:.2g}" for _, value in heights], fontsize=6, padding=1)
     axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
     axes.tick_params(axis="y", labelsize=8)
     axes.set_ylabel("|e - e*| [1]", fontsize=9)
-    finish(axes, None)
+    finish_axes(axes, None)
     axes.grid(False, axis="x")
     positive = [value for _, values in groups for value in values.values() if value > 0]
     if positive:
@@ -73,7 +73,7 @@ def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float
     groups = []
     for kind, key, label in (
         ("nominal", "rms", "nominal run,\nrms"),
-        *(("robust", key, f"scenarios,\n{text}") for key, text in KEYS.items()),
+        *(("robust", key, f"scenarios,\n{text}") for key, text in ERROR_STATISTICS.items()),
     ):
         errors = figures.get(kind, {})
         values = {
@@ -88,9 +88,9 @@ def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float
     return groups
 
 
-def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
+def _draw_range(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
     """Draw the range of one quantity on its own axis."""
-    name, unit, factor = QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
+    name, unit, factor = ENVELOPE_QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
     low, high = sorted((factor * span["low"], factor * span["high"]))
     room = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
     axes.barh(0, high - low, left=low, height=1, color=BLUE)
@@ -98,13 +98,16 @@ def _strip(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
     axes.set(xlim=(low - room, high + room), ylim=(-0.9, 0.9), yticks=[])
     axes.tick_params(axis="x", labelsize=7, pad=1.5)
     axes.set_title(
-        f"{one_line(name, 30)}: {low:.3g} to {high:.3g} {one_line(unit, 10)}", fontsize=8, loc="left", pad=3
+        f"{to_one_line(name, 30)}: {low:.3g} to {high:.3g} {to_one_line(unit, 10)}",
+        fontsize=8,
+        loc="left",
+        pad=3,
     )
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
 
 
-def _is_span(value: Any) -> bool:
+def _is_range(value: Any) -> bool:
     """Return whether a value is a range with numbers `low` and `high`."""
     return isinstance(value, Mapping) and all(
         isinstance(value.get(key), (int, float)) for key in ("low", "high")

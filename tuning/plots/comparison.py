@@ -7,13 +7,21 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from jaxhil.simulation.contact_plot import BLACK, GREEN, LABELS, STYLES, finish, legend_below, new_figure
-from tuning.benchmark.study import LITERATURE, TUNED, LawFigures
-from tuning.benchmark.tables import best
+from jaxhil.simulation.contact_plot import (
+    BLACK,
+    CURVE_LABELS,
+    CURVE_STYLES,
+    GREEN,
+    create_figure,
+    finish_axes,
+    legend_below,
+)
+from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, LawMetrics
+from tuning.benchmark.tables import choose_best_metrics
 from tuning.plots.parts import MARKERS, name_rows
 
-COLUMNS = 4  # largest number of panels side by side
-TRANSPARENCY = {
+MAX_PANEL_COLUMNS = 4  # largest number of panels side by side
+TRANSPARENCY_TITLES = {
     "early": "transparency, push at 25 % [1]",
     "late": "transparency, push at 75 % [1]",
     "slope": "slope of e against e* [1]",
@@ -22,28 +30,28 @@ TRANSPARENCY = {
 
 
 @matplotlib.style.context("default")
-def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]], limit: float) -> Figure:
+def plot_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]], limit: float) -> Figure:
     """Plot the rms error of every law with its interval, one panel per mechanism."""
-    keys = _keys(names, found)
+    keys = _list_gain_names(names, found)
     laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
-    across = min(COLUMNS, len(names))
+    across = min(MAX_PANEL_COLUMNS, len(names))
     down = -(-len(names) // across)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
     size = (2.2 + 2.6 * across, 1.2 + height * down)
-    figure = new_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
+    figure = create_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
     panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
         by_law = {result.law: result for result in found[name]}
-        for key, offset in zip(keys, _offsets(len(keys)), strict=True):
+        for key, offset in zip(keys, _compute_offsets(len(keys)), strict=True):
             rows = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
             errors = [by_law[laws[i]].figures[key]["rms"] for i in rows]
-            colour = STYLES[key][0] if key in STYLES else GREEN
+            colour = CURVE_STYLES[key][0] if key in CURVE_STYLES else GREEN
             heights = np.array(rows) + offset
             for y, error in zip(heights, errors, strict=True):
                 panel.plot([100 * error.low, 100 * error.high], [y, y], color=colour, linewidth=1.5)
             values = [100 * error.value for error in errors]
             marker = MARKERS.get(key, "D")
-            panel.plot(values, heights, marker, color=colour, markersize=4, label=LABELS.get(key, key))
+            panel.plot(values, heights, marker, color=colour, markersize=4, label=CURVE_LABELS.get(key, key))
         panel.axvline(
             100 * limit, color=BLACK, linewidth=1.2, linestyle="--", label=f"limit {100 * limit:g} %"
         )
@@ -53,7 +61,7 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
         panel.xaxis.set_minor_formatter(NullFormatter())
         panel.tick_params(axis="x", labelsize=8)
         panel.set_title(name.removeprefix("suite-"), fontsize=9)
-        finish(panel, None)
+        finish_axes(panel, None)
     for panel in list(panels.flat)[len(names) :]:
         panel.set_visible(False)
     for panel in panels[:, 0]:
@@ -67,43 +75,46 @@ def errors_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]],
 
 
 @matplotlib.style.context("default")
-def transparency_plot(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> Figure:
+def plot_transparency(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> Figure:
     """Plot transparency, slope and peak force of every law with its best gains, one point per mechanism."""
     laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
     size = (12.0, 1.75 + 0.34 * len(laws))
-    gains = "Tuned gains" if TUNED in _keys(names, found) else "The literature's gains"
-    figure = new_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
-    panels = figure.subplots(1, len(TRANSPARENCY), sharey=True)
+    gains = "Tuned gains" if TUNED_GAINS in _list_gain_names(names, found) else "The literature's gains"
+    figure = create_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
+    panels = figure.subplots(1, len(TRANSPARENCY_TITLES), sharey=True)
     figure.subplots_adjust(left=1.6 / size[0], wspace=0.08)
-    for panel, (key, title) in zip(panels, TRANSPARENCY.items(), strict=True):
+    for panel, (key, title) in zip(panels, TRANSPARENCY_TITLES.items(), strict=True):
         low, high = (0.3, 100.0) if key == "peak" else (-1.0, 2.5)
         for row, law in enumerate(laws):
             values = [
-                best(result)[key].value for name in names for result in found[name] if result.law == law
+                choose_best_metrics(result)[key].value
+                for name in names
+                for result in found[name]
+                if result.law == law
             ]
             spread = row + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
             # Values beyond the axis are drawn at its end.
             values = np.clip(values, low, high)
             label = None if row else "a mechanism each, from above in the order given"
-            style = {"color": STYLES[TUNED][0], "markersize": 4, "alpha": 0.6, "clip_on": False}
+            style = {"color": CURVE_STYLES[TUNED_GAINS][0], "markersize": 4, "alpha": 0.6, "clip_on": False}
             panel.plot(values, spread, "o", label=label, **style)
         panel.axvline(1, color=BLACK, linewidth=1.2, linestyle="--", label="1: as in space")
         panel.set_xlim(low, high)
         if key == "peak":
             panel.set_xscale("log")
         panel.set_xlabel(title, fontsize=9)
-        finish(panel, None)
+        finish_axes(panel, None)
     name_rows(panels[0], laws)
     legend_below(figure, panels[0], 2)
     return figure
 
 
-def _keys(names: Sequence[str], found: Mapping[str, Sequence[LawFigures]]) -> list[str]:
+def _list_gain_names(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> list[str]:
     """Return the names of all evaluated gains: the literature's, settings, tuned ones."""
     keys = {key: None for name in names for result in found[name] for key in result.figures}
-    rank = {LITERATURE: 0, TUNED: 2}
+    rank = {LITERATURE_GAINS: 0, TUNED_GAINS: 2}
     return sorted(keys, key=lambda key: rank.get(key, 1))
 
 
-def _offsets(number: int) -> list[float]:
+def _compute_offsets(number: int) -> list[float]:
     return [0.3 * (index - (number - 1) / 2) / max(number - 1, 1) for index in range(number)]

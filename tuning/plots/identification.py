@@ -10,38 +10,51 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure
-from tuning.identification.contact import ContactFit
+from jaxhil.simulation.contact_plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    SKY_BLUE,
+    VERMILION,
+    create_figure,
+    finish_axes,
+)
+from tuning.identification.contact_fit import ContactFit
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.result import Identification
-from tuning.plots.parts import WIDE, legend_above
+from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
 
-DOTS: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
-TOUCHES = 3  # contacts that are plotted over time
-COLOURS = (BLUE, ORANGE, GREEN)
-LAGS, EARLIER, LATER = 25, -20, 100  # rows, ranges of the residuals' correlations
-PLAINLY = 3.0  # standard deviations from 0, above which a relative change is meaningful
+DOT_STYLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
+PLOTTED_CONTACTS = 3  # contacts that are plotted over time
+RUN_COLOURS = (BLUE, ORANGE, GREEN)
+MAX_AUTOCORRELATION_LAG, MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG = (
+    25,
+    -20,
+    100,
+)  # rows, ranges of the residuals' correlations
+MIN_ESTIMATE_SIGMAS = 3.0  # standard deviations from 0, above which a relative change is meaningful
 
 
-def draw(found: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+def draw_identification(found: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     """Return the plots by the names of their files; plots without data are omitted.
 
     `entries` are the estimates with their priors, as in `identification.json`.
     """
     figures = {}
     if found.motion is not None:
-        figures["bode.png"] = bode(found.motion)
+        figures["bode.png"] = plot_bode(found.motion)
     if found.contact is not None:
         prior = next((entry["prior"] for entry in entries if entry["key"] == "rig.force_sensor.delay"), None)
-        figures["delay.png"] = delay(found.contact, prior)
-        figures["contacts.png"] = contacts(found.contact)
-        figures["residuals.png"] = residuals(found.contact)
-    figures["compare.png"] = compare(entries)
+        figures["delay.png"] = plot_force_delay(found.contact, prior)
+        figures["contacts.png"] = plot_contacts(found.contact)
+        figures["residuals.png"] = plot_residuals(found.contact)
+    figures["compare.png"] = plot_estimates(entries)
     return figures
 
 
 @matplotlib.style.context("default")
-def bode(motion: FreeMotion) -> Figure:
+def plot_bode(motion: FreeMotion) -> Figure:
     """Plot the measured and the modelled response, noise, distortion and coherence over the frequency."""
     lines, fit = motion.lines, motion.fit
     order = np.argsort(lines.frequency)
@@ -50,75 +63,85 @@ def bode(motion: FreeMotion) -> Figure:
     noise = (lines.std / np.abs(lines.command))[order]
     slopes = fit.model.slopes(2j * np.pi * frequency)
     band = np.sqrt(np.maximum(np.einsum("il,ij,jl->l", slopes, motion.covariance, slopes.conj()).real, 0.0))
-    figure = new_figure((11, 6.6), "Motion simulator: from the desired to the measured position")
+    figure = create_figure((11, 6.6), "Motion simulator: from the desired to the measured position")
     (size, phase), (error, coherence) = figure.subplots(2, 2, sharex=True)
-    size.plot(frequency, _decibel(measured), color=BLUE, label="measured", **DOTS)
-    size.plot(frequency, _decibel(modelled), color=BLACK, linewidth=1.2, label=f"model: {_name(motion)}")
-    size.plot(frequency, _decibel(noise), color="0.6", linewidth=1.2, label="noise of the lines")
-    size.plot(frequency, _decibel(measured - modelled), color=ORANGE, label="measured less model", **DOTS)
-    for level, name, line in zip(_distortions(motion), ("odd", "even"), ("--", ":"), strict=True):
+    size.plot(frequency, _to_decibel(measured), color=BLUE, label="measured", **DOT_STYLE)
+    size.plot(
+        frequency,
+        _to_decibel(modelled),
+        color=BLACK,
+        linewidth=1.2,
+        label=f"model: {_format_structure(motion)}",
+    )
+    size.plot(frequency, _to_decibel(noise), color="0.6", linewidth=1.2, label="noise of the lines")
+    size.plot(
+        frequency, _to_decibel(measured - modelled), color=ORANGE, label="measured less model", **DOT_STYLE
+    )
+    for level, name, line in zip(_find_distortion_levels(motion), ("odd", "even"), ("--", ":"), strict=True):
         if level:
             size.axhline(
-                _decibel(level), color=VERMILION, linestyle=line, linewidth=1.2, label=f"{name} distortion"
+                _to_decibel(level), color=VERMILION, linestyle=line, linewidth=1.2, label=f"{name} distortion"
             )
     size.set(ylabel="magnitude [dB]", xscale="log")
-    finish(size, "center left")
-    phase.plot(frequency, _degrees(measured), color=BLUE, label="measured", **DOTS)
-    phase.plot(frequency, _degrees(modelled), color=BLACK, linewidth=1.2, label="model")
+    finish_axes(size, "center left")
+    phase.plot(frequency, _compute_phase(measured), color=BLUE, label="measured", **DOT_STYLE)
+    phase.plot(frequency, _compute_phase(modelled), color=BLACK, linewidth=1.2, label="model")
     phase.set(ylabel="phase [degrees]")
-    finish(phase, "lower left")
+    finish_axes(phase, "lower left")
     share, chance = 100.0 * np.abs(measured / modelled - 1.0), 100.0 * noise / np.abs(modelled)
-    error.plot(frequency, share, color=BLUE, label="measured off the model", **DOTS)
+    error.plot(frequency, share, color=BLUE, label="measured off the model", **DOT_STYLE)
     # The magnitude of complex normal noise is below 1.73 standard deviations at 95 % of the lines.
     error.plot(frequency, np.sqrt(-np.log(0.05)) * chance, color="0.6", linewidth=1.2, label="95 % of noise")
-    error.plot(frequency, 100.0 * WIDE * band, color=BLACK, linewidth=1.2, label="95 % of the model")
+    error.plot(
+        frequency, 100.0 * INTERVAL_SIGMAS * band, color=BLACK, linewidth=1.2, label="95 % of the model"
+    )
     error.set(xlabel="frequency [Hz]", ylabel="share of the response [%]", yscale="log")
-    finish(error, "best")
+    finish_axes(error, "best")
     of_lines = np.concatenate([spectrum.coherence for spectrum in motion.spectra])[order]
-    coherence.plot(frequency, of_lines, color=BLUE, label="coherence", **DOTS)
+    coherence.plot(frequency, of_lines, color=BLUE, label="coherence", **DOT_STYLE)
     coherence.set(xlabel="frequency [Hz]", ylabel="coherence [1]", ylim=(min(0.9, of_lines.min()), 1.005))
     for axes in (error, coherence):
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    finish(coherence, "lower left")
+    finish_axes(coherence, "lower left")
     return figure
 
 
 @matplotlib.style.context("default")
-def delay(contact: ContactFit, told: float | None) -> Figure:
+def plot_force_delay(contact: ContactFit, told: float | None) -> Figure:
     """Plot the profile likelihood of the force delay, and its correlation with the damping or the surface."""
     posterior = contact.posterior
     draws = contact.draws()
-    figure = new_figure((11, 4.6), "Force delay: what the touches say of it")
+    figure = create_figure((11, 4.6), "Force delay: what the touches say of it")
     left, right = figure.subplots(1, 2)
     low, high = np.quantile(draws[:, 0], (0.025, 0.975))
     density = np.exp(posterior.log_posterior)
-    left.axvspan(1e3 * low, 1e3 * high, color=SKY, alpha=0.3, linewidth=0, label="95 %")
+    left.axvspan(1e3 * low, 1e3 * high, color=SKY_BLUE, alpha=0.3, linewidth=0, label="95 %")
     left.plot(1e3 * posterior.delays, density, color=BLUE, linewidth=1.5, label="profile of the likelihood")
     reach = 1e3 * (high - low)
     if told is not None and abs(1e3 * told - 500.0 * (low + high)) < 4.0 * reach:
         left.axvline(1e3 * told, color=VERMILION, linestyle="--", linewidth=1.2, label="prior")
     left.set(xlabel="force delay [ms]", ylabel="likelihood over its greatest [1]")
-    finish(left, "best")
+    finish_axes(left, "best")
     name = next((name for name in posterior.names if name.startswith("damping")), "plane")
     second = draws[:, posterior.names.index(name)]
     scale, unit = (1e6, "um") if name == "plane" else (1.0, "N s/m" if name == "damping" else "SI")
     correlation = np.corrcoef(draws[:, 0], second)[0, 1]
-    right.plot(1e3 * draws[::4, 0], scale * second[::4], color=BLUE, alpha=0.4, label="draws", **DOTS)
+    right.plot(1e3 * draws[::4, 0], scale * second[::4], color=BLUE, alpha=0.4, label="draws", **DOT_STYLE)
     right.set(xlabel="force delay [ms]", ylabel=f"{name} [{unit}]")
     right.set_title(f"correlation {correlation:.3f}", fontsize=10)
-    finish(right, None)
+    finish_axes(right, None)
     return figure
 
 
 @matplotlib.style.context("default")
-def contacts(contact: ContactFit) -> Figure:
+def plot_contacts(contact: ContactFit) -> Figure:
     """Plot the measured and the modelled force over time and over depth, for three contacts."""
     readings, problem = contact.readings, contact.problem
-    depth, predicted = _modelled(contact)
+    depth, predicted = _compute_depth_and_force(contact)
     inside = readings.counts & (depth > 0.0)
-    lanes = _shown(contact, inside)
+    lanes = _select_plotted_contacts(contact, inside)
     title = f"Touches: force over time and depth, law {contact.law.name}"
-    figure = new_figure((11, 6.6), title, above=0.75)
+    figure = create_figure((11, 6.6), title, above=0.75)
     figure.subplots_adjust(hspace=0.3)
     grid: Any = figure.subplots(2, max(len(lanes), 1), squeeze=False)
     for column, lane in enumerate(lanes):
@@ -129,9 +152,9 @@ def contacts(contact: ContactFit) -> Figure:
         time = 1e3 * problem.motion.period * (rows - touched[0])
         force = np.where(counts, readings.force[:, lane], np.nan)[around]
         for axes, abscissa in ((grid[0, column], time), (grid[1, column], 1e3 * depth[around, lane])):
-            axes.plot(abscissa, force, color=BLUE, label="measured", **DOTS)
+            axes.plot(abscissa, force, color=BLUE, label="measured", **DOT_STYLE)
             axes.plot(abscissa, predicted[around, lane], color=BLACK, linewidth=1.2, label="model")
-            finish(axes, None)
+            finish_axes(axes, None)
         grid[0, column].set_xlabel("time since the touch [ms]")
         grid[0, column].set_title(f"touch {lane}", fontsize=10)
         grid[1, column].set_xlabel("depth when the force was [mm]")
@@ -143,39 +166,53 @@ def contacts(contact: ContactFit) -> Figure:
 
 
 @matplotlib.style.context("default")
-def residuals(contact: ContactFit) -> Figure:
+def plot_residuals(contact: ContactFit) -> Figure:
     """Plot the whitened residuals of the force over time and depth, and their correlations."""
     readings, problem = contact.readings, contact.problem
-    depth, predicted = _modelled(contact)
+    depth, predicted = _compute_depth_and_force(contact)
     left = problem.whiten(readings.force - predicted) / readings.std
     left = np.where(readings.counts, left, np.nan)
-    figure = new_figure((11, 6.6), "Force less the model's, over the noise")
+    figure = create_figure((11, 6.6), "Force less the model's, over the noise")
     figure.subplots_adjust(hspace=0.3)
     (over_time, by_depth), (autocorrelation, cross) = figure.subplots(2, 2)
     inside = (depth > 0.0) & readings.counts
     time = problem.motion.period * (np.arange(len(left))[:, None] - np.argmax(inside, axis=0))
     shown = readings.counts & (time > -0.02)
     shown &= time < 0.02 + problem.motion.period * inside.sum(axis=0).max()
-    over_time.plot(1e3 * time[shown], left[shown], color=BLUE, alpha=0.5, label="all touches", **DOTS)
+    over_time.plot(1e3 * time[shown], left[shown], color=BLUE, alpha=0.5, label="all touches", **DOT_STYLE)
     over_time.set(xlabel="time since the touch [ms]", ylabel="left over noise [1]")
-    by_depth.plot(1e3 * depth[inside], left[inside], color=BLUE, alpha=0.5, label="all touches", **DOTS)
+    by_depth.plot(1e3 * depth[inside], left[inside], color=BLUE, alpha=0.5, label="all touches", **DOT_STYLE)
     by_depth.set(xlabel="depth when the force was [mm]", ylabel="left over noise [1]")
     for axes in (over_time, by_depth):
-        for side in (-WIDE, WIDE):
+        for side in (-INTERVAL_SIGMAS, INTERVAL_SIGMAS):
             axes.axhline(side, color=ORANGE, linestyle="--", linewidth=1, label="95 %" * (side > 0))
         axes.set_ylim(*(1.3 * np.array(axes.get_ylim())))
-        finish(axes, "upper right")
-    _correlation(autocorrelation, left, left, range(1, LAGS + 1), "with itself, later by [rows]")
+        finish_axes(axes, "upper right")
+    _plot_correlation(
+        autocorrelation, left, left, range(1, MAX_AUTOCORRELATION_LAG + 1), "with itself, later by [rows]"
+    )
     command = np.where(inside, np.gradient(depth, axis=0), np.nan)
-    _correlation(cross, command, left, range(EARLIER, LATER + 1), "with the speed before, by [rows]")
+    _plot_correlation(
+        cross,
+        command,
+        left,
+        range(MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG + 1),
+        "with the speed before, by [rows]",
+    )
     return figure
 
 
 @matplotlib.style.context("default")
-def compare(entries: Sequence[Mapping[str, Any]]) -> Figure:
+def plot_estimates(entries: Sequence[Mapping[str, Any]]) -> Figure:
     """Plot every estimate's 95 % interval and the prior's value, relative to the estimate."""
-    plain = [entry for entry in entries if entry["std"] and abs(entry["value"]) > PLAINLY * entry["std"]]
-    figure = new_figure((9, 1.7 + 0.3 * max(len(plain), 1)), "Estimates, and what the prior said", above=0.9)
+    plain = [
+        entry
+        for entry in entries
+        if entry["std"] and abs(entry["value"]) > MIN_ESTIMATE_SIGMAS * entry["std"]
+    ]
+    figure = create_figure(
+        (9, 1.7 + 0.3 * max(len(plain), 1)), "Estimates, and what the prior said", above=0.9
+    )
     figure.subplots_adjust(left=0.34)
     axes = figure.subplots()
     for row, estimate in enumerate(plain):
@@ -196,25 +233,25 @@ def compare(entries: Sequence[Mapping[str, Any]]) -> Figure:
     most = 2.0 * max(map(abs, axes.get_xlim()))
     axes.set_xlim(-most, most)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    finish(axes, None)
+    finish_axes(axes, None)
     if plain:
         legend_above(axes, 2)
     return figure
 
 
-def _decibel(value):
+def _to_decibel(value):
     return 20.0 * np.log10(np.maximum(np.abs(value), 1e-12))
 
 
-def _degrees(response: np.ndarray) -> np.ndarray:
+def _compute_phase(response: np.ndarray) -> np.ndarray:
     return np.degrees(np.unwrap(np.angle(response)))
 
 
-def _name(motion: FreeMotion) -> str:
+def _format_structure(motion: FreeMotion) -> str:
     return motion.model.structure.name.replace("_", " ")
 
 
-def _distortions(motion: FreeMotion) -> list[float]:
+def _find_distortion_levels(motion: FreeMotion) -> list[float]:
     """Return the levels of odd and even distortion, the largest of the runs; 0 if none was measured."""
     return [
         max(
@@ -225,23 +262,23 @@ def _distortions(motion: FreeMotion) -> list[float]:
     ]
 
 
-def _modelled(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
+def _compute_depth_and_force(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
     """Return the depth [m] at the time of each force and the force of the best fit [N], (rows, lanes)."""
     at, plane, inner = contact.posterior.best
     problem = contact.problem
     return problem.motion.at(at)[0] - plane, problem.force(at, plane, inner.coefficients)
 
 
-def _shown(contact: ContactFit, inside: np.ndarray) -> list[int]:
+def _select_plotted_contacts(contact: ContactFit, inside: np.ndarray) -> list[int]:
     """Return the contacts with the least, the median and the greatest peak force."""
     lanes = np.flatnonzero(inside.any(axis=0))
     peak = np.max(np.where(inside, contact.readings.force, 0.0), axis=0)[lanes]
     order = lanes[np.argsort(peak, kind="stable")]
-    places = np.linspace(0, len(order) - 1, TOUCHES).round().astype(int)
+    places = np.linspace(0, len(order) - 1, PLOTTED_CONTACTS).round().astype(int)
     return list(dict.fromkeys(order[places].tolist())) if len(order) else []
 
 
-def _correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, words: str) -> None:
+def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, words: str) -> None:
     """Plot the correlation of `x` with `y` at each lag [rows], with its 95 % band for white noise."""
     values, chance = [], []
     for lag in lags:
@@ -250,10 +287,12 @@ def _correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, words: s
         both_finite = np.isfinite(a) & np.isfinite(b)
         power = np.sqrt(np.sum(a[both_finite] ** 2) * np.sum(b[both_finite] ** 2))
         values.append(np.sum(a[both_finite] * b[both_finite]) / power if power > 0.0 else 0.0)
-        chance.append(WIDE / np.sqrt(max(both_finite.sum(), 1)))
-    axes.fill_between(list(lags), -np.array(chance), chance, color=SKY, alpha=0.4, linewidth=0, label="95 %")
+        chance.append(INTERVAL_SIGMAS / np.sqrt(max(both_finite.sum(), 1)))
+    axes.fill_between(
+        list(lags), -np.array(chance), chance, color=SKY_BLUE, alpha=0.4, linewidth=0, label="95 %"
+    )
     axes.plot(list(lags), values, color=BLUE, linewidth=1, marker="o", markersize=2.5, label="correlation")
     most = 1.6 * max(*chance, *np.abs(values))  # leaves space for the legend
     axes.set_ylim(-most, most)
     axes.set(xlabel=words, ylabel="correlation of what is left [1]")
-    finish(axes, "upper right")
+    finish_axes(axes, "upper right")

@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxhil.simulation.contact_plot import BLACK, BLUE, ORANGE, finish, new_figure
+from jaxhil.simulation.contact_plot import BLACK, BLUE, ORANGE, create_figure, finish_axes
 from tuning.rig.loop import ANSWER_SHARE
 from tuning.rig.session import SessionReport
 
@@ -19,25 +19,25 @@ def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
 
     Both axes are logarithmic. `period` [s] is the control period, which is drawn with the answer's deadline.
     """
-    figure = new_figure((10, 4.6), title)
+    figure = create_figure((10, 4.6), title)
     left, right = figure.subplots(1, 2, sharey=True)
     loops = {"empty loop": session.empty, "controller": session.run}
     for axes, name in ((left, "tick_time"), (right, "round_trip")):
         for label, loop in loops.items():
             if loop is not None:
-                _histogram(axes, getattr(loop.times, name), label)
+                _plot_histogram(axes, getattr(loop.times, name), label)
         axes.axvline(1e6 * period, color=BLACK, linewidth=0.8, linestyle=":", label="control period")
         axes.set(xscale="log", yscale="log")
     share = 1e6 * ANSWER_SHARE * period
     right.axvline(share, color=BLACK, linewidth=0.8, linestyle="-.", label="answer due")
     left.set(xlabel="controller's time per tick [µs]", ylabel="share of ticks per bin [1]")
     right.set(xlabel="round trip, as the rig sees it [µs]")
-    finish(left, "best")
-    finish(right, "best")
+    finish_axes(left, "best")
+    finish_axes(right, "best")
     return figure
 
 
-def _histogram(axes: Axes, times: np.ndarray, label: str) -> None:
+def _plot_histogram(axes: Axes, times: np.ndarray, label: str) -> None:
     micro = 1e6 * times[times > 0]
     if not len(micro):
         return

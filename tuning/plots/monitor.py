@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jaxhil.errors import one_line
-from jaxhil.simulation.contact_plot import BLUE, SKY, VERMILION, finish, legend_below, new_figure
-from tuning.identification.monitor.figures import FIGURES
-from tuning.plots.parts import WIDE
+from jaxhil.errors import to_one_line
+from jaxhil.simulation.contact_plot import BLUE, SKY_BLUE, VERMILION, create_figure, finish_axes, legend_below
+from tuning.identification.monitor.metrics import METRICS
+from tuning.plots.parts import INTERVAL_SIGMAS
 
 
 @matplotlib.style.context("default")
@@ -23,16 +23,16 @@ def monitor_plot(
     Rows of a metric are its values, their predicted standard deviations, and their deviations in these. A
     change is likely since contact `since`.
     """
-    name = one_line(mechanism, 60)
-    figure = new_figure((9.6, 8.4), f"Contacts held against {name}", below=0.95)
+    name = to_one_line(mechanism, 60)
+    figure = create_figure((9.6, 8.4), f"Contacts held against {name}", below=0.95)
     figure.subplots_adjust(hspace=0.3, wspace=0.28)
     grid: Any = figure.subplots(4, 2, sharex=True)
-    for axes, (figure_name, unit, scale) in zip(grid.flat, FIGURES, strict=False):
+    for axes, (figure_name, unit, scale) in zip(grid.flat, METRICS, strict=False):
         value, std, z = metrics[figure_name]
         middle = scale * (value - z * std)
         axes.fill_between(
-            contacts, middle - WIDE * scale * std, middle + WIDE * scale * std,
-            color=SKY, alpha=0.35, linewidth=0, label="predicted, 95 %",
+            contacts, middle - INTERVAL_SIGMAS * scale * std, middle + INTERVAL_SIGMAS * scale * std,
+            color=SKY_BLUE, alpha=0.35, linewidth=0, label="predicted, 95 %",
         )  # fmt: skip
         axes.plot(
             contacts, scale * value, color=BLUE, marker="o", markersize=4, linewidth=1, label="measured"
@@ -42,7 +42,7 @@ def monitor_plot(
             axes.axvline(since - 0.5, label="a change is likely since", **style)
         axes.set_ylabel(f"{figure_name} [{unit}]", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-        finish(axes, None)
+        finish_axes(axes, None)
     grid[3, 1].set_axis_off()
     for axes in (grid[3, 0], grid[2, 1]):
         axes.set_xlabel("contact")

@@ -12,29 +12,29 @@ from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.shapes import Ball, Box, Capsule, Cavity, Drogue, Plane, Rim, Shape, Shell
 from jaxhil.sixdof.vectors import Vector
 
-Line = np.ndarray  # (points, 3) [m]
+Polyline = np.ndarray  # (points, 3) [m]
 
-TURN = np.linspace(0, 2 * np.pi, 49)  # angles of the points of a circle
-MERIDIANS = 24  # number of meridians of a surface of revolution
-MARK = 0.02  # half size of the cross that marks a point, relative to the mechanism
+CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # angles of the points of a circle
+MERIDIAN_COUNT = 24  # number of meridians of a surface of revolution
+POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, relative to the mechanism
 
 
-def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Line], list[Line]]:
+def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Polyline], list[Polyline]]:
     """Return the outlines of the target, in T axes, and of the chaser, in C axes, without duplicate lines.
 
     They are those of the first batch element.
     """
-    pairs = [pair for group in groups for pair in _pairs(group.candidates)]
+    pairs = [pair for group in groups for pair in _shape_pairs(group.candidates)]
     corners = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])
     size = float(np.max(np.linalg.norm(corners, axis=1), initial=1e-3))
     bodies = []
     for shapes in ([target for _, target in pairs], [chaser for chaser, _ in pairs]):
-        lines = {line.round(9).tobytes(): line for shape in shapes for line in _lines(shape, size)}
+        lines = {line.round(9).tobytes(): line for shape in shapes for line in _shape_outline(shape, size)}
         bodies.append(list(lines.values()))
     return bodies[0], bodies[1]
 
 
-def _pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
+def _shape_pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
     """Return the pairs (chaser's, target's shape) of the first batch element."""
 
     def unstack(shape: Any) -> list[Any]:
@@ -54,22 +54,22 @@ def _corners(shape: Any) -> np.ndarray:
     """Return points (n, 3) that span a shape; none for a plane or an infinite cone."""
     if isinstance(shape, (Ball, Cavity)):
         reach = 0.0 if isinstance(shape, Cavity) else float(shape.radius)
-        return _point(shape.centre)[None] + reach * np.eye(3)
+        return _as_point(shape.centre)[None] + reach * np.eye(3)
     if isinstance(shape, Capsule):
-        return np.stack([_point(shape.start), _point(shape.end)])
+        return np.stack([_as_point(shape.start), _as_point(shape.end)])
     if isinstance(shape, Shell):
         return np.array([[float(shape.mouth_radius), 0.0, 0.0]])
     if isinstance(shape, Box):
-        return _point(shape.centre)[None] + _point(shape.half_lengths)
+        return _as_point(shape.centre)[None] + _as_point(shape.half_lengths)
     return np.zeros((0, 3))
 
 
-def _lines(shape: Any, size: float) -> list[Line]:
+def _shape_outline(shape: Any, size: float) -> list[Polyline]:
     """Return the outline of a shape of a mechanism of this `size` [m]."""
     if isinstance(shape, (Ball, Cavity)):
         radius = float(shape.radius)
         circles = [radius * np.roll(_circle(), turn, axis=1) for turn in range(3)] if radius else _cross(size)
-        return [_point(shape.centre) + circle for circle in circles]
+        return [_as_point(shape.centre) + circle for circle in circles]
     if isinstance(shape, Plane):
         return _plane(shape, size)
     if isinstance(shape, Drogue):
@@ -82,24 +82,24 @@ def _lines(shape: Any, size: float) -> list[Line]:
     return _box(shape)
 
 
-def _circle() -> Line:
-    return np.stack([np.cos(TURN), np.sin(TURN), 0 * TURN], axis=1)
+def _circle() -> Polyline:
+    return np.stack([np.cos(CIRCLE_ANGLES), np.sin(CIRCLE_ANGLES), 0 * CIRCLE_ANGLES], axis=1)
 
 
-def _cross(size: float) -> list[Line]:
-    return [MARK * size * np.outer([-1, 1], axis) for axis in np.eye(3)]
+def _cross(size: float) -> list[Polyline]:
+    return [POINT_MARK_SIZE * size * np.outer([-1, 1], axis) for axis in np.eye(3)]
 
 
-def _plane(plane: Plane, size: float) -> list[Line]:
-    normal = _point(plane.normal)
+def _plane(plane: Plane, size: float) -> list[Polyline]:
+    normal = _as_point(plane.normal)
     across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
     sides = np.stack([across, np.cross(normal, across)])
     corners = 1.2 * size * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) @ sides
-    return [_point(plane.point) + corners]
+    return [_as_point(plane.point) + corners]
 
 
-def _drogue(drogue: Drogue, size: float) -> list[Line]:
+def _drogue(drogue: Drogue, size: float) -> list[Polyline]:
     """Return meridians and parallels of the bottom and of the cone up to the mouth."""
     angle, bottom = float(drogue.half_angle), float(drogue.bottom_radius)
     mouth = float(drogue.mouth_radius) if isinstance(drogue, Shell) else 1.2 * size
@@ -108,12 +108,15 @@ def _drogue(drogue: Drogue, size: float) -> list[Line]:
     end = (mouth * np.cos(angle) - bottom) / np.sin(angle)
     radius, height = np.append(radius, mouth), np.append(height, end) + float(drogue.bottom)
     meridian = np.stack([radius, 0 * radius, height], axis=1)
-    lines = [meridian @ _about_z(turn).T for turn in np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)]
+    lines = [
+        meridian @ _rotation_about_z(turn).T
+        for turn in np.linspace(0, 2 * np.pi, MERIDIAN_COUNT, endpoint=False)
+    ]
     return lines + [r * _circle() + [0, 0, z] for r, z in zip(radius[-2:], height[-2:], strict=True)]
 
 
-def _capsule(capsule: Capsule) -> list[Line]:
-    start, end, radius = _point(capsule.start), _point(capsule.end), float(capsule.radius)
+def _capsule(capsule: Capsule) -> list[Polyline]:
+    start, end, radius = _as_point(capsule.start), _as_point(capsule.end), float(capsule.radius)
     along = (end - start) / np.linalg.norm(end - start)
     across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     across *= radius / np.linalg.norm(across)
@@ -121,17 +124,17 @@ def _capsule(capsule: Capsule) -> list[Line]:
     return [np.stack([start, end]), *(np.stack([start + side, end + side]) for side in sides)]
 
 
-def _box(box: Box) -> list[Line]:
-    half = _point(box.half_lengths)
+def _box(box: Box) -> list[Polyline]:
+    half = _as_point(box.half_lengths)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     edges = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
-    points = (corners * half) @ rotation_matrix(box.attitude).T + _point(box.centre)
+    points = (corners * half) @ rotation_matrix(box.attitude).T + _as_point(box.centre)
     return [points[list(edge)] for edge in edges]
 
 
 def rotation_matrix(attitude: Quaternion) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a unit quaternion."""
-    w, (x, y, z) = float(attitude.w), _point(attitude.v)
+    w, (x, y, z) = float(attitude.w), _as_point(attitude.v)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -139,10 +142,10 @@ def rotation_matrix(attitude: Quaternion) -> np.ndarray:
     ])  # fmt: skip
 
 
-def _about_z(angle: float) -> np.ndarray:
+def _rotation_about_z(angle: float) -> np.ndarray:
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
-def _point(vector: Vector) -> np.ndarray:
+def _as_point(vector: Vector) -> np.ndarray:
     return np.array([float(vector.x), float(vector.y), float(vector.z)])

@@ -17,10 +17,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from jaxhil.simulation.contact_plot import BLACK
 
-WIDE = 1.96  # half width of a 95 % interval [standard deviations]
+INTERVAL_SIGMAS = 1.96  # half width of a 95 % interval [standard deviations]
 MARKERS = {"before": "^", "literature": "s", "tuned": "o"}
-IDENTIFIER = re.compile(r'<g id="[^"]*"')
-LINK = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
+ID_PATTERN = re.compile(r'<g id="[^"]*"')
+LINK_PATTERN = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
 
 def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2, **style: Any) -> None:
@@ -45,12 +45,12 @@ def set_scale(axis: Axis, low: float, high: float, logarithmic: bool) -> None:
     """Set the scale of an input's axis and its ticks, for values from `low` to `high`."""
     if logarithmic:
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
-        plain_ticks(axis, low, high)
+        set_plain_ticks(axis, low, high)
     else:
         axis.set_major_locator(MaxNLocator(6, steps=(1, 2, 2.5, 5, 10)))
 
 
-def plain_ticks(axis: Axis, low: float, high: float) -> None:
+def set_plain_ticks(axis: Axis, low: float, high: float) -> None:
     """Set enough ticks on a logarithmic axis to read off values, with plain numbers as labels."""
     decades = np.log10(high / low)
     factors = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
@@ -71,7 +71,7 @@ def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
     with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
         figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     svg = content.getvalue()
-    svg = IDENTIFIER.sub("<g", svg[svg.index("<svg") :])
+    svg = ID_PATTERN.sub("<g", svg[svg.index("<svg") :])
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
 
     def link(match: re.Match[str]) -> str:
@@ -79,4 +79,4 @@ def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
         label = html.escape(f"scenario {index}: {(points or {}).get(index, '')}")
         return f'<a href="#scenario-{index}" aria-label="{label}"><title>{label}</title>'
 
-    return LINK.sub(link, svg).replace("xlink:href", "href")
+    return LINK_PATTERN.sub(link, svg).replace("xlink:href", "href")

@@ -11,18 +11,18 @@ from matplotlib.figure import Figure
 
 from jaxhil.simulation.contact_plot import (
     BLACK,
-    SKY,
+    SKY_BLUE,
     VERMILION,
-    contact_plot,
-    finish,
+    create_figure,
+    finish_axes,
     legend_below,
-    new_figure,
+    plot_contacts,
 )
-from tuning.plots.parts import draw_limit, plain_ticks, set_scale
+from tuning.plots.parts import draw_limit, set_plain_ticks, set_scale
 from tuning.sweeps.chunks import Sweep
 from tuning.sweeps.manifest import Manifest
-from tuning.sweeps.regions import Input, Plan, Points, Regions
-from tuning.sweeps.replay import motion_of, recorded
+from tuning.sweeps.plot_statistics import PlotInput, PlotPlan, PlotPoints, PlotStatistics
+from tuning.sweeps.replay import compute_motion, record_six_axes
 
 FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
 
@@ -30,20 +30,20 @@ FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
 def scenario_plot(sweep: Sweep, index: int, title: str) -> Figure:
     """Plot the scenario's motion at every tick, for one axis or six."""
     if sweep.model.axes == 1:
-        return contact_plot(motion_of(sweep, index), title, sensors="rig")
+        return plot_contacts(compute_motion(sweep, index), title, sensors="rig")
     from tuning.plots.six_axes import six_axes_plot
 
-    return six_axes_plot(recorded(sweep, index), title)
+    return six_axes_plot(record_six_axes(sweep, index), title)
 
 
 @matplotlib.style.context("default")
-def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
+def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
     """Plot scenarios as points, failed or not, over both inputs, and the worst error over each input."""
     number = len(plan.per_scenario)
     points, limit = regions.points, manifest.limit or None
     size = (13, 4.9) if number == 2 else (7, 5.3)
     title = f"{name}: {regions.failed} of {regions.scenarios} scenarios failed"
-    figure = new_figure(size, title, below=1.0 if number == 2 else 1.4)
+    figure = create_figure(size, title, below=1.0 if number == 2 else 1.4)
     figure.subplots_adjust(wspace=0.32)
     panels: Any = figure.subplots(1, 3 if number == 2 else 1, squeeze=False)[0]
     if number == 2:
@@ -62,12 +62,12 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
         draw_limit(axes.axhline, limit, 1.5, zorder=4)
         name_axis(axes.xaxis, quantity, points.inputs[index])
         axes.set(yscale="log", ylim=(low, high * 1.1), ylabel="worst error of the scenario |e - e*| [1]")
-        plain_ticks(axes.yaxis, low, high)
+        set_plain_ticks(axes.yaxis, low, high)
     for axes in panels:
-        finish(axes, None)
+        finish_axes(axes, None)
     handles, labels = panels[-1].get_legend_handles_labels()
     columns = (2 if UNENDED in labels else 4) if number == 2 else (1 if UNENDED in labels else 2)
-    labels = [_counted(label, points, regions) for label in labels]
+    labels = [_label_with_count(label, points, regions) for label in labels]
     style: dict[str, Any] = {"fontsize": 9, "frameon": False, "markerscale": 2}
     figure.legend(handles, labels, loc="lower center", ncols=columns, **style)
     return figure
@@ -75,11 +75,11 @@ def failure_region(plan: Plan, regions: Regions, manifest: Manifest, name: str) 
 
 @matplotlib.style.context("default")
 def linked_scenarios(
-    name: str, inputs: Sequence[Any], points: Points, limit: float | None, linked: Sequence[int]
+    name: str, inputs: Sequence[Any], points: PlotPoints, limit: float | None, linked: Sequence[int]
 ) -> Figure:
     """Draw the worst error of scenarios over each input, with rings around the linked scenarios."""
     number = max(1, len(inputs))
-    figure = new_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
+    figure = create_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
     panels: Any = figure.subplots(1, number, squeeze=False)[0]
     positions = {int(index): column for column, index in enumerate(points.index)}
     rings_at = [positions[index] for index in linked if index in positions]
@@ -89,7 +89,7 @@ def linked_scenarios(
     for column, axes in enumerate(panels):
         across = points.inputs[column] if inputs else points.index
         for mask, label, colour, marker in (
-            (~points.failed, "not failed", SKY, "."), (points.failed, "failed", VERMILION, "x"),
+            (~points.failed, "not failed", SKY_BLUE, "."), (points.failed, "failed", VERMILION, "x"),
         ):  # fmt: skip
             if np.any(mask):
                 axes.plot(across[mask], errors[mask], linestyle="none", marker=marker, markersize=3,
@@ -100,11 +100,11 @@ def linked_scenarios(
         draw_limit(axes.axhline, limit, 1.5)
         label = inputs[column].label if inputs else "scenario [1]"
         axes.set(yscale="log", xlabel=label, ylabel="worst |e - e*| of the scenario [1]")
-        plain_ticks(axes.yaxis, *axes.get_ylim())
+        set_plain_ticks(axes.yaxis, *axes.get_ylim())
         if inputs and inputs[column].logarithmic:
             axes.set_xscale("log")
-            plain_ticks(axes.xaxis, *axes.get_xlim())
-        finish(axes, None)
+            set_plain_ticks(axes.xaxis, *axes.get_xlim())
+        finish_axes(axes, None)
     legend_below(figure, panels[0])
     return figure
 
@@ -115,7 +115,7 @@ def _draw_points(
     """Draw scenarios as points whose marker shows whether they failed and whether all contacts ended."""
     ended = np.isfinite(size)
     for which, label, colour, marker, width in (
-        (~failed, "not failed", SKY, "o", 2.0),
+        (~failed, "not failed", SKY_BLUE, "o", 2.0),
         (failed & ended, FAILED, VERMILION, "x", 3.5),
         (failed & ~ended, UNENDED, BLACK, "^", 3.5),
     ):
@@ -125,7 +125,7 @@ def _draw_points(
             axes.plot(across[which], up[which], color=colour, label=label, **style)
 
 
-def _counted(label: str, points: Points, regions: Regions) -> str:
+def _label_with_count(label: str, points: PlotPoints, regions: PlotStatistics) -> str:
     """Return a label of points with their number and, if only some are drawn, the total."""
     shown, total = int(np.sum(points.failed)), regions.failed
     unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
@@ -141,7 +141,7 @@ def _counted(label: str, points: Points, regions: Regions) -> str:
     return f"{label} ({total})" if shown == total else f"{label} (the first {shown} of {total})"
 
 
-def name_axis(axis: Axis, quantity: Input, values: Sequence[float] | np.ndarray = ()) -> None:
+def name_axis(axis: Axis, quantity: PlotInput, values: Sequence[float] | np.ndarray = ()) -> None:
     """Set label, scale and limits of an input's axis, which also covers `values` and their markers."""
     axis.set_label_text(quantity.label)
     low, high = float(np.min(values, initial=quantity.low)), float(np.max(values, initial=quantity.high))

@@ -8,16 +8,32 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, finish, new_figure
+from jaxhil.simulation.contact_plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    SKY_BLUE,
+    VERMILION,
+    create_figure,
+    finish_axes,
+)
 from jaxhil.sixdof.recording import Recorded
-from tuning.plots.outlines import Line, outlines, rotation_matrix
+from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 
-AXES = ("x", "y", "z")
-COLOURS = (BLUE, VERMILION, GREEN)
-MANY = (BLUE, VERMILION, GREEN, ORANGE, SKY, "0.35")  # colours of candidates; repeated with dashed lines
-MARGIN = 0.05  # s; time shown before the first and after the last contact
-FLATTEST = 0.3  # least ratio of a view's height to its width
-MOST_NAMES = 12  # limit on the number of candidates in a legend
+AXIS_NAMES = ("x", "y", "z")
+AXIS_COLOURS = (BLUE, VERMILION, GREEN)
+CANDIDATE_COLOURS = (
+    BLUE,
+    VERMILION,
+    GREEN,
+    ORANGE,
+    SKY_BLUE,
+    "0.35",
+)  # colours of candidates; repeated with dashed lines
+TIME_MARGIN = 0.05  # s; time shown before the first and after the last contact
+MIN_VIEW_RATIO = 0.3  # least ratio of a view's height to its width
+MAX_LEGEND_ENTRIES = 12  # limit on the number of candidates in a legend
 VIEWS = ((0, 2), (1, 2))  # horizontal and vertical axis of each view
 
 
@@ -27,24 +43,24 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
 
     Grey lines show the ideal contact.
     """
-    figure = new_figure((12, 8.8), title, above=0.6, below=0.75)
+    figure = create_figure((12, 8.8), title, above=0.6, below=0.75)
     rows = figure.add_gridspec(3, 4, height_ratios=(1, 1, 0.75), hspace=0.38, wspace=0.36)
-    shown, (origin, since) = window(recorded), origin_of(recorded)
+    shown, (origin, since) = find_shown_ticks(recorded), find_time_origin(recorded)
     time = 1e3 * (recorded.time[shown] - recorded.time[origin])
     for cell, name, part in ((rows[0, :2], "position [mm]", 0), (rows[0, 2:], "rotation [mrad]", 3)):
         axes = figure.add_subplot(cell)
-        for axis, colour in enumerate(COLOURS):
+        for axis, colour in enumerate(AXIS_COLOURS):
             entry = part + axis
             curves = (curve[shown, entry] - recorded.in_space[origin, entry] for curve in recorded[1:4])
             desired, actual, in_space = (1e3 * curve for curve in curves)
             axes.plot(time, in_space, color="0.7", linewidth=3)
-            axes.plot(time, desired, color=colour, label=AXES[axis])
+            axes.plot(time, desired, color=colour, label=AXIS_NAMES[axis])
             axes.plot(time, actual, color=colour, linestyle=":")
         axes.set(ylabel=f"{name}, less that\n{since.replace('since', 'at')}")
-        finish(axes, "best")
+        finish_axes(axes, "best")
     left, right = figure.add_subplot(rows[1, :2]), figure.add_subplot(rows[1, 2:])
-    _forces(left, recorded, shown, time)
-    _moments(right, recorded, shown, time)
+    _plot_forces(left, recorded, shown, time)
+    _plot_moments(right, recorded, shown, time)
     for axes in (left, right):
         axes.set(xlabel=f"time {since} [ms]")
     target, chaser = outlines(recorded.groups)
@@ -60,7 +76,7 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
     return figure
 
 
-def origin_of(recorded: Recorded) -> tuple[int, str]:
+def find_time_origin(recorded: Recorded) -> tuple[int, str]:
     """Return the tick of time 0 and its description: the first touch, of the ideal contact if it touches."""
     in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
     if len(in_space):
@@ -77,22 +93,28 @@ def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
     return ("first touch", int(touching[0])), ("deepest", int(np.argmax(recorded.depth.max(axis=1))))
 
 
-def window(recorded: Recorded) -> slice:
+def find_shown_ticks(recorded: Recorded) -> slice:
     """Return the ticks from first to last contact, on the rig or ideal, with a margin; else all ticks."""
     touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_in_space != 0, axis=1)
     ticks = np.flatnonzero(touching)
     if not len(ticks):
         return slice(0, len(recorded.time))
-    margin = round(MARGIN / float(recorded.time[1] - recorded.time[0])) + 1
+    margin = round(TIME_MARGIN / float(recorded.time[1] - recorded.time[0])) + 1
     return slice(max(ticks[0] - margin, 0), min(ticks[-1] + margin, len(recorded.time)))
 
 
 def draw_view(
-    axes: Axes, recorded: Recorded, tick: int, target: list[Line], chaser: list[Line], across: int, up: int
+    axes: Axes,
+    recorded: Recorded,
+    tick: int,
+    target: list[Polyline],
+    chaser: list[Polyline],
+    across: int,
+    up: int,
 ) -> None:
     """Draw both mechanisms at a tick, seen along the third axis, in mm."""
     pose = recorded.actual[tick]
-    rotation = rotation_matrix(rotation_of(pose[3:]))
+    rotation = rotation_matrix(quaternion_of(pose[3:]))
     moved = [line @ rotation.T + pose[:3] for line in chaser]
     for lines, colour in ((target, "0.55"), (moved, BLUE)):
         flat: Any = [1e3 * line[:, [across, up]] for line in lines]
@@ -101,20 +123,20 @@ def draw_view(
     axes.set_aspect("equal", adjustable="box")
     width, height = (float(np.ptp(limits)) for limits in (axes.dataLim.intervalx, axes.dataLim.intervaly))
     # A flat mechanism needs additional height for its forces.
-    missing = max(FLATTEST * width - height, 0.0)
+    missing = max(MIN_VIEW_RATIO * width - height, 0.0)
     axes.set_ylim(axes.get_ylim()[0] - missing / 2, axes.get_ylim()[1] + missing / 2)
     largest = max(float(np.max(recorded.force)), 1e-12)
-    length = 0.4 * max(height, FLATTEST * width)
+    length = 0.4 * max(height, MIN_VIEW_RATIO * width)
     for candidate in np.flatnonzero(recorded.depth[tick] > 0):
         start = 1e3 * recorded.point[tick, candidate][[across, up]]
         push = length * recorded.push[tick, candidate][[across, up]] / largest
         axes.plot(*start, marker=".", color=BLACK, markersize=5)
         axes.annotate("", start + push, start, arrowprops={"arrowstyle": "->", "color": BLACK})
-    axes.set(xlabel=f"{AXES[across]} of T [mm]", ylabel=f"{AXES[up]} of T [mm]")
+    axes.set(xlabel=f"{AXIS_NAMES[across]} of T [mm]", ylabel=f"{AXIS_NAMES[up]} of T [mm]")
     axes.tick_params(labelsize=8)
 
 
-def rotation_of(theta: np.ndarray) -> Any:
+def quaternion_of(theta: np.ndarray) -> Any:
     """Return the quaternion of a rotation vector [rad]."""
     import jax.numpy as jnp
 
@@ -124,23 +146,26 @@ def rotation_of(theta: np.ndarray) -> Any:
     return exponential(vector(jnp.asarray(theta)))
 
 
-def _forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
     """Plot the normal force of every candidate in contact, and the total force of the ideal contact."""
     total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
     axes.plot(time, total, color="0.7", linewidth=3, label="in space, whole")
     for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
-        colour, line = MANY[index % len(MANY)], "-" if index < len(MANY) else "--"
-        name = recorded.names[candidate] if index < MOST_NAMES else None
+        colour, line = (
+            CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)],
+            "-" if index < len(CANDIDATE_COLOURS) else "--",
+        )
+        name = recorded.names[candidate] if index < MAX_LEGEND_ENTRIES else None
         axes.plot(time, recorded.force[shown, candidate], color=colour, linestyle=line, label=name)
     axes.set(ylabel="normal force of each contact [N]")
-    finish(axes, "best")
+    finish_axes(axes, "best")
 
 
-def _moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+def _plot_moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
     """Plot the moment about T of the real contact, of the command to the numerical model, and ideal."""
-    for axis, colour in enumerate(COLOURS):
+    for axis, colour in enumerate(AXIS_COLOURS):
         axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
-        axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXES[axis])
+        axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXIS_NAMES[axis])
         axes.plot(time, recorded.wrench[shown, 3 + axis], color=colour, linestyle=":")
     axes.set(ylabel="moment about T [N m]")
-    finish(axes, "best")
+    finish_axes(axes, "best")

@@ -11,27 +11,30 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from jaxhil.errors import one_line
-from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, SKY, VERMILION, finish, new_figure
+from jaxhil.errors import to_one_line
+from jaxhil.simulation.contact_plot import BLACK, BLUE, GREEN, SKY_BLUE, VERMILION, create_figure, finish_axes
 from tuning.plots.parts import set_scale
 from tuning.stability_map.axes import MapAxis
-from tuning.stability_map.grid import Map
-from tuning.sweeps.regions import NAMES, UNITS
+from tuning.stability_map.grid import MapResults
+from tuning.sweeps.plot_statistics import DISPLAY_UNITS, INPUT_LABELS
 
-STEPS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
-LARGEST = 10.0  # largest error on the colour scale
-FEW, MANY = 4, 20  # largest number of contours, and of ticks of the colour bar, for either sign
-PALE = "#F7CF85"  # orange on which black lines are visible
+CONTOUR_ERRORS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
+MAX_COLOUR_ERROR = 10.0  # largest error on the colour scale
+MAX_CONTOURS, MAX_COLOUR_TICKS = (
+    4,
+    20,
+)  # largest number of contours, and of ticks of the colour bar, for either sign
+PALE_ORANGE = "#F7CF85"  # orange on which black lines are visible
 
 
 @matplotlib.style.context("default")
-def map_plot(stability_map: Map, title: str, limit: float) -> Figure:
+def map_plot(stability_map: MapResults, title: str, limit: float) -> Figure:
     """Draw the signed error in colours with contours, those of theory, and the nominal point with margins."""
-    figure = new_figure((8.6, 7.0), title)
+    figure = create_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
     axes = figure.subplots()
     x, y = (
-        _shown(axis, values)
+        _in_plot_unit(axis, values)
         for axis, values in zip(stability_map.axes, (stability_map.x, stability_map.y), strict=True)
     )
     handles = _draw_error(figure, axes, stability_map, x, y, limit)
@@ -39,13 +42,15 @@ def map_plot(stability_map: Map, title: str, limit: float) -> Figure:
     handles += _draw_theory(axes, stability_map, x, y, limit)
     handles += _draw_nominal(axes, stability_map)
     for axis, plot_axis in zip(stability_map.axes, (axes.xaxis, axes.yaxis), strict=True):
-        low, high = _shown(axis, np.array([axis.low, axis.high]))
+        low, high = _in_plot_unit(axis, np.array([axis.low, axis.high]))
         # A key is text, not a formula.
-        label = f"{NAMES.get(axis.key, one_line(axis.key, 60))} [{one_line(_unit(axis), 20)}]"
+        label = (
+            f"{INPUT_LABELS.get(axis.key, to_one_line(axis.key, 60))} [{to_one_line(_plot_unit(axis), 20)}]"
+        )
         plot_axis.set_label_text(label.replace("$", r"\$"))
         set_scale(plot_axis, low, high, axis.logarithmic)
         (axes.set_xlim if plot_axis is axes.xaxis else axes.set_ylim)(low, high)
-    finish(axes, None)
+    finish_axes(axes, None)
     axes.grid(False)
     figure.subplots_adjust(bottom=(0.7 + 0.22 * -(-len(handles) // 2)) / 7.0)
     figure.legend(handles=handles, loc="lower center", fontsize=8.5, frameon=False, ncols=2, handlelength=3.5)
@@ -53,26 +58,28 @@ def map_plot(stability_map: Map, title: str, limit: float) -> Figure:
 
 
 def _draw_error(
-    figure: Figure, axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, limit: float
+    figure: Figure, axes: Axes, stability_map: MapResults, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
     """Draw the error in colours with contours, and return the handles for the legend."""
     error = stability_map.error
-    anchors = [BLUE, SKY, "white", PALE, VERMILION]
+    anchors = [BLUE, SKY_BLUE, "white", PALE_ORANGE, VERMILION]
     colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
     finite = np.abs(error[np.isfinite(error)])
     drawn = limit if 0 < limit < np.inf else 0.01
-    most = float(np.clip(np.max(finite, initial=0.0), 3 * drawn, LARGEST))
+    most = float(np.clip(np.max(finite, initial=0.0), 3 * drawn, MAX_COLOUR_ERROR))
     mesh = axes.pcolormesh(
         x, y, np.ma.masked_invalid(np.clip(error, -most, most)), cmap=colours, shading="nearest",
         norm=SymLogNorm(drawn, vmin=-most, vmax=most), rasterized=True,
     )  # fmt: skip
     bar = figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
     bar.set_label("largest error of a contact, e - e* [1]  (above 0: divergence)")
-    bar.ax.yaxis.set_major_locator(FixedLocator([0.0, *_levels(np.array([-most, most]), drawn, MANY)]))
+    bar.ax.yaxis.set_major_locator(
+        FixedLocator([0.0, *_contour_levels(np.array([-most, most]), drawn, MAX_COLOUR_TICKS)])
+    )
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.3g}" if value else "0"))
     handles: list[Any] = []
-    levels = [level for level in _levels(error, drawn) if abs(level) != drawn]
+    levels = [level for level in _contour_levels(error, drawn) if abs(level) != drawn]
     if levels:
         lines = axes.contour(x, y, error, levels=levels, colors=BLACK, linewidths=0.8, linestyles="-")
         axes.clabel(lines, fmt=lambda value: f"{value:+.2g}", fontsize=8)
@@ -85,7 +92,9 @@ def _draw_error(
     return handles
 
 
-def _draw_theory(axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, limit: float) -> list[Any]:
+def _draw_theory(
+    axes: Axes, stability_map: MapResults, x: np.ndarray, y: np.ndarray, limit: float
+) -> list[Any]:
     """Draw the contours of the closed forms, and return the handles for the legend."""
     handles: list[Any] = []
     drawn = limit if 0 < limit < np.inf else 0.01
@@ -94,7 +103,9 @@ def _draw_theory(axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, l
         (stability_map.closed.characteristic_root, GREEN, (0, (1, 2)), "theory: characteristic root"),
     ):
         levels = (
-            [] if values is None else [level for level in _levels(stability_map.error, drawn) if level > 0]
+            []
+            if values is None
+            else [level for level in _contour_levels(stability_map.error, drawn) if level > 0]
         )
         if values is not None and levels:
             axes.contour(x, y, values - 1, levels=levels, colors=colour, linewidths=2.0, linestyles=[line])
@@ -108,20 +119,23 @@ def _draw_theory(axes: Axes, stability_map: Map, x: np.ndarray, y: np.ndarray, l
     return handles
 
 
-def _draw_growth(axes: Axes, stability_map: Map) -> list[Any]:
+def _draw_growth(axes: Axes, stability_map: MapResults) -> list[Any]:
     """Draw the contour at which the spectral radius of a lasting contact is 1; return its handle."""
     radii = stability_map.radii
     if radii is None or not np.min(radii.values) < 1 < np.max(radii.values):
         return []
-    x, y = (_shown(axis, values) for axis, values in zip(stability_map.axes, (radii.x, radii.y), strict=True))
+    x, y = (
+        _in_plot_unit(axis, values)
+        for axis, values in zip(stability_map.axes, (radii.x, radii.y), strict=True)
+    )
     axes.contour(x, y, radii.values, levels=[1.0], colors=GREEN, linewidths=2.2)
     label = "spectral radius 1: beyond, a contact that lasts grows"
     return [Line2D([], [], color=GREEN, linewidth=2.2, label=label)]
 
 
-def _draw_nominal(axes: Axes, stability_map: Map) -> list[Any]:
+def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
     """Draw the nominal point and its margins, and return its handle."""
-    point = [float(_shown(axis, np.array(axis.nominal))) for axis in stability_map.axes]
+    point = [float(_in_plot_unit(axis, np.array(axis.nominal))) for axis in stability_map.axes]
     style: dict[str, Any] = {
         "marker": "o",
         "markersize": 8,
@@ -139,25 +153,25 @@ def _draw_nominal(axes: Axes, stability_map: Map) -> list[Any]:
                 axis.low if margin.low is None else margin.low,
                 axis.high if margin.high is None else margin.high,
             ]
-            line = [list(_shown(axis, np.array(ends))), [point[1 - index]] * 2]
+            line = [list(_in_plot_unit(axis, np.array(ends))), [point[1 - index]] * 2]
             axes.plot(*(line if index == 0 else line[::-1]), color=BLACK, linewidth=1.2, linestyle=":")
     return [Line2D([], [], linestyle=":" if "and" in label else "none", color=BLACK, label=label, **style)]
 
 
-def _levels(error: np.ndarray, limit: float, most: int = FEW) -> list[float]:
+def _contour_levels(error: np.ndarray, limit: float, most: int = MAX_CONTOURS) -> list[float]:
     """Return the errors with contours: 1 and 3 in each decade, and the limit, within the range of errors."""
-    sizes = sorted({limit, *(size for size in STEPS if size > 1.5 * limit)})
+    sizes = sorted({limit, *(size for size in CONTOUR_ERRORS if size > 1.5 * limit)})
     low, high = np.nanmin(error, initial=0.0), np.nanmax(error, initial=0.0)
     above = [size for size in sizes if size < high][-most:]
     below = [-size for size in sizes if -size > low][-most:]
     return sorted([*below, *above])
 
 
-def _unit(axis: MapAxis) -> str:
+def _plot_unit(axis: MapAxis) -> str:
     """Return the unit of an axis in the plot."""
-    return UNITS.get(axis.unit, (1.0, axis.unit))[1]
+    return DISPLAY_UNITS.get(axis.unit, (1.0, axis.unit))[1]
 
 
-def _shown(axis: MapAxis, values: np.ndarray) -> np.ndarray:
+def _in_plot_unit(axis: MapAxis, values: np.ndarray) -> np.ndarray:
     """Return values in the unit of the plot."""
-    return UNITS.get(axis.unit, (1.0, axis.unit))[0] * values
+    return DISPLAY_UNITS.get(axis.unit, (1.0, axis.unit))[0] * values

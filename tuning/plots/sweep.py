@@ -16,54 +16,60 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-from jaxhil.files import writing
+from jaxhil.files import report_write_errors
 from jaxhil.simulation.contact_plot import (
     BLACK,
     BLUE,
     GREEN,
     ORANGE,
-    SKY,
+    SKY_BLUE,
     VERMILION,
-    finish,
-    new_figure,
-    save,
+    create_figure,
+    finish_axes,
+    save_figure,
 )
-from tuning.plots.parts import draw_limit, legend_above, plain_ticks
-from tuning.plots.scenarios import failure_region, name_axis
+from tuning.plots.parts import draw_limit, legend_above, set_plain_ticks
+from tuning.plots.scenarios import name_axis, plot_failure_region
 from tuning.statistics.intervals import binomial_interval, confidence_sequence, replicate_interval
-from tuning.sweeps.manifest import Manifest, loaded_gains
-from tuning.sweeps.regions import Input, Plan, Regions, quantile, read_regions
-from tuning.sweeps.store import PLOTS, Store
+from tuning.sweeps.manifest import Manifest, load_gains
+from tuning.sweeps.plot_statistics import (
+    PlotInput,
+    PlotPlan,
+    PlotStatistics,
+    compute_error_quantile,
+    read_regions,
+)
+from tuning.sweeps.store import PLOTS, SweepStore
 
-FEW = 20  # least number of contacts of a cell with a 95th percentile
+MIN_CONTACTS_PER_CELL = 20  # least number of contacts of a cell with a 95th percentile
 # Terms for errors and contacts that replace those of one axis in six-axis plots.
-IN_SPACE = {
+SIX_AXIS_TERMS = {
     "|e - e*|": "|error|",
     "restitution error": "errors",
     "a contact": "an episode",
     "contacts": "errors",
 }
 # Order, label, colour and line style of every quantile of the profile.
-PROFILE = (
-    (0.5, "half of the contacts", SKY, "-"),
+PROFILE_QUANTILES = (
+    (0.5, "half of the contacts", SKY_BLUE, "-"),
     (0.95, "95 %", BLUE, "-"),
     (0.99, "99 %", ORANGE, "-."),
 )
 
 
-def draw_store(store: Store, acceptable: float | None = None) -> dict[str, Figure]:
+def draw_plots(store: SweepStore, acceptable: float | None = None) -> dict[str, Figure]:
     """Draw the plots of the parts before the first missing one; return them by file name.
 
     One part is read at a time. `acceptable` is a failure probability [1] that the convergence plot shows.
     """
-    manifest, mechanism = store.manifest, loaded_gains(store.manifest).mechanism
+    manifest, mechanism = store.manifest, load_gains(store.manifest).mechanism
     plan, regions = read_regions(store, mechanism)
     if plan is None or regions is None:
         return {}
     drawn = (
-        error_map(plan, regions, manifest, mechanism.name),
-        failure_region(plan, regions, manifest, mechanism.name),
-        convergence(plan, regions, manifest, mechanism.name, acceptable),
+        plot_error_map(plan, regions, manifest, mechanism.name),
+        plot_failure_region(plan, regions, manifest, mechanism.name),
+        plot_convergence(plan, regions, manifest, mechanism.name, acceptable),
     )
     if manifest.axes == 6:
         for figure in drawn:
@@ -76,32 +82,34 @@ def _rename_for_six_axes(figure: Figure) -> None:
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         label = text.get_text()
-        for old, new in IN_SPACE.items():
+        for old, new in SIX_AXIS_TERMS.items():
             label = label.replace(old, new)
         text.set_text(label)
 
 
-def write_plots(store: Store, acceptable: float | None = None) -> list[str]:
+def write_plots(store: SweepStore, acceptable: float | None = None) -> list[str]:
     """Draw and write the plots; return their paths. Raise `InputError` if one cannot be written."""
     paths = []
-    for name, figure in draw_store(store, acceptable).items():
+    for name, figure in draw_plots(store, acceptable).items():
         path = Path(store.folder) / name
-        with writing(path):
-            save(figure, path)
+        with report_write_errors(path):
+            save_figure(figure, path)
         paths.append(str(path))
     return paths
 
 
 @matplotlib.style.context("default")
-def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Figure:
+def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
     """Plot quantiles of |e - e*| over the first input and, as a map, over both inputs."""
-    figure = new_figure((8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85)
+    figure = create_figure(
+        (8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85
+    )
     two = len(plan.per_contact) == 2
     figure.subplots_adjust(left=0.095, right=0.88, hspace=0.12, wspace=0.03)
     grid: Any = figure.subplots(2 if two else 1, 2, squeeze=False, gridspec_kw={"width_ratios": (40, 1)})
     grid[0, 1].axis("off")
     if not plan.per_contact:
-        finish(grid[0, 0], None)
+        finish_axes(grid[0, 0], None)
         return figure
     first, limit = plan.per_contact[0], manifest.limit or None
     _draw_profile(grid[0, 0], first, plan.cells, regions.sizes, limit)
@@ -114,17 +122,17 @@ def error_map(plan: Plan, regions: Regions, manifest: Manifest, name: str) -> Fi
 
 
 @matplotlib.style.context("default")
-def convergence(
-    plan: Plan, regions: Regions, manifest: Manifest, name: str, acceptable: float | None = None
+def plot_convergence(
+    plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str, acceptable: float | None = None
 ) -> Figure:
     """Plot the failure probability and its interval over the number of scenarios, in order of the index."""
-    figure = new_figure((7.6, 5.2), f"{name}: failure probability as scenarios are added", below=1.05)
+    figure = create_figure((7.6, 5.2), f"{name}: failure probability as scenarios are added", below=1.05)
     figure.subplots_adjust(right=0.93)  # The last tick label is long.
     axes = figure.subplots()
     axes.set(xlabel="number of scenarios [1]", ylabel="failure probability [1]")
     looks = plan.looks[plan.looks <= regions.scenarios]
     if not len(looks):
-        finish(axes, None)
+        finish_axes(axes, None)
         return figure
     failures = np.cumsum(regions.failures, axis=0)[: len(looks)]
     total = np.sum(failures, axis=1)
@@ -142,7 +150,7 @@ def convergence(
         text = f"95 % from {plan.replicates} scrambled Sobol replicates"
     axes.set_xscale("log")
     text += f", last {low[-1]:.3g} to {high[-1]:.3g}"
-    axes.fill_between(looks, low, high, color=SKY, alpha=0.4, linewidth=0, label=text)
+    axes.fill_between(looks, low, high, color=SKY_BLUE, alpha=0.4, linewidth=0, label=text)
     if wide_low is not None and wide_high is not None:
         label = "95 % at all numbers at once: stop wherever you like"
         style: dict[str, Any] = {"color": ORANGE, "linestyle": "--", "linewidth": 1.3}
@@ -155,22 +163,24 @@ def convergence(
         axes.axhline(
             acceptable, color=GREEN, linestyle=":", linewidth=1.5, label=f"acceptable {acceptable:g}"
         )
-    _limit_probability(axes, looks, share, low, high, acceptable)
-    finish(axes, None)
+    _set_probability_limits(axes, looks, share, low, high, acceptable)
+    finish_axes(axes, None)
     axes.set_xlim(looks[0] / 1.05, looks[-1] * 1.05)
-    plain_ticks(axes.xaxis, looks[0], looks[-1])
+    set_plain_ticks(axes.xaxis, looks[0], looks[-1])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}".replace(",", " ")))
     figure.legend(loc="lower center", fontsize=9, frameon=False, ncols=2)
     return figure
 
 
-def _draw_profile(axes: Axes, quantity: Input, cells: int, sizes: np.ndarray, limit: float | None) -> None:
+def _draw_profile(
+    axes: Axes, quantity: PlotInput, cells: int, sizes: np.ndarray, limit: float | None
+) -> None:
     """Draw quantiles of |e - e*| over one input."""
     counts = sizes.reshape(cells, -1, sizes.shape[-1]).sum(axis=1)
     edges = quantity.edges(cells)
     middles = np.sqrt(edges[1:] * edges[:-1]) if quantity.logarithmic else (edges[1:] + edges[:-1]) / 2
-    for order, label, colour, line in PROFILE:
-        values = quantile(counts, order, round(1 / (1 - order)))
+    for order, label, colour, line in PROFILE_QUANTILES:
+        values = compute_error_quantile(counts, order, round(1 / (1 - order)))
         shown = np.where(np.isfinite(values), values, np.nan)
         axes.plot(middles, shown, color=colour, linestyle=line, marker="o", markersize=3, label=label)
     if np.any(counts[:, -1]):
@@ -180,28 +190,28 @@ def _draw_profile(axes: Axes, quantity: Input, cells: int, sizes: np.ndarray, li
     draw_limit(axes.axhline, limit, 1.5)
     name_axis(axes.xaxis, quantity)
     axes.set(xlabel="", ylabel="|e - e*| not exceeded by [1]")
-    plain_ticks(axes.yaxis, *axes.get_ylim())
-    finish(axes, None)
+    set_plain_ticks(axes.yaxis, *axes.get_ylim())
+    finish_axes(axes, None)
     legend_above(axes, 5)
 
 
 def _draw_map(
-    figure: Figure, axes: Axes, bar: Axes, plan: Plan, sizes: np.ndarray, limit: float | None
+    figure: Figure, axes: Axes, bar: Axes, plan: PlotPlan, sizes: np.ndarray, limit: float | None
 ) -> None:
     """Draw the 95th percentile per cell; with a limit, blue within it and red beyond."""
     first, second = plan.per_contact
-    values = quantile(sizes, 0.95, FEW)
+    values = compute_error_quantile(sizes, 0.95, MIN_CONTACTS_PER_CELL)
     finite = values[np.isfinite(values)]
     low, high = (np.min(finite), np.max(finite)) if len(finite) else (1e-3, 1e-1)
     if limit:
         low, high = np.clip(low, limit / 100, limit / 1.5), max(high, 1.5 * limit)
         middle = float(np.log(limit / low) / np.log(high / low))
         positions = (0.0, middle / 2, middle, (1 + middle) / 2, 1.0)
-        anchors = list(zip(positions, (BLUE, SKY, "white", ORANGE, VERMILION), strict=True))
+        anchors = list(zip(positions, (BLUE, SKY_BLUE, "white", ORANGE, VERMILION), strict=True))
         colours = LinearSegmentedColormap.from_list("limit", anchors)
     else:
         high = max(high, 1.5 * low)
-        colours = LinearSegmentedColormap.from_list("sizes", ["white", SKY, BLUE, BLACK])
+        colours = LinearSegmentedColormap.from_list("sizes", ["white", SKY_BLUE, BLUE, BLACK])
     colours = colours.with_extremes(bad="0.8", over=BLACK)
     unended = bool(np.any(np.isinf(values)))
     shown = np.ma.masked_invalid(np.where(np.isinf(values), 1e300, values))
@@ -215,12 +225,16 @@ def _draw_map(
     )
     colour_bar = figure.colorbar(mesh, cax=bar, extend=extend)
     colour_bar.set_label("|e - e*| not exceeded by 95 % of contacts [1]")
-    _bar_ticks(bar.yaxis, low, high)
+    _set_bar_ticks(bar.yaxis, low, high)
     if limit:
         bar.axhline(limit, color=BLACK, linewidth=1.5)
     name_axis(axes.xaxis, first)
     name_axis(axes.yaxis, second)
-    handles = [Patch(color="0.8", label=f"fewer than {FEW} contacts")] if np.any(np.isnan(values)) else []
+    handles = (
+        [Patch(color="0.8", label=f"fewer than {MIN_CONTACTS_PER_CELL} contacts")]
+        if np.any(np.isnan(values))
+        else []
+    )
     if unended:
         handles.append(Patch(color=BLACK, label="more than 5 % did not end"))
     if handles:
@@ -228,7 +242,7 @@ def _draw_map(
         figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=2)
 
 
-def _bar_ticks(axis: Axis, low: float, high: float) -> None:
+def _set_bar_ticks(axis: Axis, low: float, high: float) -> None:
     """Set ticks of a colour bar at both ends, and between them where they do not overlap the ends."""
     values = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
     gap = (high / low) ** 0.06
@@ -239,7 +253,7 @@ def _bar_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: ends.get(value, f"{value:g}")))
 
 
-def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
+def _set_probability_limits(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
     """Set the limits of the probability axis by the last 99 % of the scenarios, with narrow intervals."""
     late = looks >= looks[-1] / 100
     ends = [*low[late], *high[late], *share[late], acceptable or 0.0]
@@ -249,4 +263,4 @@ def _limit_probability(axes: Axes, looks, share, low, high, acceptable: float | 
     else:
         axes.set_yscale("log")
         axes.set_ylim(least / 3, min(1.0, 3 * top))
-        plain_ticks(axes.yaxis, least / 3, 3 * top)
+        set_plain_ticks(axes.yaxis, least / 3, 3 * top)

@@ -9,20 +9,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from jaxhil.errors import one_line
-from jaxhil.rig_models import rig_model
+from jaxhil.errors import to_one_line
+from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation.contact_plot import (
     BLACK,
     BLUE,
+    CURVE_LABELS,
+    CURVE_STYLES,
     GREEN,
-    LABELS,
     ORANGE,
-    STYLES,
-    finish,
-    new_figure,
+    create_figure,
+    finish_axes,
 )
 from tuning.gains.objective import Objective
-from tuning.gains.pareto import Front
+from tuning.gains.pareto import ParetoFront
 from tuning.gains.tune import TuneResult
 from tuning.plots.parts import MARKERS, draw_limit, legend_above
 
@@ -30,7 +30,7 @@ from tuning.plots.parts import MARKERS, draw_limit, legend_above
 @matplotlib.style.context("default")
 def errors_plot(result: TuneResult, limit: float) -> Figure:
     """Plot distribution and contact frequency of the restitution errors, before and after tuning."""
-    figure = new_figure(
+    figure = create_figure(
         (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
     )
     left, right = figure.subplots(1, 2)
@@ -45,34 +45,34 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
         style: dict[str, Any] = {"linestyle": "none", "marker": MARKERS[name], "markersize": 2.5}
         style |= {"alpha": 0.6, "markeredgewidth": 0, "rasterized": True}
         points = frequency[outcome.good], outcome.error[outcome.good]
-        right.plot(*points, color=STYLES[name][0], label=LABELS[name], **style)
+        right.plot(*points, color=CURVE_STYLES[name][0], label=CURVE_LABELS[name], **style)
     if has_limit:
         right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
     left.set(xlabel="size of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
     right.axhline(0, color=BLACK, linewidth=0.6)
     right.set_yscale("symlog", linthresh=limit if has_limit else 0.01)
     right.set(xlabel="contact frequency [Hz]", ylabel="error e - e* [1]  (above 0: divergence)")
-    finish(left, "lower left")
-    finish(right, None)
+    finish_axes(left, "lower left")
+    finish_axes(right, None)
     if right.get_legend_handles_labels()[0]:
         # There are points everywhere inside the axes.
         legend = legend_above(right, 4, markerscale=2.5, columnspacing=1.2)
         for handle in legend.legend_handles:
             if handle is not None:
-                handle.set_alpha(1 if handle.get_label() in LABELS.values() else 0.3)
+                handle.set_alpha(1 if handle.get_label() in CURVE_LABELS.values() else 0.3)
     return figure
 
 
 @matplotlib.style.context("default")
-def two_errors_plot(result: TuneResult, limit: float) -> Figure:
+def six_axis_errors_plot(result: TuneResult, limit: float) -> Figure:
     """Plot the distributions of the energy and twist errors of six axes, before and after tuning."""
-    figure = new_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
+    figure = create_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
     shown = {"energy_error": "size of the energy error [1]", "twist_error": "twist error [1]"}
-    by_error = rig_model(result.mechanism).by_error
+    by_error = choose_rig_model(result.mechanism).by_error
     for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
         _draw_shares(axes, {name: by_error(each)[error] for name, each in result.outcomes.items()}, limit)
         axes.set(xlabel=label, ylabel="share of episodes with a larger error [1]")
-        finish(axes, "lower left")
+        finish_axes(axes, "lower left")
     return figure
 
 
@@ -83,12 +83,12 @@ def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
         size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
         if not len(size):
             continue
-        colour, line, width = STYLES[name]
+        colour, line, width = CURVE_STYLES[name]
         total = int(np.sum(outcome.wanted))
         # Contacts that did not end count as larger than any error and raise the whole curve.
         share = (np.arange(1, len(size) + 1) + total - len(size)) / total
         style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
-        axes.step(size, share, where="post", label=LABELS[name], **style)
+        axes.step(size, share, where="post", label=CURVE_LABELS[name], **style)
         sizes += [float(size[0]), float(np.percentile(size, 2))]
     draw_limit(axes.axvline, limit)
     positive = [value for value in sizes if value > 0] or [1.0]
@@ -98,7 +98,7 @@ def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
 @matplotlib.style.context("default")
 def loss_plot(result: TuneResult) -> Figure:
     """Plot the objective of each start against the steps of the solver."""
-    figure = new_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
+    figure = create_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
     best = min(finite, key=lambda start: start.rms) if finite else None
@@ -121,7 +121,7 @@ def loss_plot(result: TuneResult) -> Figure:
     what = objective.name if objective == Objective(objective.name) else "objective"
     axes.set(xlabel="solver step", ylabel=f"{what} on training scenarios [1]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    finish(axes, "best")
+    finish_axes(axes, "best")
     return figure
 
 
@@ -129,7 +129,7 @@ def loss_plot(result: TuneResult) -> Figure:
 def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
     """Plot the rms error of every mechanism before tuning, with the literature's gains, and after tuning."""
     height = 1.6 + 0.2 * len(results)
-    figure = new_figure(
+    figure = create_figure(
         (8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9
     )
     longest = max(len(result.mechanism.name) for result in results)
@@ -138,20 +138,27 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
     rows = np.arange(len(results))
     for name in ("before", "literature", "tuned"):
         rms = [result.figures[name].rms for result in results]
-        style = {"linestyle": "none", "marker": MARKERS[name], "color": STYLES[name][0], "markersize": 5}
-        axes.plot(rms, rows, label=LABELS[name], **style)
+        style = {
+            "linestyle": "none",
+            "marker": MARKERS[name],
+            "color": CURVE_STYLES[name][0],
+            "markersize": 5,
+        }
+        axes.plot(rms, rows, label=CURVE_LABELS[name], **style)
     draw_limit(axes.axvline, limit)
-    axes.set_yticks(rows, [one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8)
+    axes.set_yticks(
+        rows, [to_one_line(r.mechanism.name, 40).replace("$", r"\$") for r in results], fontsize=8
+    )
     axes.set(xscale="log", xlabel="rms of the restitution error e - e* [1]", ylim=(len(results) - 0.5, -0.5))
-    finish(axes, None)
+    finish_axes(axes, None)
     legend_above(axes, 4)
     return figure
 
 
 @matplotlib.style.context("default")
-def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
+def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
     """Plot restitution error against cost: the front, all numbered points, literature's and tuned gains."""
-    figure = new_figure(
+    figure = create_figure(
         (7, 5), f"{result.mechanism.name}: restitution error against {front.axis.name}, fresh scenarios"
     )
     axes = figure.subplots()
@@ -160,9 +167,9 @@ def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
     for points, label, marker, size, edge, face in (
         (best, "front", "o", 7, BLUE, BLUE),
         ([p for p in front.points if not p.on_front], "beaten by another", "o", 7, BLUE, "white"),
-        ([front.literature], LABELS["literature"], "s", 7, ORANGE, ORANGE),
+        ([front.literature], CURVE_LABELS["literature"], "s", 7, ORANGE, ORANGE),
         # The marker is open, because the tuned gains may also be a point of the front.
-        ([front.tuned], LABELS["tuned"], "D", 10, BLACK, "none"),
+        ([front.tuned], CURVE_LABELS["tuned"], "D", 10, BLACK, "none"),
     ):
         if points:
             values = [point.cost for point in points], [point.error for point in points]
@@ -176,16 +183,16 @@ def front_plot(front: Front, result: TuneResult, limit: float) -> Figure:
         # Labels alternate above and below the points, so that they do not overlap.
         offset = {"xytext": (6, -14 if index % 2 else 6), "textcoords": "offset points"}
         axes.annotate(", ".join(numbers[error, cost]), (cost, error), fontsize=8, **offset)
-    _scale(axes, "x", [point.cost for point in (*front.points, front.literature, front.tuned)])
-    _scale(axes, "y", [point.error for point in (*front.points, front.literature, front.tuned)])
+    _set_log_scale(axes, "x", [point.cost for point in (*front.points, front.literature, front.tuned)])
+    _set_log_scale(axes, "y", [point.error for point in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
     name = result.settings.objective.name
     axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of e - e* [1]")
-    finish(axes, "best")
+    finish_axes(axes, "best")
     return figure
 
 
-def _scale(axes: Axes, name: str, values: Sequence[float]) -> None:
+def _set_log_scale(axes: Axes, name: str, values: Sequence[float]) -> None:
     """Make an axis logarithmic with plain tick labels if its values differ by more than a factor of 3."""
     low, high = min(values), max(values)
     if not 0 < 3 * low < high:

@@ -3,7 +3,7 @@
 from msgspec import Struct
 
 
-class Probability(Struct):
+class ProbabilityEntry(Struct):
     """Probability with a 95 % confidence interval."""
 
     value: float
@@ -12,7 +12,7 @@ class Probability(Struct):
     method: str = ""
 
 
-class Quantile(Struct):
+class QuantileEntry(Struct):
     """Quantile of the worst |e - e*| of a scenario; None if it is infinite."""
 
     order: float
@@ -31,7 +31,7 @@ class WorstScenario(Struct):
     inputs: dict[str, float | None] = {}
 
 
-class InputShares(Struct):
+class InputIndicesEntry(Struct):
     """Sobol indices of an input, with their confidence intervals."""
 
     input: str
@@ -43,16 +43,16 @@ class InputShares(Struct):
     total_high: float | None = None
 
 
-class Drivers(Struct):
+class SobolIndicesEntry(Struct):
     """Sobol indices of the error."""
 
-    inputs: list[InputShares]
+    inputs: list[InputIndicesEntry]
     cap: float
     evaluations: int
     capped: int
 
 
-class Rare(Struct):
+class SubsetSimulationEntry(Struct):
     """Result of a subset simulation."""
 
     limit: float
@@ -76,19 +76,19 @@ class SweepVerdict(Struct):
     sampling: str
     precision: str
     failed: int
-    failure_probability: Probability
-    error_quantiles: list[Quantile]
+    failure_probability: ProbabilityEntry
+    error_quantiles: list[QuantileEntry]
     outcomes: dict[str, int]
     worst: list[WorstScenario]
     verdict: str
     limit: float | None = None
     until_width: float | None = None
     acceptable: float | None = None
-    drivers: Drivers | None = None
-    rare: Rare | None = None
+    drivers: SobolIndicesEntry | None = None
+    rare: SubsetSimulationEntry | None = None
 
 
-class Estimate(Struct):
+class EstimateEntry(Struct):
     """Parameter that was identified, or known beforehand."""
 
     key: str
@@ -101,7 +101,7 @@ class Estimate(Struct):
     prior: float | None = None
 
 
-class Check(Struct):
+class CheckEntry(Struct):
     """Effect that an identification looked for."""
 
     name: str
@@ -112,11 +112,11 @@ class Check(Struct):
     counts: bool = True
 
 
-class Identification(Struct):
+class IdentificationDocument(Struct):
     """Document identification.json."""
 
-    estimates: list[Estimate]
-    checks: list[Check]
+    estimates: list[EstimateEntry]
+    checks: list[CheckEntry]
     effect: float | None
     limit: float | None
     verdict: str
@@ -128,7 +128,7 @@ class Identification(Struct):
     effect_on_error: float | None = None
 
 
-class MonitoredFigure(Struct):
+class MonitoredMetric(Struct):
     """Metric of a contact, 0 if the mechanism file is right; None if the log does not show it."""
 
     value: float | None
@@ -142,10 +142,10 @@ class MonitoredContact(Struct):
     contact: int
     log: str
     state: str
-    figures: dict[str, MonitoredFigure]
+    figures: dict[str, MonitoredMetric]
 
 
-class Monitoring(Struct):
+class MonitoringDocument(Struct):
     """Document of `jaxhil monitor --json`."""
 
     mechanism: str  # path of a file, or name of a built-in one
@@ -159,7 +159,7 @@ class Monitoring(Struct):
     since: int | None = None  # number of the contact at which a change likely began, from 1
 
 
-class Figure(Struct):
+class MetricEntry(Struct):
     """Metric of a compensator, with its interval if it has one."""
 
     value: float | None = None
@@ -167,21 +167,21 @@ class Figure(Struct):
     high: float | None = None
 
 
-class LawOfComparison(Struct):
+class ComparedCompensator(Struct):
     """Metrics of a compensator by the name of its gains, then by the metric's name."""
 
     law: str
-    figures: dict[str, dict[str, Figure]]
+    figures: dict[str, dict[str, MetricEntry]]
 
 
-class MechanismOfComparison(Struct):
+class ComparedMechanism(Struct):
     """Metrics of all compensators for one mechanism."""
 
     mechanism: str
-    laws: list[LawOfComparison]
+    laws: list[ComparedCompensator]
 
 
-class Comparison(Struct):
+class ComparisonDocument(Struct):
     """Document compare.json."""
 
     limit: float | None
@@ -189,7 +189,7 @@ class Comparison(Struct):
     scenarios: int
     judged: int
     tuned: bool
-    mechanisms: list[MechanismOfComparison]
+    mechanisms: list[ComparedMechanism]
 
 
 class AxisOfMap(Struct):

@@ -11,32 +11,40 @@ import numpy as np
 
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.contact_plot import contact_plot
+from jaxhil.simulation.contact_plot import plot_contacts
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.motion import nominal_motion
+from jaxhil.simulation.motion_curves import compute_nominal_motion
 from jaxhil.sixdof.run import simulate_six_axes
-from tuning.identification.monitor.figures import FIGURES
-from tuning.plots.identification import compare
+from tuning.identification.monitor.metrics import METRICS
+from tuning.plots.identification import plot_estimates
 from tuning.plots.monitor import monitor_plot
 from tuning.plots.parts import as_svg
 from tuning.plots.scenarios import linked_scenarios
 from tuning.plots.six_axes import six_axes_plot
 from tuning.plots.stability_map import map_plot
-from tuning.reporting.documents import AxisOfMap, Identification, MapDocument, Monitoring, WorstScenario
+from tuning.reporting.documents import (
+    AxisOfMap,
+    IdentificationDocument,
+    MapDocument,
+    MonitoringDocument,
+    WorstScenario,
+)
 from tuning.stability_map.axes import MapAxis
 from tuning.stability_map.closed_forms import ClosedForms
 from tuning.stability_map.contact_growth import Growth
-from tuning.stability_map.grid import Map, Margin, Nominal, Radii
+from tuning.stability_map.grid import MapResults, NominalMargin, NominalPoint, SpectralRadii
 from tuning.sweeps.chunks import build_sweep
-from tuning.sweeps.regions import Points, read_regions
-from tuning.sweeps.replay import motion_of
-from tuning.sweeps.store import Store
+from tuning.sweeps.plot_statistics import PlotPoints, read_regions
+from tuning.sweeps.replay import compute_motion
+from tuning.sweeps.store import SweepStore
 
-TYPICAL = 6  # number of scenarios with plots besides the worst, at equal distances in the order of errors
-ESTIMATE = ("key", "value", "unit", "std", "low", "high", "prior")  # fields of an estimate in its plot
+TYPICAL_SCENARIOS = (
+    6  # number of scenarios with plots besides the worst, at equal distances in the order of errors
+)
+ESTIMATE_FIELDS = ("key", "value", "unit", "std", "low", "high", "prior")  # fields of an estimate in its plot
 
 
-class Drawing(NamedTuple):
+class SvgPlot(NamedTuple):
     """Plot in a page."""
 
     svg: str
@@ -44,63 +52,65 @@ class Drawing(NamedTuple):
     caption: str
 
 
-class Trace(NamedTuple):
+class ScenarioPlot(NamedTuple):
     """Plot of a scenario's run."""
 
     index: int
     text: str  # how it ended
-    drawing: Drawing
+    drawing: SvgPlot
 
 
-def nominal_drawing(subject: LoadedGains) -> Drawing:
+def draw_nominal_run(subject: LoadedGains) -> SvgPlot:
     """Draw the nominal run uncompensated, with the literature's gains, and with those of the file."""
     if isinstance(subject.mechanism, SixAxisMechanism):
-        return _nominal_in_space(subject)
+        return _draw_six_axis_run(subject)
     law = subject.compensator
     laws = {"before": ("none", {}), "literature": (law, literature_gains(subject.mechanism, law))}
     if law == "none":
         laws = {}
-    motion = nominal_motion(subject.mechanism, {**laws, "tuned": (law, subject.gains)})
-    figure = contact_plot(motion, f"{subject.mechanism.name}, nominal run: {law}", sensors="tuned")
-    return Drawing(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
+    motion = compute_nominal_motion(subject.mechanism, {**laws, "tuned": (law, subject.gains)})
+    figure = plot_contacts(motion, f"{subject.mechanism.name}, nominal run: {law}", sensors="tuned")
+    return SvgPlot(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
 
 
-def _nominal_in_space(subject: LoadedGains) -> Drawing:
+def _draw_six_axis_run(subject: LoadedGains) -> SvgPlot:
     """Draw the nominal run of a six-axis mechanism."""
     run = simulate_six_axes(subject.mechanism, subject.compensator, subject.gains)
     figure = six_axes_plot(run.ticks, f"{subject.mechanism.name}, nominal run: {subject.compensator}")
     says = "Pose, forces and moment over time, beside the same contact in space"
     [episode, *_] = run.episodes
     errors = f"Energy error {episode.energy_error:+.4f}, twist error {episode.twist_error:.4f}"
-    return Drawing(as_svg(figure), says, f"The nominal run. {errors}.")
+    return SvgPlot(as_svg(figure), says, f"The nominal run. {errors}.")
 
 
-def map_drawing(document: MapDocument) -> Drawing:
+def draw_map(document: MapDocument) -> SvgPlot:
     """Draw the stability map of a document."""
     title = f"{document.mechanism}, compensation: {document.compensator}"
-    figure = map_plot(_map_of(document), title, np.inf if document.limit is None else document.limit)
+    figure = map_plot(
+        _map_from_document(document), title, np.inf if document.limit is None else document.limit
+    )
     says = f"Restitution error over {document.x.key} and {document.y.key}"
-    return Drawing(as_svg(figure), says, f"{says}, under gains that stay the same.")
+    return SvgPlot(as_svg(figure), says, f"{says}, under gains that stay the same.")
 
 
-def estimates_drawing(document: Identification) -> Drawing:
+def draw_estimates(document: IdentificationDocument) -> SvgPlot:
     """Draw the identified parameters and their prior values."""
     estimates = [estimate for estimate in document.estimates if None not in (estimate.low, estimate.high)]
-    entries = [{name: getattr(estimate, name) for name in ESTIMATE} for estimate in estimates]
+    entries = [{name: getattr(estimate, name) for name in ESTIMATE_FIELDS} for estimate in estimates]
     says = "Every estimate's interval, and the prior's value, over the estimate"
-    return Drawing(as_svg(compare(entries)), says, f"{says}.")
+    return SvgPlot(as_svg(plot_estimates(entries)), says, f"{says}.")
 
 
-def monitor_drawing(document: Monitoring) -> Drawing:
+def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
     """Draw all metrics over the number of the contact."""
     numbers = [contact.contact for contact in document.contacts]
-    metrics = {name: _columns(document, name) for name, *_ in FIGURES}
+    metrics = {name: _columns(document, name) for name, *_ in METRICS}
     figure = monitor_plot(document.mechanism, numbers, metrics, document.since)
     says = "Figures of every contact over its number, with their predicted range"
-    return Drawing(as_svg(figure), says, f"{says}, 95 % of contacts of the rig of the file.")
+    return SvgPlot(as_svg(figure), says, f"{says}, 95 % of contacts of the rig of the file.")
 
 
-def _columns(document: Monitoring, name: str) -> np.ndarray:
+def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
     """Return value, predicted standard deviation, and z of a metric, (3, contacts); NaN if unknown."""
     rows = []
     for contact in document.contacts:
@@ -109,48 +119,52 @@ def _columns(document: Monitoring, name: str) -> np.ndarray:
     return np.array(rows, float).reshape(-1, 3).T
 
 
-def sweep_drawings(
-    store: Store, worst: Sequence[WorstScenario], say: Callable[[str], None]
-) -> tuple[Drawing, list[Trace]]:
+def draw_sweep(
+    store: SweepStore, worst: Sequence[WorstScenario], say: Callable[[str], None]
+) -> tuple[SvgPlot, list[ScenarioPlot]]:
     """Draw the errors of scenarios as points, and the runs of the worst and of some others."""
     sweep = build_sweep(store.manifest)
     plan, regions = read_regions(store, sweep.mechanism)
     assert plan is not None and regions is not None
     points = regions.points
-    texts = {entry.index: _ended(entry.outcome, entry.worst_error, entry.worst_contact) for entry in worst}
-    for position in _typical(points):
+    texts = {
+        entry.index: _describe_end(entry.outcome, entry.worst_error, entry.worst_contact) for entry in worst
+    }
+    for position in _select_typical(points):
         texts.setdefault(int(points.index[position]), f"|e - e*| at most {points.size[position]:.4g}")
     name = sweep.mechanism.name
     figure = linked_scenarios(name, plan.per_scenario, points, store.manifest.limit, list(texts))
     caption = "Scenarios of the sweep. A ringed one leads to its trace below."
-    drawing = Drawing(as_svg(figure, texts), "Worst error of scenarios over the inputs drawn", caption)
+    drawing = SvgPlot(as_svg(figure, texts), "Worst error of scenarios over the inputs drawn", caption)
     traces = []
     for index, text in texts.items():
         say(f"scenario {index}")
-        run_figure = contact_plot(motion_of(sweep, index), f"{name}, scenario {index}", sensors="rig")
-        run_drawing = Drawing(
+        run_figure = plot_contacts(compute_motion(sweep, index), f"{name}, scenario {index}", sensors="rig")
+        run_drawing = SvgPlot(
             as_svg(run_figure), f"Force and position over time of scenario {index}", f"{text}."
         )
-        traces.append(Trace(index, text, run_drawing))
+        traces.append(ScenarioPlot(index, text, run_drawing))
     return drawing, traces
 
 
-def _typical(points: Points) -> list[int]:
+def _select_typical(points: PlotPoints) -> list[int]:
     """Return the indices into `points` of scenarios from the smallest to below the largest error."""
     order = np.argsort(points.size, kind="stable")
     order = order[np.isfinite(points.size[order])]
-    ranks = np.linspace(0, len(order) - 1, TYPICAL + 1)[:-1].round().astype(int) if len(order) else []
+    ranks = (
+        np.linspace(0, len(order) - 1, TYPICAL_SCENARIOS + 1)[:-1].round().astype(int) if len(order) else []
+    )
     return [int(order[rank]) for rank in dict.fromkeys(ranks)]
 
 
-def _ended(outcome: str, error: float | None, contact: int | None) -> str:
+def _describe_end(outcome: str, error: float | None, contact: int | None) -> str:
     """Return a text on the end of a scenario."""
     if error is None:
         return outcome
     return f"{outcome}, e - e* = {error:+.4f}" + ("" if contact is None else f" in contact {contact}")
 
 
-def _map_of(document: MapDocument) -> Map:
+def _map_from_document(document: MapDocument) -> MapResults:
     """Return the map of a document."""
 
     def table(values: Any) -> Any:
@@ -164,9 +178,13 @@ def _map_of(document: MapDocument) -> Map:
         table(theory.series), table(theory.characteristic_root), table(theory.delay_over_critical),
         theory.none_because,
     )  # fmt: skip
-    radii = None if radius.values is None else Radii(table(radius.x), table(radius.y), table(radius.values))
+    radii = (
+        None
+        if radius.values is None
+        else SpectralRadii(table(radius.x), table(radius.y), table(radius.values))
+    )
     margins = [
-        None if margin is None else tuple(Margin(margin[axis].low, margin[axis].high) for axis in "xy")
+        None if margin is None else tuple(NominalMargin(margin[axis].low, margin[axis].high) for axis in "xy")
         for margin in (nominal.margins.error, nominal.margins.contact, nominal.margins.spectral_radius)
     ]
     growth = None
@@ -180,8 +198,8 @@ def _map_of(document: MapDocument) -> Map:
             nominal_growth.by_gain,
         )
     ratios = nominal.peak_force_ratio, nominal.duration_ratio
-    point = Nominal(nominal.restitution, nominal.error, *ratios, growth, *margins)  # pyright: ignore[reportArgumentType]
-    return Map(
+    point = NominalPoint(nominal.restitution, nominal.error, *ratios, growth, *margins)  # pyright: ignore[reportArgumentType]
+    return MapResults(
         axes=(axis(document.x), axis(document.y)),
         x=table(document.x.values),
         y=table(document.y.values),

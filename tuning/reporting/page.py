@@ -12,46 +12,46 @@ from importlib import resources
 import jinja2
 from markupsafe import Markup
 
-from tuning.reporting import content, rig_sections, study_sections
-from tuning.reporting.content import Section
-from tuning.reporting.reading import Results
+from tuning.reporting import rig_sections, study_sections, verdict_sections
+from tuning.reporting.result_files import Results
+from tuning.reporting.verdict_sections import Section
 
 TEMPLATE, SCRIPT, STYLE = "page.html.jinja", "magnify.js", "page.css"
 HEADLINES = {
-    content.GOOD: "Good: every requirement is met.",
-    content.BAD: "Bad: not every requirement is met.",
-    content.UNKNOWN: "Not decided: what was given does not show that every requirement is met.",
+    verdict_sections.GOOD: "Good: every requirement is met.",
+    verdict_sections.BAD: "Bad: not every requirement is met.",
+    verdict_sections.UNKNOWN: "Not decided: what was given does not show that every requirement is met.",
 }
 
 
-def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes:
+def build_page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes:
     """Return the HTML page of the results; `say` is called with the name of each plot."""
-    requirements = content.requirements(results)
-    verdict = content.verdict_of(requirements)
+    requirements = verdict_sections.collect_requirements(results)
+    verdict = verdict_sections.combine_verdicts(requirements)
     sections: list[Section | None] = [
-        content.assumptions(results),
-        rig_sections.identification(results),
-        rig_sections.monitoring(results),
-        content.gains(results),
-        study_sections.runs(results, say),
-        study_sections.errors(results),
-        study_sections.drivers(results),
-        study_sections.comparison(results),
-        content.watchdog(results),
-        study_sections.stability_map(results, say),
-        study_sections.reproduction(results),
+        verdict_sections.assumption_section(results),
+        rig_sections.identification_section(results),
+        rig_sections.monitoring_section(results),
+        verdict_sections.gain_section(results),
+        study_sections.run_section(results, say),
+        study_sections.error_section(results),
+        study_sections.sensitivity_section(results),
+        study_sections.comparison_section(results),
+        verdict_sections.watchdog_section(results),
+        study_sections.map_section(results, say),
+        study_sections.reproduction_section(results),
     ]
-    script = _text(SCRIPT)
+    script = _read_text(SCRIPT)
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    text = environment.from_string(_text(TEMPLATE)).render(
-        title=content.title_of(results),
+    text = environment.from_string(_read_text(TEMPLATE)).render(
+        title=verdict_sections.report_title(results),
         verdict=verdict,
         headline=HEADLINES[verdict],
         requirements=requirements,
         sections=[section for section in sections if section is not None],
-        style=Markup(_text(STYLE)),
+        style=Markup(_read_text(STYLE)),
         script=Markup(script),
         script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         drawn=Markup,
@@ -59,6 +59,6 @@ def page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes
     return text.encode("utf-8")
 
 
-def _text(name: str) -> str:
+def _read_text(name: str) -> str:
     """Return the text of a file of this package."""
     return (resources.files("tuning.reporting") / name).read_text(encoding="utf-8")

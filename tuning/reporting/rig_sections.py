@@ -2,17 +2,23 @@
 
 import math
 
-from jaxhil.errors import one_line
-from tuning.identification.monitor.figures import FIGURES
-from tuning.reporting.content import Section, Table, is_identified, is_of_another_file, number
-from tuning.reporting.documents import Estimate, MonitoredFigure
-from tuning.reporting.drawings import estimates_drawing, monitor_drawing
-from tuning.reporting.reading import Results
+from jaxhil.errors import to_one_line
+from tuning.identification.monitor.metrics import METRICS
+from tuning.reporting.documents import EstimateEntry, MonitoredMetric
+from tuning.reporting.drawings import draw_estimates, monitor_drawing
+from tuning.reporting.result_files import Results
+from tuning.reporting.verdict_sections import (
+    ReportTable,
+    Section,
+    format_number,
+    is_identified,
+    is_other_file_monitored,
+)
 
-MOST_ROWS = 60  # largest number of contacts in the table
+MAX_TABLE_ROWS = 60  # largest number of contacts in the table
 
 
-def identification(results: Results) -> Section | None:
+def identification_section(results: Results) -> Section | None:
     """Return the section on the identification of the rig."""
     document = results.identification
     if document is None:
@@ -20,8 +26,9 @@ def identification(results: Results) -> Section | None:
     rows = [
         (
             estimate.key,
-            number(estimate.value, _digits(estimate)),
-            f"{number(estimate.low, _digits(estimate))} to {number(estimate.high, _digits(estimate))}",
+            format_number(estimate.value, _significant_digits(estimate)),
+            f"{format_number(estimate.low, _significant_digits(estimate))} to "
+            f"{format_number(estimate.high, _significant_digits(estimate))}",
             estimate.unit,
             "given" if estimate.known else "logs",
         )
@@ -31,50 +38,51 @@ def identification(results: Results) -> Section | None:
         (
             check.name,
             "yes" if check.there else "no",
-            number((check.effect if check.there else 0.0) if check.counts else None, 3),
+            format_number((check.effect if check.there else 0.0) if check.counts else None, 3),
             check.finding,
         )
         for check in document.checks
     ]
-    tables = [Table(("number", "value", "95 %", "unit", "from"), rows)] if rows else []
-    tables.append(Table(("what the model may lack", "there", "effect on e", "finding"), checks, 9))
+    tables = [ReportTable(("number", "value", "95 %", "unit", "from"), rows)] if rows else []
+    tables.append(ReportTable(("what the model may lack", "there", "effect on e", "finding"), checks, 9))
     texts = [document.reason + ".", *(f"{note[:1].upper()}{note[1:]}." for note in document.notes)]
     if results.subject is not None and not is_identified(results):
         texts.append(
             "The gains were tuned for other numbers than those identified: this says nothing of them."
         )
-    drawings = [estimates_drawing(document)] if rows else []
+    drawings = [draw_estimates(document)] if rows else []
     return Section("identification", "From the rig's logs", texts, tables, drawings)
 
 
-def monitoring(results: Results) -> Section | None:
+def monitoring_section(results: Results) -> Section | None:
     """Return the section on contacts of later logs, compared with the mechanism file."""
     document = results.monitoring
     if document is None:
         return None
-    heads = [f"{name} [{unit}]" if unit != "1" else name for name, unit, _ in FIGURES]
+    heads = [f"{name} [{unit}]" if unit != "1" else name for name, unit, _ in METRICS]
     rows = [
         (
-            f"{contact.contact}, {one_line(contact.log, 60)}",
-            *(_shown(contact.figures.get(name), scale) for name, _, scale in FIGURES),
-            one_line(contact.state, 20),
+            f"{contact.contact}, {to_one_line(contact.log, 60)}",
+            *(_format_metric(contact.figures.get(name), scale) for name, _, scale in METRICS),
+            to_one_line(contact.state, 20),
         )
-        for contact in document.contacts[-MOST_ROWS:]
+        for contact in document.contacts[-MAX_TABLE_ROWS:]
     ]
     texts = [
-        f"{one_line(document.reason, 400)}.",
-        f"Held against {one_line(document.mechanism, 200)}; a figure is 0 where the rig is that of the file.",
+        f"{to_one_line(document.reason, 400)}.",
+        f"Held against {to_one_line(document.mechanism, 200)}; a figure is 0 where the rig is that of the "
+        "file.",
         *(f"{note[:1].upper()}{note[1:]}." for note in document.notes),
     ]
-    if len(document.contacts) > MOST_ROWS:
-        texts.append(f"Of {len(document.contacts)} contacts the table has the last {MOST_ROWS}.")
-    if is_of_another_file(results):
+    if len(document.contacts) > MAX_TABLE_ROWS:
+        texts.append(f"Of {len(document.contacts)} contacts the table has the last {MAX_TABLE_ROWS}.")
+    if is_other_file_monitored(results):
         texts.append("The gains were tuned for another file: this says nothing of them.")
-    table = Table(("contact, log", *heads, "state"), rows)
+    table = ReportTable(("contact, log", *heads, "state"), rows)
     return Section("monitoring", "The rig since", texts, [table], [monitor_drawing(document)])
 
 
-def _digits(estimate: Estimate) -> int:
+def _significant_digits(estimate: EstimateEntry) -> int:
     """Return the number of digits that an estimate's uncertainty supports, plus one."""
     if (
         not estimate.std
@@ -85,6 +93,6 @@ def _digits(estimate: Estimate) -> int:
     return min(max(2 + math.ceil(math.log10(ratio)), 3), 9) if ratio > 0 else 3
 
 
-def _shown(metric: MonitoredFigure | None, scale: float) -> str:
+def _format_metric(metric: MonitoredMetric | None, scale: float) -> str:
     """Return a scaled metric as text, or a dash."""
-    return number(None) if metric is None or metric.value is None else f"{scale * metric.value:+.2g}"
+    return format_number(None) if metric is None or metric.value is None else f"{scale * metric.value:+.2g}"

@@ -3,18 +3,18 @@
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 
-from jaxhil.errors import one_line
-from jaxhil.simulation.contact_bounds import STATED
-from tuning.reporting.content import Section, Table, number
-from tuning.reporting.documents import Figure, MarginOfMap
-from tuning.reporting.drawings import TYPICAL, map_drawing, nominal_drawing, sweep_drawings
-from tuning.reporting.reading import Results
+from jaxhil.errors import to_one_line
+from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
+from tuning.reporting.documents import MarginOfMap, MetricEntry
+from tuning.reporting.drawings import TYPICAL_SCENARIOS, draw_map, draw_nominal_run, draw_sweep
+from tuning.reporting.result_files import Results
+from tuning.reporting.verdict_sections import ReportTable, Section, format_number
 
-FIGURES = {  # metrics of a comparison with their headings
+METRIC_HEADINGS = {  # metrics of a comparison with their headings
     "rms": "rms |e - e*|", "p99": "99th percentile", "worst": "worst", "failures": "failures",
     "early": "early", "late": "late", "slope": "slope", "peak": "peak", "noise": "noise",
 }  # fmt: skip
-TRANSPARENCY = (
+TRANSPARENCY_NOTE = (
     "Early, late: by how much a push on the hardware at 25 and 75 % of the contact's duration in space "
     "reaches the result (1: as in space, 0: not at all). Slope: of e against e* over damped twins of the "
     "mechanism (1: as in space). Peak: largest command over the reference's peak force. Noise: of the "
@@ -24,21 +24,23 @@ TRANSPARENCY = (
 
 def count_plots(results: Results) -> int:
     """Return the largest number of plots that a report may have."""
-    scenarios = 0 if results.sweep is None or results.axes == 6 else len(results.sweep.worst) + TYPICAL + 1
+    scenarios = (
+        0 if results.sweep is None or results.axes == 6 else len(results.sweep.worst) + TYPICAL_SCENARIOS + 1
+    )
     return (results.subject is not None) + scenarios + (results.map is not None)
 
 
-def runs(results: Results, say: Callable[[str], None]) -> Section | None:
+def run_section(results: Results, say: Callable[[str], None]) -> Section | None:
     """Return the section with the nominal run and some scenarios of the sweep."""
     if results.subject is None:
         return None
     say("the nominal run")
-    drawings, traces, texts = [nominal_drawing(results.subject)], [], []
+    drawings, traces, texts = [draw_nominal_run(results.subject)], [], []
     if results.axes == 6:
         return Section("runs", "The nominal run", texts, [], drawings, traces)
     if results.store is not None and results.sweep is not None:
         say("scenarios of the sweep")
-        points, traces = sweep_drawings(results.store, results.sweep.worst, say)
+        points, traces = draw_sweep(results.store, results.sweep.worst, say)
         drawings.append(points)
         texts.append(
             "Scenarios of the sweep: the worst, and some between the smallest error and the largest."
@@ -46,7 +48,7 @@ def runs(results: Results, say: Callable[[str], None]) -> Section | None:
     return Section("runs", "The nominal run and the worst ones", texts, [], drawings, traces)
 
 
-def errors(results: Results) -> Section | None:
+def error_section(results: Results) -> Section | None:
     """Return the section on the distribution of errors and outcomes."""
     sweep = results.sweep
     if sweep is None:
@@ -54,24 +56,24 @@ def errors(results: Results) -> Section | None:
     rows = [
         (
             f"{100 * quantile.order:g} %",
-            number(quantile.value),
-            f"{number(quantile.low)} to {number(quantile.high)}",
+            format_number(quantile.value),
+            f"{format_number(quantile.low)} to {format_number(quantile.high)}",
         )
         for quantile in sweep.error_quantiles
     ]
-    tables = [Table(("share of scenarios", f"worst {results.error} up to", "95 %"), rows)]
+    tables = [ReportTable(("share of scenarios", f"worst {results.error} up to", "95 %"), rows)]
     ended = [
         (outcome, str(count), f"{count / max(sweep.scenarios, 1):.4g}")
         for outcome, count in sweep.outcomes.items()
     ]
-    tables.append(Table(("outcome", "scenarios", "share"), ended))
+    tables.append(ReportTable(("outcome", "scenarios", "share"), ended))
     origin = f"{sweep.scenarios} scenarios, {sweep.sampling}, seed {sweep.seed}, {sweep.precision}"
-    method = one_line(sweep.failure_probability.method, 200)
+    method = to_one_line(sweep.failure_probability.method, 200)
     texts = [f"{origin}. Interval of the failure probability: {method}."]
     return Section("errors", "How large the error is, and how often", texts, tables)
 
 
-def drivers(results: Results) -> Section | None:
+def sensitivity_section(results: Results) -> Section | None:
     """Return the section on Sobol indices and rare errors."""
     sweep = results.sweep
     if sweep is None or (sweep.drivers is None and sweep.rare is None):
@@ -81,22 +83,22 @@ def drivers(results: Results) -> Section | None:
         rows = [
             (
                 shares.input,
-                number(shares.first_order, 3),
-                f"{number(shares.first_order_low, 3)} to {number(shares.first_order_high, 3)}",
-                number(shares.total, 3),
-                f"{number(shares.total_low, 3)} to {number(shares.total_high, 3)}",
+                format_number(shares.first_order, 3),
+                f"{format_number(shares.first_order_low, 3)} to {format_number(shares.first_order_high, 3)}",
+                format_number(shares.total, 3),
+                f"{format_number(shares.total_low, 3)} to {format_number(shares.total_high, 3)}",
             )
             for shares in indices.inputs
         ]
-        tables.append(Table(("input", "first order", "95 %", "total", "95 %"), rows))
+        tables.append(ReportTable(("input", "first order", "95 %", "total", "95 %"), rows))
         texts.append(
             f"Sobol indices: shares of the variance of the worst {results.error}, cut at {indices.cap:g} "
             f"({indices.capped} of {indices.evaluations} runs)."
         )
     if (rare := sweep.rare) is not None:
-        interval = f"{number(rare.low, 3)} to {number(rare.high, 3)}"
-        row = (number(rare.limit), number(rare.probability, 3), interval, str(rare.evaluations))
-        tables.append(Table((f"{results.error} beyond", "probability", "95 %", "scenarios"), [row], 0))
+        interval = f"{format_number(rare.low, 3)} to {format_number(rare.high, 3)}"
+        row = (format_number(rare.limit), format_number(rare.probability, 3), interval, str(rare.evaluations))
+        tables.append(ReportTable((f"{results.error} beyond", "probability", "95 %", "scenarios"), [row], 0))
         if rare.spread_beyond_formula:
             texts.append(
                 "The replicates of the subset simulation differ far more than its formula explains: some "
@@ -105,26 +107,26 @@ def drivers(results: Results) -> Section | None:
     return Section("drivers", "What drives it, and rare errors", texts, tables)
 
 
-def comparison(results: Results) -> Section | None:
+def comparison_section(results: Results) -> Section | None:
     """Return the section on other compensators on the same scenarios, and on transparency."""
     compared = results.comparison
     if compared is None:
         return None
-    subject, tables, texts = results.subject, [], [TRANSPARENCY]
+    subject, tables, texts = results.subject, [], [TRANSPARENCY_NOTE]
     for entry in compared.mechanisms:
         if subject is not None and entry.mechanism != subject.mechanism.name:
             continue
         rows = [
-            (f"{law.law}, {gains_name}", *(_estimated(figures.get(key)) for key in FIGURES))
+            (f"{law.law}, {gains_name}", *(_format_metric(figures.get(key)) for key in METRIC_HEADINGS))
             for law in entry.laws
             for gains_name, figures in law.figures.items()
         ]
-        tables.append(Table((entry.mechanism, *FIGURES.values()), rows))
+        tables.append(ReportTable((entry.mechanism, *METRIC_HEADINGS.values()), rows))
     texts.append(f"{compared.judged} fresh scenarios for all; brackets: 95 %.")
     return Section("comparison", "Transparency, and other laws", texts, tables)
 
 
-def stability_map(results: Results, say: Callable[[str], None]) -> Section | None:
+def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
     """Return the section with the map and the margins of its nominal point."""
     document = results.map
     if document is None:
@@ -135,8 +137,9 @@ def stability_map(results: Results, say: Callable[[str], None]) -> Section | Non
         texts.append(f"At the nominal point the largest error is {document.nominal.error:+.4f}.")
     if document.nominal.peak_force_ratio is not None:
         texts.append(
-            f"There the largest real force is {number(document.nominal.peak_force_ratio, 3)} times the ideal "
-            f"contact's, and its duration {number(document.nominal.duration_ratio, 3)} times."
+            f"There the largest real force is {format_number(document.nominal.peak_force_ratio, 3)} times "
+            "the ideal "
+            f"contact's, and its duration {format_number(document.nominal.duration_ratio, 3)} times."
         )
     if (growth := document.nominal.growth) is not None:
         verb = "grows" if growth.per_second > 0 else "decays"
@@ -146,51 +149,55 @@ def stability_map(results: Results, say: Callable[[str], None]) -> Section | Non
         )
     margins = document.nominal.margins
     for condition, margin in (
-        (f"|e - e*| within {number(document.limit)}", margins.error),
-        (STATED, margins.contact),
+        (f"|e - e*| within {format_number(document.limit)}", margins.error),
+        (CONTACT_BOUNDS_TEXT, margins.contact),
         ("spectral radius at most 1", margins.spectral_radius),
     ):
         for axis, key in (("x", document.x), ("y", document.y)):
             if margin is not None and axis in margin:
-                rows.append((key.key, condition, number(key.nominal), _range(margin[axis]), key.unit))
-    tables = [Table(("key", "condition", "nominal", "holds", "unit"), rows, 9)] if rows else []
-    return Section("map", "Stability map", texts, tables, [map_drawing(document)])
+                rows.append(
+                    (key.key, condition, format_number(key.nominal), _format_margin(margin[axis]), key.unit)
+                )
+    tables = [ReportTable(("key", "condition", "nominal", "holds", "unit"), rows, 9)] if rows else []
+    return Section("map", "Stability map", texts, tables, [draw_map(document)])
 
 
-def reproduction(results: Results) -> Section:
+def reproduction_section(results: Results) -> Section:
     """Return the section on the origin of every number: files, digests, versions, commands."""
     sources = [
-        (f"jaxhil {source.command}", one_line(str(source.path), 200), source.sha256)
+        (f"jaxhil {source.command}", to_one_line(str(source.path), 200), source.sha256)
         for source in results.sources
     ]
-    tables = [Table(("result of", "file", "SHA-256"), sources, 9)]
+    tables = [ReportTable(("result of", "file", "SHA-256"), sources, 9)]
     for document in (results.identification, results.monitoring):
         if document is not None:
-            logs = [(one_line(name, 200), sha256) for name, sha256 in document.sources.items()]
-            tables.append(Table(("log", "SHA-256"), logs, 9))
-    if versions := _versions(results):
-        tables.append(Table(("version of", "with which the results were made"), list(versions.items()), 9))
+            logs = [(to_one_line(name, 200), sha256) for name, sha256 in document.sources.items()]
+            tables.append(ReportTable(("log", "SHA-256"), logs, 9))
+    if versions := _software_versions(results):
+        tables.append(
+            ReportTable(("version of", "with which the results were made"), list(versions.items()), 9)
+        )
     texts = ["Each of these commands, on the files above, prints the figures again."]
     return Section(
-        "reproduction", "How to reproduce every figure", texts, tables, lines=list(_commands(results))
+        "reproduction", "How to reproduce every figure", texts, tables, lines=list(_repeat_commands(results))
     )
 
 
-def _commands(results: Results) -> Iterator[str]:
+def _repeat_commands(results: Results) -> Iterator[str]:
     """Yield the commands that repeat the results."""
     paths = {source.command: str(source.path) for source in results.sources}
     subject, sweep = results.subject, results.sweep
     gains = paths.get("tune", paths.get("export", "GAINS"))
     if ("tune" in paths or "export" in paths) and results.axes == 1:
-        yield _command("verify", paths.get("export", gains))
+        yield _format_command("verify", paths.get("export", gains))
     if sweep is not None:
         options = {"scenarios": sweep.scenarios, "seed": sweep.seed, "sampling": sweep.sampling,
                    "precision": sweep.precision, "limit": sweep.limit,
                    "acceptable": sweep.acceptable}  # fmt: skip
         studies = (["--drivers"] if sweep.drivers else []) + (["--rare"] if sweep.rare else [])
-        yield _command("sweep", gains, "-o", "again", *_options(options), *studies)
+        yield _format_command("sweep", gains, "-o", "again", *_option_words(options), *studies)
         for scenario in sweep.worst[:1]:
-            yield _command("replay", paths["sweep"], str(scenario.index), "--plot", "worst.png")
+            yield _format_command("replay", paths["sweep"], str(scenario.index), "--plot", "worst.png")
     name = subject.mechanism.name if subject is not None else "MECHANISM"
     if (compared := results.comparison) is not None:
         names = [entry.mechanism for entry in compared.mechanisms]
@@ -198,7 +205,7 @@ def _commands(results: Results) -> Iterator[str]:
                    "limit": compared.limit}  # fmt: skip
         laws = list(dict.fromkeys(law.law for entry in compared.mechanisms for law in entry.laws))
         untuned = [] if compared.tuned else ["--untuned"]
-        yield _command("compare", *names, *_options(options), *untuned, "--compensators", *laws)
+        yield _format_command("compare", *names, *_option_words(options), *untuned, "--compensators", *laws)
     if (stability_map := results.map) is not None:
         axes = [
             f"{axis.key}={axis.values[0]!r}:{axis.values[-1]!r}"
@@ -212,26 +219,28 @@ def _commands(results: Results) -> Iterator[str]:
         }
         names = [stability_map.mechanism] if subject is None else [name]
         law = ("--compensator", stability_map.compensator)
-        yield _command("map", *names, "--x", axes[0], "--y", axes[1], *law, *gain_words, *_options(options))
+        yield _format_command(
+            "map", *names, "--x", axes[0], "--y", axes[1], *law, *gain_words, *_option_words(options)
+        )
     if (document := results.identification) is not None:
-        yield _command("identify", *document.sources, "--seed", str(document.seed))
+        yield _format_command("identify", *document.sources, "--seed", str(document.seed))
     if (document := results.monitoring) is not None:
-        yield _command("monitor", document.mechanism, *document.sources)
+        yield _format_command("monitor", document.mechanism, *document.sources)
 
 
-def _command(*words: str) -> str:
+def _format_command(*words: str) -> str:
     """Return a command as typed in a shell."""
-    return one_line(" ".join(["jaxhil", *map(shlex.quote, words)]), 2000)
+    return to_one_line(" ".join(["jaxhil", *map(shlex.quote, words)]), 2000)
 
 
-def _options(values: Mapping[str, object]) -> Iterator[str]:
+def _option_words(values: Mapping[str, object]) -> Iterator[str]:
     """Yield the words of the options that have a value."""
     for name, value in values.items():
         if value is not None:
             yield from (f"--{name}", str(value))
 
 
-def _versions(results: Results) -> dict[str, str]:
+def _software_versions(results: Results) -> dict[str, str]:
     """Return the versions of the software that made the results."""
     subject, versions = results.subject, {}
     if subject is not None and isinstance(stated := subject.document.get("versions"), Mapping):
@@ -241,16 +250,18 @@ def _versions(results: Results) -> dict[str, str]:
     return versions
 
 
-def _estimated(metric: Figure | None) -> str:
+def _format_metric(metric: MetricEntry | None) -> str:
     """Return a metric with its confidence interval as text."""
     if metric is None:
-        return number(None)
-    interval = "" if metric.low is None else f" ({number(metric.low, 3)} to {number(metric.high, 3)})"
-    return number(metric.value, 3) + interval
+        return format_number(None)
+    interval = (
+        "" if metric.low is None else f" ({format_number(metric.low, 3)} to {format_number(metric.high, 3)})"
+    )
+    return format_number(metric.value, 3) + interval
 
 
-def _range(margin: MarginOfMap) -> str:
+def _format_margin(margin: MarginOfMap) -> str:
     """Return the ends of a margin as text."""
-    low = "below the map" if margin.low is None else number(margin.low)
-    high = "beyond the map" if margin.high is None else number(margin.high)
+    low = "below the map" if margin.low is None else format_number(margin.low)
+    high = "beyond the map" if margin.high is None else format_number(margin.high)
     return f"from {low} to {high}"

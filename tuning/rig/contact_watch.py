@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 from jaxhil.mechanism.structs import Mechanism
 
-FADED = 1e-6  # command over its peak [1] below which it has died out
-LONGEST_FADING = 0.1  # longest wait for the command to die out [s]
-LONGEST_CONTACT = 10.0  # longest contact [s], after which it times out
-RUNAWAY = 1e3  # speed over the approach speed [1] beyond which a contact diverges
+FADED_COMMAND_RATIO = 1e-6  # command over its peak [1] below which it has died out
+MAX_FADING_TIME = 0.1  # longest wait for the command to die out [s]
+MAX_CONTACT_DURATION = 10.0  # longest contact [s], after which it times out
+DIVERGENCE_SPEED_RATIO = 1e3  # speed over the approach speed [1] beyond which a contact diverges
 
 
-class ContactResult(NamedTuple):
+class RigContact(NamedTuple):
     """Result of one contact."""
 
     number: int  # index in the mechanism's lists
@@ -38,13 +38,13 @@ class ContactWatch:
         self._period, self._clearance = rig.control_period, mechanism.contact.clearance
         lag = (sensor.delay + 20 * sensor.time_constant) / self._period
         self._quiet_ticks = math.floor(lag + 2 + 1e-9) + 1
-        self._patience = self._quiet_ticks + math.ceil(LONGEST_FADING / self._period)
+        self._patience = self._quiet_ticks + math.ceil(MAX_FADING_TIME / self._period)
         self._noisy = sensor.noise_std != 0.0 or sensor.bias != 0.0
-        self._limit = LONGEST_CONTACT / self._period
+        self._limit = MAX_CONTACT_DURATION / self._period
         self._waiting = self._limit
         if math.isfinite(self._clearance):
             self._waiting += 10 * self._clearance / mechanism.approach.velocity / self._period
-        self._runaway = RUNAWAY * mechanism.approach.velocity
+        self._runaway = DIVERGENCE_SPEED_RATIO * mechanism.approach.velocity
         self.begin(0)
 
     def begin(self, number: int) -> None:
@@ -56,7 +56,7 @@ class ContactWatch:
 
     def observe(
         self, position: float, velocity: float, command: float, force: float, reading: float
-    ) -> ContactResult | None:
+    ) -> RigContact | None:
         """Process one tick; return the contact that ends with it, if any.
 
         Args:
@@ -87,20 +87,20 @@ class ContactWatch:
         self._measured = self._measured or (self._contact_ticks > 0 and reading != 0.0)
         self._quiet = 0 if in_contact else self._quiet + 1
         self._tick += 1
-        faded = magnitude <= FADED * self._peak_command or self._quiet >= self._patience
+        faded = magnitude <= FADED_COMMAND_RATIO * self._peak_command or self._quiet >= self._patience
         # Between two surfaces a contact ends at the latest in the middle of the gap.
         faded = faded or self._side != (1.0 if position > -self._clearance / 2 else -1.0)
         quiet = self._quiet >= self._quiet_ticks and faded
         if self._begun >= 0 and self._side * velocity < 0.0 and quiet:
-            left = max(FADED * self._peak_command, magnitude)
+            left = max(FADED_COMMAND_RATIO * self._peak_command, magnitude)
             return self._end("ok" if self._measured else "not reached", left)
         return self._failed(magnitude)
 
-    def cut(self, status: str) -> ContactResult | None:
+    def cut(self, status: str) -> RigContact | None:
         """End the current contact, if there is one, with the given status."""
         return self._end(status, 0.0) if self._begun >= 0 else None
 
-    def _failed(self, magnitude: float) -> ContactResult | None:
+    def _failed(self, magnitude: float) -> RigContact | None:
         if not (math.isfinite(self._rebound) and math.isfinite(magnitude)):
             return self._end("non-finite", 0.0)
         if self._rebound > self._runaway:
@@ -113,10 +113,10 @@ class ContactWatch:
             return None
         return self._end("timeout" if self._contact_ticks > 0 else "not reached", 0.0)
 
-    def _end(self, status: str, left: float) -> ContactResult:
+    def _end(self, status: str, left: float) -> RigContact:
         approach = self._approach
         restitution = self._rebound / approach if status == "ok" and approach > 0.0 else math.nan
-        result = ContactResult(
+        result = RigContact(
             number=self._number,
             approach_velocity=approach,
             restitution=restitution,

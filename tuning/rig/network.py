@@ -13,7 +13,7 @@ from collections.abc import Callable
 from random import Random
 from typing import NamedTuple
 
-LONGEST_PACKET = 512
+MAX_PACKET_BYTES = 512
 
 
 class Injection(NamedTuple):
@@ -53,7 +53,7 @@ class Network:
         self._coming: list[tuple[int, int, bytes]] = []
         self._count, self._number_of = 0, number_of
         self.lost = array("b", bytes(packets))
-        self.held_back = array("q", bytes(8 * packets))
+        self.injected_delay = array("q", bytes(8 * packets))
 
     def close(self) -> None:
         """Close the socket."""
@@ -84,7 +84,7 @@ class Network:
         if not select.select([self._socket], [], [], wait)[0]:
             return None
         try:
-            return self._socket.recv(LONGEST_PACKET)
+            return self._socket.recv(MAX_PACKET_BYTES)
         except OSError:
             return None
 
@@ -113,7 +113,7 @@ class Network:
         """Read all packets from the socket and queue them with their injected delays."""
         while True:
             try:
-                packet = self._socket.recv(LONGEST_PACKET)
+                packet = self._socket.recv(MAX_PACKET_BYTES)
             except OSError:
                 # There is no further packet, or no process listens yet.
                 return
@@ -137,5 +137,5 @@ class Network:
             return None
         delay = round(1e9 * (constant + jitter * self._random.random()))
         if in_range:
-            self.held_back[number] += delay
+            self.injected_delay[number] += delay
         return delay

@@ -6,23 +6,29 @@
     plant.move(command)                               # apply the next position command for one period
 
 The physics are stages 1, 4 and 5 of `jaxhil.simulation.loop` without JAX, fast enough for real time. Linear
-parts are discretised exactly, and delays are exact fractions of a period (`tuning.rig.propagation`).
+parts are discretised exactly, and delays are exact fractions of a period (`tuning.rig.discretisation`).
 """
 
 import math
 from random import Random
 
 from jaxhil.contact.float_law import FloatLaw
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Contact, Mechanism
-from tuning.rig.propagation import WHOLE, Place, apply, propagation, split_delay
-from tuning.rig.sensor_lag import Motion, deepest_within, lagged
+from tuning.rig.discretisation import (
+    DELAY_ROUNDING_TOLERANCE,
+    MotionRows,
+    discretise_simulator,
+    evaluate_row,
+    split_delay,
+)
+from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetration
 
 # Motion at the sample of the force, at the interval's start and at its end.
-SamplingInterval = tuple[Motion, Motion | None, Motion | None]
+SamplingInterval = tuple[MotionState, MotionState | None, MotionState | None]
 
 
-class Plant:
+class RigHardware:
     """Hardware of the rig without the controller.
 
     `force` [N] is the newest sample of the real contact force at this tick, `shortfall` [m] the distance by
@@ -41,9 +47,9 @@ class Plant:
         self._place, self._noise = force_place * period, Random(seed)
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._limited = math.isfinite(min(self._limits))
-        self._rows = propagation(simulator, period, rig.command_hold, force_place, position_place)
+        self._rows = discretise_simulator(simulator, period, rig.command_hold, force_place, position_place)
         # A sample is taken `_real` intervals after its command, and is read `_force_intervals` later.
-        self._real = math.ceil(simulator.delay / period + force_place - WHOLE) - 1
+        self._real = math.ceil(simulator.delay / period + force_place - DELAY_ROUNDING_TOLERANCE) - 1
         self._force_intervals, self._position_intervals = force_intervals - self._real, position_intervals
         self._size = 1 << (max(self._force_intervals, position_intervals, self._real) + 2).bit_length()
         self.begin(-1.0, 0.0, -1.0, 0)
@@ -54,7 +60,7 @@ class Plant:
         The numerical model is at `position` [m] with `velocity` [m/s], and this tick's position command is
         `command` [m]. Before the run, the motion was uniform for an infinite time, without a force.
         """
-        self._law, self._number, self._wanted_number = _law(self._contact, number), number, number
+        self._law, self._number, self._wanted_number = _contact_law_of(self._contact, number), number, number
         stride = self._period * velocity
         self._commands = [command - back * stride for back in range(self._latency + 1)]
         self._wanted, self._step, self.shortfall = command, stride, 0.0
@@ -64,7 +70,7 @@ class Plant:
             c * (drive - stride) + s * stride
             for c, s in zip(rows.steady_command, rows.steady_step, strict=True)
         ]
-        first = apply(rows.measured, before, drive - stride, drive if linear else drive - stride)
+        first = evaluate_row(rows.measured, before, drive - stride, drive if linear else drive - stride)
         self._state = [
             c * drive + s * stride for c, s in zip(rows.steady_command, rows.steady_step, strict=True)
         ]
@@ -84,14 +90,14 @@ class Plant:
         force = self._forces[(self._tick - 1 - self._force_intervals) & last] + sensor.bias
         if sensor.noise_std > 0.0:
             force += sensor.noise_std * noise.gauss(0.0, 1.0)
-        force = _quantised(force, sensor.quantum)
+        force = _quantise(force, sensor.quantum)
         if sensor.dead_zone > 0.0:
             force = math.copysign(max(0.0, abs(force) - sensor.dead_zone), force)
         force = min(max(force, -sensor.range), sensor.range)
         position = self._positions[(self._tick - 1 - self._position_intervals) & last]
         if self._position_sensor.noise_std > 0.0:
             position += self._position_sensor.noise_std * noise.gauss(0.0, 1.0)
-        return force, _quantised(position, self._position_sensor.quantum)
+        return force, _quantise(position, self._position_sensor.quantum)
 
     def move(self, command: float) -> None:
         """Advance by one control period with the position command [m] of the tick at its end."""
@@ -103,17 +109,17 @@ class Plant:
         self._commands = [command, *commands[: self._latency]]
         rows, state, tick, last = self._rows, self._state, self._tick, self._size - 1
 
-        def motion(place: Place) -> Motion:
-            position = apply(place.position, state, start, end) - self._plane
-            return Motion(position, apply(place.velocity, state, start, end))
+        def motion(place: MotionRows) -> MotionState:
+            position = evaluate_row(place.position, state, start, end) - self._plane
+            return MotionState(position, evaluate_row(place.velocity, state, start, end))
 
         if self._force_sensor.time_constant > 0.0 or self._law.loaded is not None:
             interval = motion(rows.sample), motion(rows.start), motion(rows.end)
         else:
             interval = motion(rows.sample), None, None
         self._intervals[tick & last] = interval
-        self._positions[tick & last] = apply(rows.measured, state, start, end)
-        self._state = [apply(row, state, start, end) for row in rows.transition]
+        self._positions[tick & last] = evaluate_row(rows.measured, state, start, end)
+        self._state = [evaluate_row(row, state, start, end) for row in rows.transition]
         self._forces[tick & last] = self._contact_force(self._intervals[(tick - self._real) & last])
         self._tick = tick + 1
         self.expect(self._wanted_number)
@@ -122,7 +128,7 @@ class Plant:
         """Set the number (from 0) of the run's next contact, whose law applies once the mechanism is free."""
         self._wanted_number = number
         if number != self._number and not self._in_contact:
-            self._law, self._number = _law(self._contact, number), number
+            self._law, self._number = _contact_law_of(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
         """Compute the contact in the interval whose motion arrives now; return the lagged force [N]."""
@@ -147,17 +153,21 @@ class Plant:
         time_constant = self._force_sensor.time_constant
         if start is None or end is None or time_constant == 0.0:
             return self.force
-        reading = lagged(self._lag, self._law, clearance, start, sample, self._place, time_constant, deepest)
-        self._lag = lagged(reading, self._law, clearance, sample, end, rest, time_constant, at_sample)
+        reading = apply_sensor_lag(
+            self._lag, self._law, clearance, start, sample, self._place, time_constant, deepest
+        )
+        self._lag = apply_sensor_lag(
+            reading, self._law, clearance, sample, end, rest, time_constant, at_sample
+        )
         return reading
 
-    def _deeper(self, deepest: float, start: Motion, end: Motion, duration: float) -> float:
+    def _deeper(self, deepest: float, start: MotionState, end: MotionState, duration: float) -> float:
         """Return the deepest penetration [m] up to the end of a stretch; it is reset when contact is lost."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
         if duration <= 0.0:  # With delays of whole periods the second stretch is empty.
             return deepest
-        return max(deepest, deepest_within(start, end, duration, self._clearance))
+        return max(deepest, deepest_penetration(start, end, duration, self._clearance))
 
     def _limit(self, wanted: float) -> float:
         """Apply the rate limits to a position command [m] (`jaxhil.simulation.rate_limits.limit_command`)."""
@@ -181,12 +191,12 @@ class Plant:
         return command
 
 
-def _law(contact: Contact, number: int) -> FloatLaw:
+def _contact_law_of(contact: Contact, number: int) -> FloatLaw:
     """Return the law of contact `number` (from 0); the last entry of every list repeats."""
     stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
     damping = contact.damping[min(number, len(contact.damping) - 1)]
-    return contact_law(contact.law).in_floats(contact, stiffness, damping)
+    return find_contact_law(contact.law).in_floats(contact, stiffness, damping)
 
 
-def _quantised(value: float, quantum: float) -> float:
+def _quantise(value: float, quantum: float) -> float:
     return quantum * round(value / quantum) if quantum > 0.0 else value

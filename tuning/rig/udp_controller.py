@@ -36,10 +36,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-HERE = Path(__file__).resolve().parent
+SCRIPT_FOLDER = Path(__file__).resolve().parent
 # An isolated interpreter (-I) does not search the script's folder.
-if (HERE / "jaxhil_runtime.py").is_file():
-    sys.path.insert(0, str(HERE))
+if (SCRIPT_FOLDER / "jaxhil_runtime.py").is_file():
+    sys.path.insert(0, str(SCRIPT_FOLDER))
     # No files may be added to a bundle.
     sys.dont_write_bytecode = True
     import udp_protocol as udp  # pyright: ignore[reportMissingImports]
@@ -47,26 +47,28 @@ if (HERE / "jaxhil_runtime.py").is_file():
 else:
     # The script is in the source tree, not in a bundle.
     if not __package__:
-        sys.path.insert(0, str(HERE.parents[1]))
+        sys.path.insert(0, str(SCRIPT_FOLDER.parents[1]))
     from jaxhil.rig import Controller
     from tuning.rig import udp_protocol as udp
 
-CPU_SHARE = 0.5  # share of the period that the controller may use as CPU time
-REPLAYS = 3  # number of replays, of which the least time counts
-PRIORITY = 20  # requested priority of the real-time class
+MAX_CPU_SHARE = 0.5  # share of the period that the controller may use as CPU time
+REPLAY_COUNT = 3  # number of replays, of which the least time counts
+REAL_TIME_PRIORITY = 20  # requested priority of the real-time class
 
 
-class Empty:
+class EmptyControllerTask:
     """Task of an empty loop, which answers every packet and computes nothing."""
 
     stale = made_up = 0
     status = "ok"
     doubts: ClassVar[dict[str, int]] = {}
 
-    def answer(self, reading: udp.Reading) -> udp.Answer:
+    def answer(self, reading: udp.ReadingPacket) -> udp.AnswerPacket:
         """Return an answer with the reading's numbers and zeros."""
         _, sequence, run, tick, *_ = reading
-        return udp.Answer(udp.EMPTY | udp.READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, "")
+        return udp.AnswerPacket(
+            udp.EMPTY_LOOP | udp.READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, ""
+        )
 
 
 class TickRecord:
@@ -77,7 +79,7 @@ class TickRecord:
 
     def __init__(self, capacity: int) -> None:
         self.sequence, self.wall, self.cpu = (array("q", bytes(8 * capacity)) for _ in range(3))
-        self._packets, self._size = bytearray(udp.READING.size * capacity), udp.READING.size
+        self._packets, self._size = bytearray(udp.READING_FORMAT.size * capacity), udp.READING_FORMAT.size
         self.count = self.kept = 0
         self.capacity = capacity
 
@@ -95,7 +97,7 @@ class TickRecord:
             self.sequence[count], self.wall[count], self.cpu[count] = sequence, wall, cpu
             self.count = count + 1
 
-    def readings(self) -> Iterator[udp.Reading]:
+    def readings(self) -> Iterator[udp.ReadingPacket]:
         """Yield the readings of the stored packets."""
         for index in range(self.kept):
             packet = self._packets[index * self._size : (index + 1) * self._size]
@@ -110,10 +112,12 @@ class TickRecord:
         return {name: list(getattr(self, name)[: self.count]) for name in ("sequence", "wall", "cpu")}
 
 
-def replayed(make: Callable[[], udp.ControllerTask], record: TickRecord, limit: float) -> dict[int, int]:
+def replay_slow_ticks(
+    make: Callable[[], udp.ControllerTask], record: TickRecord, limit: float
+) -> dict[int, int]:
     """Return the least CPU time [ns] in live run and replays of the ticks above `limit` [ns] when live."""
     times, cpu_now = record.above(limit), time.thread_time_ns
-    for _ in range(REPLAYS if times else 0):
+    for _ in range(REPLAY_COUNT if times else 0):
         task = make()
         for reading in record.readings():
             start = cpu_now()
@@ -124,7 +128,7 @@ def replayed(make: Callable[[], udp.ControllerTask], record: TickRecord, limit: 
     return times
 
 
-class Ended(NamedTuple):
+class SessionEnd(NamedTuple):
     """End of a session."""
 
     why: str  # "stopped", "silent" or "interrupted"
@@ -132,21 +136,25 @@ class Ended(NamedTuple):
 
 
 def serve(
-    receiver: socket.socket, task: udp.ControllerTask | Empty, record: TickRecord, wait: float, silence: float
-) -> Ended:
+    receiver: socket.socket,
+    task: udp.ControllerTask | EmptyControllerTask,
+    record: TickRecord,
+    wait: float,
+    silence: float,
+) -> SessionEnd:
     """Answer the packets of one session until the rig stops it or is silent for `silence` [s].
 
     `wait` [s] is the longest time until the first packet.
     """
-    packet = bytearray(udp.READING.size + 1)
+    packet = bytearray(udp.READING_FORMAT.size + 1)
     now, cpu_now, clock = time.monotonic_ns, time.thread_time_ns, time.monotonic
-    sessions, peer, session, ignored = udp.Sessions(), None, 0, 0
+    sessions, peer, session, ignored = udp.SessionNumbers(), None, 0, 0
     until = clock() + wait
     while True:
         # Only packets of the session extend this deadline, since others can come from any process.
         left = until - clock()
         if left <= 0.0 or not select.select([receiver], [], [], left)[0]:
-            return Ended("silent", ignored)
+            return SessionEnd("silent", ignored)
         try:
             size, sender = receiver.recvfrom_into(packet)
         except OSError:
@@ -171,7 +179,7 @@ def serve(
         if peer is None:
             peer, until = sender, clock() + silence
         if reading.event == udp.STOP:
-            return Ended("stopped", ignored)
+            return SessionEnd("stopped", ignored)
         answer, sent = task.answer(reading), False
         if answer is not None:
             until = clock() + silence
@@ -194,7 +202,9 @@ def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the process's options."""
     parser = argparse.ArgumentParser(description="Answer a rig's sensor packets over UDP on loopback.")
-    parser.add_argument("--gains", default=str(HERE / "gains.json"), help="gain file; by default beside this")
+    parser.add_argument(
+        "--gains", default=str(SCRIPT_FOLDER / "gains.json"), help="gain file; by default beside this"
+    )
     parser.add_argument("--port", type=int, default=0, help="UDP port on 127.0.0.1; 0: any that is free")
     parser.add_argument("--record", default=None, help="file for the time of every tick, as JSON")
     parser.add_argument("--ticks", type=int, default=1_000_000, help="ticks to keep the time of")
@@ -213,12 +223,12 @@ def main(arguments: list[str] | None = None) -> int:
     limit = math.inf
     try:
         if options.empty:
-            task: udp.ControllerTask | Empty = Empty()
+            task: udp.ControllerTask | EmptyControllerTask = EmptyControllerTask()
         else:
-            task = load(options.gains)
-            limit = CPU_SHARE * task.period * 1e9
+            task = load_task(options.gains)
+            limit = MAX_CPU_SHARE * task.period * 1e9
         if options.realtime:
-            realtime()
+            request_real_time_priority()
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         print(f"udp_controller: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
@@ -233,8 +243,8 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             ended = serve(receiver, task, record, options.wait, options.silence)
         except KeyboardInterrupt:
-            ended = Ended("interrupted", 0)
-    replay = replayed(lambda: load(options.gains), record, limit)
+            ended = SessionEnd("interrupted", 0)
+    replay = replay_slow_ticks(lambda: load_task(options.gains), record, limit)
     document = {
         "ended": ended.why,
         "ignored": ended.ignored,
@@ -251,19 +261,21 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if ended.why == "stopped" else 1
 
 
-def load(path: str) -> udp.ControllerTask:
+def load_task(path: str) -> udp.ControllerTask:
     """Load the task of a gain file; raise ValueError, OSError, KeyError or TypeError if it is invalid."""
     controller = Controller.from_file(path)
     document = json.loads(Path(path).read_text(encoding="utf-8"))
     limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
-    return udp.ControllerTask(controller, document["mechanism"], udp.MOST_MADE_UP if limit is None else limit)
+    return udp.ControllerTask(
+        controller, document["mechanism"], udp.MAX_INTERPOLATED_TICKS if limit is None else limit
+    )
 
 
-def realtime() -> None:
+def request_real_time_priority() -> None:
     """Request a real-time priority; raise OSError if it is refused."""
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("this system has no real-time priorities")
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,20 @@
 """UDP protocol between a rig and the controller's process, and the controller's side without a network.
 
-The rig sends a `Reading` with the sensors' readings at a tick; the controller's process returns an `Answer`
-with the command for the next tick. Both are packets of fixed size. `ControllerTask` computes the answer from
-the reading: it holds the controller and the numerical model of the docking, but no network or clock.
+The rig sends a `ReadingPacket` with the sensors' readings at a tick; the controller's process returns an
+`AnswerPacket` with the command for the next tick. Both are packets of fixed size. `ControllerTask` computes
+the answer from the reading: it holds the controller and the numerical model of the docking, but no network or
+clock.
 
 First the rig requests a session with a random number until it gets an answer with that number and the
 session's number, which every later packet in either direction contains. Only a receiver at the rig's address
 and port can know the session's number. The session begins with the first packet from there with that number
-(`Sessions`).
+(`SessionNumbers`).
 
 Packets may be lost, late or out of order. A packet that is not newer than the last one is dropped and counted
-(`Sequence`). Missing ticks are computed when the next packet arrives, from linearly interpolated readings,
-and answered with the fault `missed_tick`. If more ticks are missing than the gain file's limit
-`missed_in_a_row` (by default `MOST_MADE_UP`), they are not interpolated: the controller detects the gap in
-the rig's time, and the model continues under the last F_c, so that its time remains the rig's.
+(`SequenceFilter`). Missing ticks are computed when the next packet arrives, from linearly interpolated
+readings, and answered with the fault `missed_tick`. If more ticks are missing than the gain file's limit
+`missed_in_a_row` (by default `MAX_INTERPOLATED_TICKS`), they are not interpolated: the controller detects the
+gap in the rig's time, and the model continues under the last F_c, so that its time remains the rig's.
 """
 
 import hmac
@@ -24,25 +25,25 @@ from typing import Any, NamedTuple
 
 PREPARE, TICK, STOP, RESET = 1, 2, 3, 4  # kinds of packets from the rig
 EVENTS = (PREPARE, TICK, STOP, RESET)
-READY, TRIPPED, TARING, EMPTY = 1, 2, 4, 8  # flags of an answer
-FLAGS = READY | TRIPPED | TARING | EMPTY
+READY, TRIPPED, TARING, EMPTY_LOOP = 1, 2, 4, 8  # flags of an answer
+FLAGS = READY | TRIPPED | TARING | EMPTY_LOOP
 
 # Little-endian: mark, version, kind, session, sequence, run, tick; time [s], force [N], position [m],
 # start [m, m/s].
-READING = struct.Struct("<4sBBxxQIIIxxxx5d")
+READING_FORMAT = struct.Struct("<4sBBxxQIIIxxxx5d")
 # Mark, version, flags, session, sequence, run, tick; position command, rate, position, velocity, force;
 # faults; reason of a trip.
-ANSWER = struct.Struct("<4sBBxxQIII4xdddddQ96s")
+ANSWER_FORMAT = struct.Struct("<4sBBxxQIII4xdddddQ96s")
 # Mark, version, the rig's number, the session's number, which is 0 in the request.
-OPENING = struct.Struct("<4sBxxxQQ")
-MARK_IN, MARK_OUT, VERSION = b"JHrd", b"JHan", 2
-MARK_ASK, MARK_OPEN = b"JHas", b"JHop"
+OPENING_FORMAT = struct.Struct("<4sBxxxQQ")
+READING_MARK, ANSWER_MARK, VERSION = b"JHrd", b"JHan", 2
+REQUEST_MARK, OPENING_MARK = b"JHas", b"JHop"
 
-NUMBERS = 0xFFFFFFFF  # largest number of a packet, which is followed by 0
-WINDOW = 100  # largest step of the packet number that is accepted at once
-APPROACH = 0.02  # time of free approach before a contact [s]
-MOST_MADE_UP = 10  # largest number of missing ticks in a row that are interpolated, by default
-MOST_PASSED = 10_000  # largest number of periods that the model continues under the last force
+MAX_PACKET_NUMBER = 0xFFFFFFFF  # largest number of a packet, which is followed by 0
+MAX_SEQUENCE_STEP = 100  # largest step of the packet number that is accepted at once
+APPROACH_TIME = 0.02  # time of free approach before a contact [s]
+MAX_INTERPOLATED_TICKS = 10  # largest number of missing ticks in a row that are interpolated, by default
+MAX_COASTED_PERIODS = 10_000  # largest number of periods that the model continues under the last force
 MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # bits of the runtime's faults with these names
 
 
@@ -50,7 +51,7 @@ class PacketError(ValueError):
     """Error for bytes that are no packet of this protocol."""
 
 
-class Reading(NamedTuple):
+class ReadingPacket(NamedTuple):
     """Packet from the rig at one tick."""
 
     event: int  # kind of packet, one of `EVENTS`
@@ -64,7 +65,7 @@ class Reading(NamedTuple):
     start_velocity: float  # velocity of the numerical model at the run's tick 0 [m/s]
 
 
-class Answer(NamedTuple):
+class AnswerPacket(NamedTuple):
     """Packet to the rig in answer to one reading."""
 
     flags: int  # any of `FLAGS`
@@ -80,21 +81,21 @@ class Answer(NamedTuple):
     words: str  # reason of the controller's trip; empty without one
 
 
-def encode_reading(reading: Reading, session: int) -> bytes:
+def encode_reading(reading: ReadingPacket, session: int) -> bytes:
     """Return the packet of a reading."""
-    return READING.pack(MARK_IN, VERSION, reading.event, session, *reading[1:])
+    return READING_FORMAT.pack(READING_MARK, VERSION, reading.event, session, *reading[1:])
 
 
-def decode_reading(packet: bytes | bytearray, session: int | None) -> Reading:
+def decode_reading(packet: bytes | bytearray, session: int | None) -> ReadingPacket:
     """Decode the reading in a packet of the session (None: any); sensor values may be NaN.
 
     Raise PacketError for any other packet.
     """
-    if len(packet) != READING.size:
-        raise PacketError(f"{len(packet)} bytes, allowed {READING.size}")
-    mark, version, event, packet_session, *fields = READING.unpack(packet)
-    reading = Reading(event, *fields)
-    if mark != MARK_IN or version != VERSION or event not in EVENTS:
+    if len(packet) != READING_FORMAT.size:
+        raise PacketError(f"{len(packet)} bytes, expected {READING_FORMAT.size}")
+    mark, version, event, packet_session, *fields = READING_FORMAT.unpack(packet)
+    reading = ReadingPacket(event, *fields)
+    if mark != READING_MARK or version != VERSION or event not in EVENTS:
         raise PacketError("not a packet from the rig of this version")
     if session is not None and packet_session != session:
         raise PacketError("a packet of another session")
@@ -103,42 +104,42 @@ def decode_reading(packet: bytes | bytearray, session: int | None) -> Reading:
     return reading
 
 
-def encode_answer(answer: Answer, session: int) -> bytes:
+def encode_answer(answer: AnswerPacket, session: int) -> bytes:
     """Return the packet of an answer; its words are cut to 96 ASCII characters."""
     words = answer.words.encode("ascii", "replace")
-    return ANSWER.pack(MARK_OUT, VERSION, answer.flags, session, *answer[1:-1], words)
+    return ANSWER_FORMAT.pack(ANSWER_MARK, VERSION, answer.flags, session, *answer[1:-1], words)
 
 
-def decode_answer(packet: bytes, session: int | None) -> Answer:
+def decode_answer(packet: bytes, session: int | None) -> AnswerPacket:
     """Decode the answer in a packet of the session (None: any); raise PacketError for any other packet."""
-    if len(packet) != ANSWER.size:
-        raise PacketError(f"{len(packet)} bytes, allowed {ANSWER.size}")
-    mark, version, flags, packet_session, *fields, words = ANSWER.unpack(packet)
-    if mark != MARK_OUT or version != VERSION or flags & ~FLAGS:
+    if len(packet) != ANSWER_FORMAT.size:
+        raise PacketError(f"{len(packet)} bytes, expected {ANSWER_FORMAT.size}")
+    mark, version, flags, packet_session, *fields, words = ANSWER_FORMAT.unpack(packet)
+    if mark != ANSWER_MARK or version != VERSION or flags & ~FLAGS:
         raise PacketError("not an answer of this version")
     if session is not None and packet_session != session:
         raise PacketError("an answer of another session")
     text = words.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
         raise PacketError("words that are not printable")
-    return Answer._make((flags, *fields, text.decode("ascii")))
+    return AnswerPacket._make((flags, *fields, text.decode("ascii")))
 
 
-def ask_for_session(number: int) -> bytes:
+def encode_session_request(number: int) -> bytes:
     """Return the rig's request for a session, with a random number of 64 bits."""
-    return OPENING.pack(MARK_ASK, VERSION, number, 0)
+    return OPENING_FORMAT.pack(REQUEST_MARK, VERSION, number, 0)
 
 
 def decode_session(packet: bytes, number: int) -> int:
     """Decode the session's number in the answer to request `number`; raise PacketError if it is none."""
-    if len(packet) == OPENING.size:
-        mark, version, requested, session = OPENING.unpack(packet)
-        if (mark, version, requested) == (MARK_OPEN, VERSION, number):
+    if len(packet) == OPENING_FORMAT.size:
+        mark, version, requested, session = OPENING_FORMAT.unpack(packet)
+        if (mark, version, requested) == (OPENING_MARK, VERSION, number):
             return session
     raise PacketError("not the answer to that question for a session")
 
 
-class Sessions:
+class SessionNumbers:
     """Session numbers, computed from address and port by a keyed hash.
 
     Requests need no memory, and an answer is not longer than the request. Only a receiver at an address can
@@ -155,35 +156,37 @@ class Sessions:
 
     def answer(self, packet: bytes | bytearray, sender: tuple[str, int]) -> bytes | None:
         """Return the answer to a request for a session; None for any other packet."""
-        if len(packet) != OPENING.size:
+        if len(packet) != OPENING_FORMAT.size:
             return None
-        mark, version, requested, _ = OPENING.unpack(packet)
-        if mark != MARK_ASK or version != VERSION:
+        mark, version, requested, _ = OPENING_FORMAT.unpack(packet)
+        if mark != REQUEST_MARK or version != VERSION:
             return None
-        return OPENING.pack(MARK_OPEN, VERSION, requested, self.number(sender))
+        return OPENING_FORMAT.pack(OPENING_MARK, VERSION, requested, self.number(sender))
 
 
-class Sequence:
+class SequenceFilter:
     """Filter for packets that are newer than all before, by numbers of 32 bits (RFC 1982).
 
-    One packet with a wrong number must not make all later packets old. So a number more than `WINDOW` ahead
-    counts only after a second packet that follows it (as in RFC 3550, A.1).
+    One packet with a wrong number must not make all later packets old. So a number more than
+    `MAX_SEQUENCE_STEP` ahead counts only after a second packet that follows it (as in RFC 3550, A.1).
     """
 
     __slots__ = ("_awaited", "_newest")
 
     def __init__(self, newest: int = -1) -> None:
-        self._newest = newest & NUMBERS
+        self._newest = newest & MAX_PACKET_NUMBER
         self._awaited: int | None = None
 
     def is_newer(self, number: int) -> bool:
         """Return whether a packet is newer; if so, it becomes the newest one."""
-        ahead = number - self._newest & NUMBERS
-        if not 0 < ahead <= NUMBERS // 2:
+        ahead = number - self._newest & MAX_PACKET_NUMBER
+        if not 0 < ahead <= MAX_PACKET_NUMBER // 2:
             return False
         awaited = self._awaited
-        if ahead > WINDOW and (awaited is None or number - awaited & NUMBERS > WINDOW):
-            self._awaited = number + 1 & NUMBERS
+        if ahead > MAX_SEQUENCE_STEP and (
+            awaited is None or number - awaited & MAX_PACKET_NUMBER > MAX_SEQUENCE_STEP
+        ):
+            self._awaited = number + 1 & MAX_PACKET_NUMBER
             return False
         self._newest, self._awaited = number, None
         return True
@@ -209,7 +212,7 @@ class NumericalModel:
         velocity = float(approach["velocity"])
         phase = float(approach.get("phase", 1.0 / 3.0))
         nearer = min(float(rig.get("contact_plane", 0.0)), 0.0)
-        self.start = nearer - velocity * (APPROACH + phase * self._period), velocity
+        self.start = nearer - velocity * (APPROACH_TIME + phase * self._period), velocity
         self.place(*self.start)
 
     def place(self, position: float, velocity: float) -> None:
@@ -243,16 +246,18 @@ class ControllerTask:
         *("_sequence", "_tared", "_words", "_zeroed", "doubts", "made_up", "period", "stale"),
     )
 
-    def __init__(self, controller: Any, mechanism: dict[str, Any], bridged: float = MOST_MADE_UP) -> None:
+    def __init__(
+        self, controller: Any, mechanism: dict[str, Any], bridged: float = MAX_INTERPOLATED_TICKS
+    ) -> None:
         self._controller = controller
-        self._model, self._bridged = NumericalModel(mechanism), min(bridged, MOST_MADE_UP)
+        self._model, self._bridged = NumericalModel(mechanism), min(bridged, MAX_INTERPOLATED_TICKS)
         self.period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
         # Before tick 0 there is no force, although a noisy sensor reads one.
         self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
-        self._sequence, self._run, self._tared = Sequence(), -1, False
+        self._sequence, self._run, self._tared = SequenceFilter(), -1, False
         self._command = self._force = 0.0
-        self._last: Reading | None = None
+        self._last: ReadingPacket | None = None
         self._words = ""
         self.stale = self.made_up = 0
         self.doubts: dict[str, int] = {}
@@ -262,7 +267,7 @@ class ControllerTask:
         """Return the status of the controller."""
         return str(self._controller.status)
 
-    def answer(self, reading: Reading) -> Answer | None:
+    def answer(self, reading: ReadingPacket) -> AnswerPacket | None:
         """Return the answer to a reading; None if it is not newer than the last or its run is unprepared."""
         unprepared = reading.event == TICK and reading.run != self._run
         if unprepared or not self._sequence.is_newer(reading.sequence):
@@ -272,7 +277,7 @@ class ControllerTask:
             self._words = ""
         return self._step(reading) if reading.event == TICK else self._prepare(reading)
 
-    def _prepare(self, reading: Reading) -> Answer:
+    def _prepare(self, reading: ReadingPacket) -> AnswerPacket:
         model, faults = self._model, 0
         if reading.run != self._run:
             if not self._tared:
@@ -282,7 +287,7 @@ class ControllerTask:
             faults = self._begin(reading)
         return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, faults)
 
-    def _begin(self, reading: Reading) -> int:
+    def _begin(self, reading: ReadingPacket) -> int:
         """Begin a new run; return the faults at the end of the last one."""
         model, faults = self._model, 0
         if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
@@ -304,7 +309,7 @@ class ControllerTask:
             self.doubts[status] = self.doubts.get(status, 0) + 1
         return controller.faults
 
-    def _step(self, reading: Reading) -> Answer:
+    def _step(self, reading: ReadingPacket) -> AnswerPacket:
         model, last = self._model, self._last
         missed = reading.tick - (-1 if last is None else last.tick) - 1
         faults = 0
@@ -313,7 +318,7 @@ class ControllerTask:
             if missed <= self._bridged:
                 faults |= self._make_up(missed, reading)
             else:
-                for _ in range(min(missed, MOST_PASSED)):
+                for _ in range(min(missed, MAX_COASTED_PERIODS)):
                     model.integrate(self._force)
         position, velocity, before = model.position, model.velocity, self._command
         faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
@@ -322,7 +327,7 @@ class ControllerTask:
         rate = (self._command - before) / self.period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
-    def _make_up(self, missed: int, reading: Reading) -> int:
+    def _make_up(self, missed: int, reading: ReadingPacket) -> int:
         """Compute the missing ticks from interpolated readings; return their faults."""
         self.made_up += missed
         faults = 0
@@ -350,18 +355,18 @@ class ControllerTask:
 
     def _reply(
         self,
-        reading: Reading,
+        reading: ReadingPacket,
         flags: int,
         rate: float,
         position: float,
         velocity: float,
         force: float,
         faults: int,
-    ) -> Answer:
+    ) -> AnswerPacket:
         if self._controller.tripped:
             flags |= TRIPPED
             self._words = self._words or self.status[:96]
         _, sequence, run, tick, *_ = reading
-        return Answer(
+        return AnswerPacket(
             *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults), self._words
         )

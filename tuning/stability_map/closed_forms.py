@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import lambertw
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import Scenario
 
-TERMS = 40  # terms of the series; 4.5^81/81! is far below the rounding error
-LONGEST_DELAY = 1.0  # omega tau; up to this value the first zero of the series is before 4.5/omega
-ENTRIES = 2049  # entries of a table of the series; linear interpolation has errors below 1e-6
-INTEGRATORS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # delay [control periods]
+SERIES_TERMS = 40  # terms of the series; 4.5^81/81! is far below the rounding error
+MAX_DELAY_PHASE = 1.0  # omega tau; up to this value the first zero of the series is before 4.5/omega
+TABLE_SIZE = 2049  # entries of a table of the series; linear interpolation has errors below 1e-6
+INTEGRATOR_DELAYS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # delay [control periods]
 
 
 class ClosedForms(NamedTuple):
@@ -30,9 +30,9 @@ class ClosedForms(NamedTuple):
     reason: str | None  # reason if no form applies
 
 
-def closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ClosedForms:
+def compute_closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ClosedForms:
     """Return the closed forms that apply to a batch of scenarios, for the stiffest contact of each."""
-    reason = _reason(mechanism, compensator, scenarios)
+    reason = _reason_none_applies(mechanism, compensator, scenarios)
     if reason:
         return ClosedForms(None, None, None, reason)
     contacts = mechanism.approach.contacts
@@ -42,7 +42,7 @@ def closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) ->
     if np.all(damping > 0):
         return ClosedForms(None, None, delay / critical_delay(mass, stiffness, damping), None)
     phase = np.sqrt(stiffness / mass) * delay
-    return ClosedForms(series(phase), characteristic_root(phase), None, None)
+    return ClosedForms(restitution_by_series(phase), restitution_by_root(phase), None, None)
 
 
 def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
@@ -52,29 +52,29 @@ def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
     shares of the control period (item 7).
     """
     rig = mechanism.rig
-    periods = INTEGRATORS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
+    periods = INTEGRATOR_DELAYS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
     sensed = np.asarray(scenarios.force_sensor.delay) + np.asarray(scenarios.simulator.delay)
     return sensed + periods * np.asarray(scenarios.control_period)
 
 
-def series(phase: np.ndarray) -> np.ndarray:
+def restitution_by_series(phase: np.ndarray) -> np.ndarray:
     """Return the restitution of x'' = -omega^2 x(t - tau) at phase = omega tau; NaN unless 0 <= phase <= 1.
 
     The motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!, with time in units of 1/omega. It continues
     for tau after its first zero t_s, and the restitution is |S'(t_s + tau)| (item 1).
     """
-    table = np.linspace(0.0, LONGEST_DELAY, ENTRIES)
+    table = np.linspace(0.0, MAX_DELAY_PHASE, TABLE_SIZE)
     low, high = np.full_like(table, 2.0), np.full_like(table, 4.5)
     for _ in range(50):
         middle = (low + high) / 2
-        before = _motion(middle, table, 0) > 0
+        before = _series_motion(middle, table, 0) > 0
         low, high = np.where(before, middle, low), np.where(before, high, middle)
-    rebound = np.abs(_motion(low + table, table, 1))
+    rebound = np.abs(_series_motion(low + table, table, 1))
     phase = np.asarray(phase, float)
-    return np.where((phase >= 0) & (phase <= LONGEST_DELAY), np.interp(phase, table, rebound), np.nan)
+    return np.where((phase >= 0) & (phase <= MAX_DELAY_PHASE), np.interp(phase, table, rebound), np.nan)
 
 
-def characteristic_root(phase: np.ndarray) -> np.ndarray:
+def restitution_by_root(phase: np.ndarray) -> np.ndarray:
     """Return the restitution exp(pi Re s/|Im s|) at phase = omega tau >= 0.
 
     s = (2/tau) W_0(j omega tau/2), with the principal branch W_0 of the Lambert function, is a root of
@@ -94,12 +94,12 @@ def critical_delay(mass: np.ndarray, stiffness: np.ndarray, damping: np.ndarray)
     return np.arctan(damping * frequency / stiffness) / frequency
 
 
-def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str | None:
+def _reason_none_applies(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str | None:
     """Return the reason why no closed form applies, or None."""
     damping = np.asarray(scenarios.contact.damping)[: mechanism.approach.contacts]
     if compensator != "none":
         return "there is a compensation"
-    if not contact_law(mechanism.contact.law).is_linear:
+    if not find_contact_law(mechanism.contact.law).is_linear:
         return f"the contact law is {mechanism.contact.law}"
     if mechanism.rig.simulator.model != "ideal":
         return f"the motion simulator is {mechanism.rig.simulator.model}"
@@ -112,10 +112,10 @@ def _reason(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str 
     return None
 
 
-def _motion(time: np.ndarray, delay: np.ndarray, derivative: int) -> np.ndarray:
-    """Return S(t), or its derivative, elementwise; `TERMS` terms must be enough."""
+def _series_motion(time: np.ndarray, delay: np.ndarray, derivative: int) -> np.ndarray:
+    """Return S(t), or its derivative, elementwise; `SERIES_TERMS` terms must be enough."""
     total = np.zeros_like(time)
-    for n in range(TERMS):
+    for n in range(SERIES_TERMS):
         power = 2 * n + 1 - derivative
         since = np.maximum(time - n * delay, 0.0)
         term = since**power / math.factorial(power)

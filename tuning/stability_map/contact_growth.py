@@ -21,9 +21,9 @@ import numpy as np
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.laws.simulation_base import Compensator, Constants, Gains, Signals
+from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants, Signals
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.scenario import Scenario
@@ -32,13 +32,16 @@ LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
     "smith_hybrid",
 )  # fmt: skip
-SHORTEST_LAG = 1e-3  # control periods; in a batch with lags, lanes without a lag get this one
-SQUARINGS, TERMS = 12, 12  # of the matrix exponential: errors below 1e-12 for norms up to 1000
-DEEP = 1e-3  # m; penetration at which the loop is linearised
-PER_CHUNK = 4_000_000  # matrix entries computed at a time
+MIN_LAG = 1e-3  # control periods; in a batch with lags, lanes without a lag get this one
+EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = (
+    12,
+    12,
+)  # of the matrix exponential: errors below 1e-12 for norms up to 1000
+LINEARISATION_DEPTH = 1e-3  # m; penetration at which the loop is linearised
+MAX_CHUNK_ENTRIES = 4_000_000  # matrix entries computed at a time
 
 
-class Shape(NamedTuple):
+class ProgramParameters(NamedTuple):
     """Static parameters of the compiled program."""
 
     compensator: str
@@ -49,7 +52,7 @@ class Shape(NamedTuple):
     delays: int  # largest number of delayed readings
 
 
-class Lane(NamedTuple):
+class LoopParameters(NamedTuple):
     """Parameters of one loop in contact, or arrays over lanes."""
 
     mass: Any  # M [kg]
@@ -72,11 +75,11 @@ class Growth(NamedTuple):
     by_gain: dict[str, float]  # derivative of the spectral radius [1 over the gain's unit]
 
 
-def no_growth(mechanism: Mechanism, compensator: str) -> str | None:
+def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
     """Return the reason why the loop in contact is not linear, or None if it is linear."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
-    if not contact_law(mechanism.contact.law).is_linear:
+    if not find_contact_law(mechanism.contact.law).is_linear:
         return f"the contact law {mechanism.contact.law} is not linear"
     return None
 
@@ -89,14 +92,14 @@ def spectral_radii(
     `gains` are scalars or have one value per lane.
     """
     number = len(np.asarray(scenarios.velocity))
-    shape, lane_gains = _shape(mechanism, compensator, scenarios), _per_lane(gains, number)
+    shape, lane_gains = _program_parameters(mechanism, compensator, scenarios), _per_lane(gains, number)
     largest = np.zeros(number)
-    for slot in _contacts(mechanism):
-        lanes = _lanes(scenarios, slot)
-        size = _size(shape, lanes)
-        for start in range(0, number, step := max(1, PER_CHUNK // size**2)):
+    for slot in _distinct_contacts(mechanism):
+        lanes = _lane_parameters(scenarios, slot)
+        size = _matrix_size(shape, lanes)
+        for start in range(0, number, step := max(1, MAX_CHUNK_ENTRIES // size**2)):
             part = slice(start, start + step)
-            matrices = _matrices(
+            matrices = _period_matrices(
                 shape, *jax.tree.map(lambda leaf, part=part: leaf[part], (lanes, lane_gains))
             )
             radii = np.max(np.abs(np.linalg.eigvals(np.asarray(matrices))), axis=-1)
@@ -104,19 +107,26 @@ def spectral_radii(
     return largest
 
 
-def cost(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> float:
+def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> float:
     """Return the order of magnitude of the operations for one lane's eigenvalues."""
-    shape = _shape(mechanism, compensator, scenarios)
-    return len(_contacts(mechanism)) * float(_size(shape, _lanes(scenarios, 0))) ** 3
+    shape = _program_parameters(mechanism, compensator, scenarios)
+    return (
+        len(_distinct_contacts(mechanism)) * float(_matrix_size(shape, _lane_parameters(scenarios, 0))) ** 3
+    )
 
 
-def growth(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario) -> Growth:
+def compute_growth(
+    mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario
+) -> Growth:
     """Return the growth of the first lane in its fastest growing contact, with the slope by every gain."""
-    shape, values = _shape(mechanism, compensator, scenarios), {k: jnp.asarray(v) for k, v in gains.items()}
+    shape, values = (
+        _program_parameters(mechanism, compensator, scenarios),
+        {k: jnp.asarray(v) for k, v in gains.items()},
+    )
     most: Growth | None = None
-    for slot in _contacts(mechanism):
-        lane: Lane = jax.tree.map(lambda leaf: leaf[0], _lanes(scenarios, slot))
-        matrix, slopes = _with_slopes(shape, lane, values)
+    for slot in _distinct_contacts(mechanism):
+        lane: LoopParameters = jax.tree.map(lambda leaf: leaf[0], _lane_parameters(scenarios, slot))
+        matrix, slopes = _matrix_derivatives(shape, lane, values)
         solution: Any = scipy.linalg.eig(np.asarray(matrix), left=True)
         eigenvalues, left, right = solution
         index = int(np.argmax(np.abs(eigenvalues)))
@@ -137,7 +147,7 @@ def growth(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], s
     return most
 
 
-def _contacts(mechanism: Mechanism) -> list[int]:
+def _distinct_contacts(mechanism: Mechanism) -> list[int]:
     """Return the contacts of the schedule with distinct stiffness and damping."""
     contact, pairs = mechanism.contact, {}
     for slot in range(mechanism.approach.contacts):
@@ -147,19 +157,21 @@ def _contacts(mechanism: Mechanism) -> list[int]:
     return sorted(pairs.values())
 
 
-def _shape(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> Shape:
+def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ProgramParameters:
     """Return the static parameters of the program for a batch."""
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
     lagging = bool(np.any(np.asarray(scenarios.force_sensor.time_constant) > 0))
-    return Shape(compensator, rig.integrator, rig.command_hold, rig.command_latency, lagging, longest + 1)
+    return ProgramParameters(
+        compensator, rig.integrator, rig.command_hold, rig.command_latency, lagging, longest + 1
+    )
 
 
-def _lanes(scenarios: Scenario, slot: int) -> Lane:
+def _lane_parameters(scenarios: Scenario, slot: int) -> LoopParameters:
     """Return the parameters of every lane in one contact of the schedule."""
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
-    numbers = Lane(
+    numbers = LoopParameters(
         mass=scenarios.equivalent_mass,
         period=scenarios.control_period,
         stiffness=scenarios.contact.stiffness[slot],
@@ -177,47 +189,59 @@ def _per_lane(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
     return {name: np.broadcast_to(np.asarray(value, float), (number,)) for name, value in gains.items()}
 
 
-def _size(shape: Shape, lanes: Lane) -> int:
+def _matrix_size(shape: ProgramParameters, lanes: LoopParameters) -> int:
     """Return the approximate number of rows of a matrix."""
     return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.has_lag + shape.delays + 4
 
 
 @partial(jax.jit, static_argnums=0)
-def _matrices(shape: Shape, lanes: Lane, gains: Gains) -> jax.Array:
+def _period_matrices(shape: ProgramParameters, lanes: LoopParameters, gains: Gains) -> jax.Array:
     """Return the matrices of all lanes, (lanes, size, size)."""
-    return jax.vmap(partial(_matrix, shape))(lanes, gains)
+    return jax.vmap(partial(_period_matrix, shape))(lanes, gains)
 
 
 @partial(jax.jit, static_argnums=0)
-def _with_slopes(shape: Shape, lane: Lane, gains: Gains) -> tuple[jax.Array, Gains]:
+def _matrix_derivatives(
+    shape: ProgramParameters, lane: LoopParameters, gains: Gains
+) -> tuple[jax.Array, Gains]:
     """Return the matrix, and its derivative by every gain."""
-    matrix = partial(_matrix, shape, lane)
+    matrix = partial(_period_matrix, shape, lane)
     return matrix(gains), jax.jacfwd(matrix)(gains) if gains else {}
 
 
-def _matrix(shape: Shape, lane: Lane, gains: Gains) -> jax.Array:
+def _period_matrix(shape: ProgramParameters, lane: LoopParameters, gains: Gains) -> jax.Array:
     """Return the matrix of one control period, (size, size)."""
     law = COMPENSATORS[shape.compensator]
-    constants = Constants(lane.period, jnp.full_like(lane.period, jnp.inf))
+    constants = KnownConstants(lane.period, jnp.full_like(lane.period, jnp.inf))
     plant = jnp.zeros(lane.numerator.shape[0] + shape.has_lag)
     start = (
-        jnp.full_like(lane.period, DEEP), jnp.zeros_like(lane.period), jnp.full(shape.latency + 1, DEEP),
-        plant, jnp.zeros(shape.delays), law.init(gains, constants, 16),
-    )  # fmt: skip
+        jnp.full_like(lane.period, LINEARISATION_DEPTH),
+        jnp.zeros_like(lane.period),
+        jnp.full(shape.latency + 1, LINEARISATION_DEPTH),
+        plant,
+        jnp.zeros(shape.delays),
+        law.init(gains, constants, 16),
+    )
     flat, unravel = ravel_pytree(start)
-    transition, reading = _plant(shape, lane)
+    transition, reading = _plant_transition(shape, lane)
 
     def one_period(flat: jax.Array) -> jax.Array:
-        after = _period(shape, law, lane, gains, constants, transition, reading, unravel(flat))
+        after = _advance_period(shape, law, lane, gains, constants, transition, reading, unravel(flat))
         return ravel_pytree(after)[0]
 
     return jax.jacfwd(one_period)(flat)
 
 
-def _period(
-    shape: Shape, law: Compensator, lane: Lane, gains: Gains, constants: Constants, transition: jax.Array,
-    reading: jax.Array, before: Any,
-) -> Any:  # fmt: skip
+def _advance_period(
+    shape: ProgramParameters,
+    law: Compensator,
+    lane: LoopParameters,
+    gains: Gains,
+    constants: KnownConstants,
+    transition: jax.Array,
+    reading: jax.Array,
+    before: Any,
+) -> Any:
     """Return the state of the loop in contact after one control period, from tick to tick."""
     position, velocity, commands, plant, readings, state = before
     # The reading at a tick was sampled a whole number of periods before the newest sample.
@@ -236,7 +260,7 @@ def _period(
     return position, velocity, sent[:-1], transition @ driven, readings, state
 
 
-def _plant(shape: Shape, lane: Lane) -> tuple[jax.Array, jax.Array]:
+def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[jax.Array, jax.Array]:
     """Return the transition of motion simulator, contact and sensor lag over a control period.
 
     The rows of the next state, and the row of the new reading, multiply (state, command at the period's
@@ -261,23 +285,23 @@ def _plant(shape: Shape, lane: Lane) -> tuple[jax.Array, jax.Array]:
         generator = generator.at[order - 1, command].set(1.0)
     force = lane.stiffness * position + lane.damping / period * (position @ generator)
     if shape.has_lag:
-        ratio = 1.0 / jnp.maximum(lane.lag / period, SHORTEST_LAG)
+        ratio = 1.0 / jnp.maximum(lane.lag / period, MIN_LAG)
         generator = generator.at[order].set(ratio * force).at[order, order].add(-ratio)
         force = jnp.zeros(size + 2).at[order].set(1.0)
     # A reading at a tick has the value just before the tick, so its time lies in (0, 1].
     time = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
-    whole, part = (_exponential(generator * share) for share in (jnp.ones_like(time), time))
+    whole, part = (_matrix_exponential(generator * share) for share in (jnp.ones_like(time), time))
     rows = jnp.concatenate([whole[:size], (force @ part)[None]])
     rows = rows.at[:, command].add(-rows[:, slope])
     return rows[:size], rows[size]
 
 
-def _exponential(matrix: jax.Array) -> jax.Array:
+def _matrix_exponential(matrix: jax.Array) -> jax.Array:
     """Return a matrix exponential by scaling and squaring; `expm` compiles much more slowly."""
-    identity, scaled = jnp.eye(len(matrix)), matrix / 2**SQUARINGS
+    identity, scaled = jnp.eye(len(matrix)), matrix / 2**EXPONENTIAL_SQUARINGS
 
     def horner(step: Any, total: jax.Array) -> jax.Array:
-        return identity + scaled @ total / (TERMS - step)
+        return identity + scaled @ total / (EXPONENTIAL_TERMS - step)
 
-    total = jax.lax.fori_loop(0, TERMS, horner, identity)
-    return jax.lax.fori_loop(0, SQUARINGS, lambda _, total: total @ total, total)
+    total = jax.lax.fori_loop(0, EXPONENTIAL_TERMS, horner, identity)
+    return jax.lax.fori_loop(0, EXPONENTIAL_SQUARINGS, lambda _, total: total @ total, total)

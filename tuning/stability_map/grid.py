@@ -10,36 +10,42 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.mechanism.file import to_builtins
+from jaxhil.mechanism.file import to_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.caches.cluster import Piece, on_workers
-from tuning.caches.pieces import NOTHING_KEPT, Pieces, digest_of
-from tuning.caches.worker import setting
-from tuning.stability_map.axes import MapAxis, draws
-from tuning.stability_map.closed_forms import ClosedForms, closed_forms
-from tuning.stability_map.contact_growth import Growth, cost, growth, no_growth, spectral_radii
+from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
+from tuning.caches.cluster import WorkUnit, run_on_workers
+from tuning.caches.worker import get_process_setting
+from tuning.stability_map.axes import MapAxis, mechanism_draws
+from tuning.stability_map.closed_forms import ClosedForms, compute_closed_forms
+from tuning.stability_map.contact_growth import (
+    Growth,
+    compute_growth,
+    eigenvalue_cost,
+    explain_nonlinearity,
+    spectral_radii,
+)
 
-LINE = 201  # points of each line through the nominal point
-PART = 2048  # largest number of runs computed at a time
-MOST_WORK = (
+LINE_POINTS = 201  # points of each line through the nominal point
+MAX_TILE_RUNS = 2048  # largest number of runs computed at a time
+MAX_EIGENVALUE_COST = (
     5e7  # cost of all eigenvalues; if the whole map costs more, the spectral radius has a coarser grid
 )
-FEWEST = 15  # smallest number of points along an axis of the coarser grid
+MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser grid
 
 
-class Margin(NamedTuple):
+class NominalMargin(NamedTuple):
     """Nearest values of one key at which a limit is exceeded; None if the map ends first."""
 
     low: float | None  # nearest value below the nominal one [unit of the key]
     high: float | None  # nearest value above the nominal one
 
 
-class Radii(NamedTuple):
+class SpectralRadii(NamedTuple):
     """Spectral radius of the loop in contact, over its own grid."""
 
     x: np.ndarray  # (columns,)
@@ -47,7 +53,7 @@ class Radii(NamedTuple):
     values: np.ndarray  # (rows, columns) [1]
 
 
-class Nominal(NamedTuple):
+class NominalPoint(NamedTuple):
     """Results at the nominal point, which the mechanism file describes."""
 
     restitution: float | None  # e of the contact with the largest error [1]
@@ -56,14 +62,16 @@ class Nominal(NamedTuple):
     peak_force_ratio: float | None
     duration_ratio: float | None  # ratio of durations farthest from 1 [1]; None if a contact did not end
     growth: Growth | None  # growth of a lasting contact; None if the loop in contact is not linear
-    error_margins: tuple[Margin, Margin] | None  # along x and y, to the limit; None if the error exceeds it
+    error_margins: (
+        tuple[NominalMargin, NominalMargin] | None
+    )  # along x and y, to the limit; None if the error exceeds it
     # along x and y, to the bounds on real peak force and duration; None if they are exceeded
-    contact_margins: tuple[Margin, Margin] | None
+    contact_margins: tuple[NominalMargin, NominalMargin] | None
     # along x and y, to a spectral radius of 1; None if it is exceeded
-    radius_margins: tuple[Margin, Margin] | None
+    radius_margins: tuple[NominalMargin, NominalMargin] | None
 
 
-class Map(NamedTuple):
+class MapResults(NamedTuple):
     """All results of a map."""
 
     axes: tuple[MapAxis, MapAxis]  # axes x and y
@@ -71,12 +79,12 @@ class Map(NamedTuple):
     y: np.ndarray  # values along y, (rows,), in the unit of its key
     restitution: np.ndarray  # e of the contact with the largest error (rows, columns) [1]
     error: np.ndarray  # e - e* of that contact (rows, columns) [1]; NaN if a contact did not end
-    peak_force_ratio: np.ndarray  # as in `Nominal` (rows, columns) [1]; NaN if a contact did not end
-    duration_ratio: np.ndarray  # as in `Nominal` (rows, columns) [1]; NaN if a contact did not end
+    peak_force_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
+    duration_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     closed: ClosedForms  # closed forms, each (rows, columns)
-    radii: Radii | None  # spectral radius of a lasting contact; None if there is none
+    radii: SpectralRadii | None  # spectral radius of a lasting contact; None if there is none
     no_growth: str | None  # reason why `radii` is None
-    nominal: Nominal
+    nominal: NominalPoint
 
 
 def compute_map(
@@ -89,8 +97,8 @@ def compute_map(
     seed: int,
     tell: Callable[[str, float], None],
     scheduler: str | None = None,
-    checkpoints: Pieces = NOTHING_KEPT,
-) -> Map:
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+) -> MapResults:
     """Compute the map with `points` values along each axis.
 
     `tell` is called with the current step and the number of finished runs, of `runs(points)`. With a
@@ -99,36 +107,44 @@ def compute_map(
     """
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
-        return _gains(gains, axes, values), _scenarios(mechanism, axes, values, seed)
+        return _point_gains(gains, axes, values), _build_scenarios(mechanism, axes, values, seed)
 
     x, y = (axis.values(points) for axis in axes)
-    lines = [axis.values(LINE) for axis in axes]
+    lines = [axis.values(LINE_POINTS) for axis in axes]
     middle = np.array([[axis.nominal for axis in axes]])
-    across, up = np.repeat(middle, LINE, axis=0), np.repeat(middle, LINE, axis=0)
+    across, up = np.repeat(middle, LINE_POINTS, axis=0), np.repeat(middle, LINE_POINTS, axis=0)
     across[:, 0], up[:, 1] = lines
-    point_gains, scenarios = batch(np.concatenate([_grid(x, y), across, up, middle]))
-    worst = _run(mechanism, compensator, point_gains, scenarios, tell, scheduler, checkpoints)
+    point_gains, scenarios = batch(np.concatenate([_grid_points(x, y), across, up, middle]))
+    worst = _run_tiles(mechanism, compensator, point_gains, scenarios, tell, scheduler, checkpoints)
     restitution, error, force, duration, _ = worst
     size = points**2
 
-    tell("eigenvalues of the loop in contact", runs(points))
-    reason = no_growth(mechanism, compensator)
+    tell("eigenvalues of the loop in contact", count_runs(points))
+    reason = explain_nonlinearity(mechanism, compensator)
     radii = on_lines = nominal_growth = None
     if reason is None:
         plain = {name: float(value) for name, value in gains.items()}
-        nominal_growth = growth(mechanism, compensator, plain, batch(middle)[1])
-        coarse = min(points, max(FEWEST, int((MOST_WORK / cost(mechanism, compensator, scenarios)) ** 0.5)))
+        nominal_growth = compute_growth(mechanism, compensator, plain, batch(middle)[1])
+        coarse = min(
+            points,
+            max(
+                MIN_COARSE_POINTS,
+                int((MAX_EIGENVALUE_COST / eigenvalue_cost(mechanism, compensator, scenarios)) ** 0.5),
+            ),
+        )
         grid = [axis.values(coarse) for axis in axes]
-        all_radii = spectral_radii(mechanism, compensator, *batch(np.concatenate([_grid(*grid), across, up])))
-        radii = Radii(grid[0], grid[1], all_radii[: coarse**2].reshape(coarse, coarse))
-        on_lines = all_radii[coarse**2 :].reshape(2, LINE)
-    closed = closed_forms(mechanism, compensator, batch(_grid(x, y))[1])
-    nominal = _nominal(worst, size, axes, lines, limit)
+        all_radii = spectral_radii(
+            mechanism, compensator, *batch(np.concatenate([_grid_points(*grid), across, up]))
+        )
+        radii = SpectralRadii(grid[0], grid[1], all_radii[: coarse**2].reshape(coarse, coarse))
+        on_lines = all_radii[coarse**2 :].reshape(2, LINE_POINTS)
+    closed = compute_closed_forms(mechanism, compensator, batch(_grid_points(x, y))[1])
+    nominal = _nominal_point(worst, size, axes, lines, limit)
     if on_lines is not None and nominal_growth is not None:
-        margins = _margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
+        margins = _line_margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
         nominal = nominal._replace(growth=nominal_growth, radius_margins=margins)
     shape = points, points
-    return Map(
+    return MapResults(
         axes=axes,
         x=x,
         y=y,
@@ -136,27 +152,27 @@ def compute_map(
         error=error[:size].reshape(shape),
         peak_force_ratio=force[:size].reshape(shape),
         duration_ratio=duration[:size].reshape(shape),
-        closed=_reshaped(closed, points),
+        closed=_reshape_forms(closed, points),
         radii=radii,
         no_growth=reason,
         nominal=nominal,
     )
 
 
-def _nominal(
+def _nominal_point(
     worst: np.ndarray,
     size: int,
     axes: tuple[MapAxis, MapAxis],
     lines: list[np.ndarray],
     limit: float,
-) -> Nominal:
+) -> NominalPoint:
     """Return the nominal point, which is the last run, and its margins along the lines.
 
     The first `size` runs are those of the map.
     """
     restitution, error, force, duration, unlike = worst
     if not np.isfinite(error[-1]):
-        return Nominal(
+        return NominalPoint(
             restitution=None,
             error=None,
             peak_force_ratio=None,
@@ -166,49 +182,49 @@ def _nominal(
             contact_margins=None,
             radius_margins=None,
         )
-    errors = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE)
-    bounds = np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE)
-    return Nominal(
+    errors = np.nan_to_num(np.abs(error[size:-1]), nan=np.inf).reshape(2, LINE_POINTS)
+    bounds = np.nan_to_num(unlike[size:-1], nan=1.0).reshape(2, LINE_POINTS)
+    return NominalPoint(
         restitution=float(restitution[-1]),
         error=float(error[-1]),
         peak_force_ratio=float(force[-1]),
         duration_ratio=float(duration[-1]),
         growth=None,
-        error_margins=_margins(axes, lines, errors, limit) if abs(error[-1]) <= limit else None,
-        contact_margins=_margins(axes, lines, bounds, 0.5) if not unlike[-1] else None,
+        error_margins=_line_margins(axes, lines, errors, limit) if abs(error[-1]) <= limit else None,
+        contact_margins=_line_margins(axes, lines, bounds, 0.5) if not unlike[-1] else None,
         radius_margins=None,
     )
 
 
-def runs(points: int) -> int:
+def count_runs(points: int) -> int:
     """Return the number of runs of a map with `points` values along each axis."""
-    return points**2 + 2 * LINE + 1
+    return points**2 + 2 * LINE_POINTS + 1
 
 
-def run_part(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
-    """Run a tile of scenarios, and return the result of `_worst` for each of them, (5, lanes)."""
-    return np.stack(_worst(evaluate(loop, gains, scenarios, at_least=at_least)))
+def run_tile(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
+    """Run a tile of scenarios, and return the result of `_worst_contact` for each of them, (5, lanes)."""
+    return np.stack(_worst_contact(evaluate(loop, gains, scenarios, at_least=at_least)))
 
 
-def _run(
+def _run_tiles(
     mechanism: Mechanism,
     compensator: str,
     gains: Mapping[str, Any],
     scenarios: Scenario,
     tell: Callable[[str, float], None],
     scheduler: str | None,
-    checkpoints: Pieces,
+    checkpoints: Checkpoints,
 ) -> np.ndarray:
-    """Return the result of `_worst` for each run, (5, lanes), computed tile by tile.
+    """Return the result of `_worst_contact` for each run, (5, lanes), computed tile by tile.
 
     Every tile has a mix of long and short runs, so that all tiles take a similar time.
     """
     loop = build_loop(mechanism, compensator, scenarios)
     order = np.argsort(ONE_AXIS.expected_duration(scenarios))
     worst = np.empty((5, len(order)))
-    parts = -(-len(order) // PART)
+    parts = -(-len(order) // MAX_TILE_RUNS)
     lanes = [order[number::parts] for number in range(parts)]
-    inputs = digest_of((to_builtins(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
+    inputs = compute_digest((to_plain_data(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
     finished = 0
     tell("running the contacts", finished)
 
@@ -218,34 +234,36 @@ def _run(
         finished += len(lanes[number])
         tell("running the contacts", finished)
 
-    def tile_pieces(numbers: Iterable[int]) -> Iterator[Piece]:
+    def tile_pieces(numbers: Iterable[int]) -> Iterator[WorkUnit]:
         for number in numbers:
             part = lanes[number]
             tile_gains = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
             tile_scenarios = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
-            yield Piece(number, (loop, tile_gains, tile_scenarios, len(lanes[0])))
+            yield WorkUnit(number, (loop, tile_gains, tile_scenarios, len(lanes[0])))
 
     missing = []
     for number in range(parts):
         stored = checkpoints.read(f"part {number}", (inputs, number), np.ndarray)
         missing.append(number) if stored is None else take(number, stored)
     if scheduler is None:
-        computed = ((number, run_part(*arguments)) for number, arguments in tile_pieces(missing))
+        computed = ((number, run_tile(*arguments)) for number, arguments in tile_pieces(missing))
     else:
-        computed = on_workers(scheduler, run_part, tile_pieces(missing), setting(), f"map-{inputs[:16]}")
+        computed = run_on_workers(
+            scheduler, run_tile, tile_pieces(missing), get_process_setting(), f"map-{inputs[:16]}"
+        )
     for number, values in computed:
         checkpoints.write(f"part {number}", (inputs, number), values)
         take(number, values)
     return worst
 
 
-def _grid(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _grid_points(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the points of a grid row by row, (rows x columns, 2)."""
     across, up = np.meshgrid(x, y)
     return np.stack([across.ravel(), up.ravel()], axis=1)
 
 
-def _reshaped(closed: ClosedForms, points: int) -> ClosedForms:
+def _reshape_forms(closed: ClosedForms, points: int) -> ClosedForms:
     """Return the closed forms with rows and columns instead of lanes."""
     series, root, critical = (
         None if values is None else values.reshape(points, points) for values in closed[:3]
@@ -253,17 +271,19 @@ def _reshaped(closed: ClosedForms, points: int) -> ClosedForms:
     return ClosedForms(series, root, critical, closed.reason)
 
 
-def _scenarios(
+def _build_scenarios(
     mechanism: Mechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
 ) -> Scenario:
     """Build the scenarios of the points `values` (lanes, 2), all with the same sensor noise."""
     phase = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
-    scenarios = build_scenarios(mechanism, phase | draws(mechanism, axes, values), seed)
+    scenarios = build_scenarios(mechanism, phase | mechanism_draws(mechanism, axes, values), seed)
     # Every lane gets the noise of the first, so that points differ only by the keys.
     return scenarios._replace(key=np.broadcast_to(scenarios.key[:, :1], scenarios.key.shape))  # pyright: ignore[reportArgumentType]
 
 
-def _gains(gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np.ndarray) -> dict[str, Any]:
+def _point_gains(
+    gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np.ndarray
+) -> dict[str, Any]:
     """Return the gains of the points `values` (lanes, 2): arrays over lanes if an axis is a gain."""
     varied = {
         axis.key.partition(".")[2]: values[:, index] for index, axis in enumerate(axes) if not axis.path
@@ -273,7 +293,7 @@ def _gains(gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np
     return {name: varied.get(name, np.full(len(values), value)) for name, value in gains.items()}
 
 
-def _worst(outcome: Outcome) -> tuple[np.ndarray, ...]:
+def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     """Return the worst values of each lane, five arrays (lanes,).
 
     These are e and e - e* of the contact with the largest error, the largest peak force ratio, the duration
@@ -299,23 +319,23 @@ def _worst(outcome: Outcome) -> tuple[np.ndarray, ...]:
     )
 
 
-def _margins(
+def _line_margins(
     axes: tuple[MapAxis, MapAxis], lines: list[np.ndarray], values: np.ndarray, most: float
-) -> tuple[Margin, Margin]:
+) -> tuple[NominalMargin, NominalMargin]:
     """Return where `values` (axes, points) along lines through the nominal point first exceed `most`."""
     margins = []
     for axis, line, along in zip(axes, lines, values, strict=True):
         below, above = line < axis.nominal, line > axis.nominal
         margins.append(
-            Margin(
-                _crossing(line[below][::-1], along[below][::-1], most),
-                _crossing(line[above], along[above], most),
+            NominalMargin(
+                _first_crossing(line[below][::-1], along[below][::-1], most),
+                _first_crossing(line[above], along[above], most),
             )
         )
     return margins[0], margins[1]
 
 
-def _crossing(line: np.ndarray, values: np.ndarray, most: float) -> float | None:
+def _first_crossing(line: np.ndarray, values: np.ndarray, most: float) -> float | None:
     """Return the first value on a line at which `values`, linearly interpolated, exceed `most`, or None."""
     beyond = np.flatnonzero(values > most)
     if not len(beyond):

@@ -6,9 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 
-RESAMPLES = 1999
-LEVEL = 0.95
-MANY = 4096  # number of scenarios above which the BCa correction is negligible and its jackknife is slow
+BOOTSTRAP_RESAMPLES = 1999
+CONFIDENCE_LEVEL = 0.95
+MAX_BCA_SCENARIOS = (
+    4096  # number of scenarios above which the BCa correction is negligible and its jackknife is slow
+)
 
 
 class Interval(NamedTuple):
@@ -29,20 +31,20 @@ class ErrorIntervals(NamedTuple):
         return {name: interval._asdict() for name, interval in self._asdict().items()}
 
 
-def error_intervals(
+def compute_error_intervals(
     errors: Float[np.ndarray, "slots scenarios"],
     good: Bool[np.ndarray, "slots scenarios"],
     *,
-    resamples: int = RESAMPLES,
-    level: float = LEVEL,
+    resamples: int = BOOTSTRAP_RESAMPLES,
+    level: float = CONFIDENCE_LEVEL,
     seed: int = 0,
 ) -> ErrorIntervals:
     """Return bootstrap confidence intervals of the rms and 99th percentile of |e - e*| over `good` contacts.
 
     Whole scenarios are resampled, because the contacts of a scenario depend on each other. The rms, a ratio
     of two means over scenarios, has the BCa interval (bias-corrected and accelerated), or with more than
-    `MANY` scenarios the percentile interval. The 99th percentile, which is not smooth enough for an
-    acceleration, has the percentile interval.
+    `MAX_BCA_SCENARIOS` scenarios the percentile interval. The 99th percentile, which is not smooth enough for
+    an acceleration, has the percentile interval.
 
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 13 and 14.
     """
@@ -68,18 +70,18 @@ def error_intervals(
         n_resamples=resamples,
         batch=max(1, 2_000_000 // len(squares)),
         confidence_level=level,
-        method="BCa" if len(squares) <= MANY else "percentile",
+        method="BCa" if len(squares) <= MAX_BCA_SCENARIOS else "percentile",
         rng=np.random.default_rng(seed),
     ).confidence_interval
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
-    percentiles = _resampled_percentile(size, good, 0.99, resamples, np.random.default_rng(seed))
+    percentiles = _resample_percentile(size, good, 0.99, resamples, np.random.default_rng(seed))
     return ErrorIntervals(
         Interval(float(rms.low), float(rms.high)),
         Interval(*map(float, np.quantile(percentiles, tails))),
     )
 
 
-def _resampled_percentile(size, good, share, resamples, generator):
+def _resample_percentile(size, good, share, resamples, generator):
     """Return the quantile of order `share` of `size` (slots, scenarios) at `good`, for each of the resamples.
 
     A resample is a count per scenario. Its quantile is among the largest contacts, so that only these are

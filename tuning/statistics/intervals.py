@@ -6,7 +6,7 @@ level:
 - *a fixed number of independent scenarios*: `binomial_interval`, which is exact;
 - *as many scenarios as necessary* until the interval is narrow enough: an exact interval is no longer exact
   if it is computed repeatedly, since one stops at a favourable moment. `confidence_sequence` covers at all
-  numbers simultaneously, thus at any stopping rule; `Running` stores its state;
+  numbers simultaneously, thus at any stopping rule; `SequentialState` stores its state;
 - *a few independent scramblings of a Sobol sequence*: `replicate_interval`. The points of a scrambling depend
   on each other, so that no binomial distribution applies; the interval uses the spread of the scramblings,
   which are independent;
@@ -21,10 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-LEVEL = 0.95
-PRIOR = 0.5  # both parameters of the mixing beta distribution (Jeffreys; Krichevsky and Trofimov)
-FEW = 100  # failures (or successes) of all replicates below which Student's interval alone is not used
-_STEPS = 62  # steps of bisection, which reduce a bracket of 1500 to rounding
+CONFIDENCE_LEVEL = 0.95
+BETA_PRIOR = 0.5  # both parameters of the mixing beta distribution (Jeffreys; Krichevsky and Trofimov)
+MIN_STUDENT_FAILURES = (
+    100  # failures (or successes) of all replicates below which Student's interval alone is not used
+)
+_BISECTION_STEPS = 62  # steps of bisection, which reduce a bracket of 1500 to rounding
 
 
 class Estimate(NamedTuple):
@@ -39,17 +41,17 @@ class Estimate(NamedTuple):
         return self.high - self.low
 
 
-class Running(NamedTuple):
+class SequentialState(NamedTuple):
     """State of a running sweep."""
 
     failures: int = 0  # number of failures so far
     number: int = 0  # number of scenarios so far
     low: float = 0.0  # lower end of the interval
     high: float = 1.0  # upper end of the interval
-    level: float = LEVEL  # confidence level of the interval
+    level: float = CONFIDENCE_LEVEL  # confidence level of the interval
 
 
-def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> Estimate:
+def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL) -> Estimate:
     """Return the exact interval of the probability for `failures` among `number` independent scenarios.
 
     At its ends p, the probability of at least, or at most, as many failures is (1 - level) / 2; the ends are
@@ -57,19 +59,19 @@ def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = LEV
     `number` was fixed in advance. Without scenarios it is 0 to 1, with estimate nan. Raise ValueError unless
     0 <= failures <= number and 0 < level < 1.
     """
-    failures, number = _counts(failures, number, level)
+    failures, number = _check_counts(failures, number, level)
     tail = (1.0 - level) / 2.0
     passes = number - failures
     # A beta distribution with parameter 0 does not exist; the end is then 0 or 1.
     low = np.where(failures > 0, special.betaincinv(np.maximum(failures, 1.0), passes + 1.0, tail), 0.0)
     high = np.where(passes > 0, special.betainccinv(failures + 1.0, np.maximum(passes, 1.0), tail), 1.0)
-    return Estimate(_share(failures, number), low, high)
+    return Estimate(_compute_share(failures, number), low, high)
 
 
-def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = LEVEL) -> Estimate:
+def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL) -> Estimate:
     """Return an interval that covers, with at least `level`, at all numbers of scenarios simultaneously.
 
-    For s failures among n, the true probability p, the beta function B and a = `PRIOR`,
+    For s failures among n, the true probability p, the beta function B and a = `BETA_PRIOR`,
 
         M_n(p) = B(a + s, a + n - s) / (B(a, a) p^s (1 - p)^(n - s))
 
@@ -82,22 +84,28 @@ def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = L
     Source: Robbins 1970, "Statistical methods related to the law of the iterated logarithm"; Howard, Ramdas,
     McAuliffe, Sekhon 2021, "Time-uniform, nonparametric, nonasymptotic confidence sequences".
     """
-    failures, number = _counts(failures, number, level)
+    failures, number = _check_counts(failures, number, level)
     passes = number - failures
-    log_mixture = special.betaln(PRIOR + failures, PRIOR + passes) - special.betaln(PRIOR, PRIOR)
+    log_mixture = special.betaln(BETA_PRIOR + failures, BETA_PRIOR + passes) - special.betaln(
+        BETA_PRIOR, BETA_PRIOR
+    )
     least = log_mixture + np.log1p(-level)
 
     def outside(logit):
         return failures * special.log_expit(logit) + passes * special.log_expit(-logit) <= least
 
-    share = _share(failures, number)
+    share = _compute_share(failures, number)
     middle = np.clip(special.logit(np.nan_to_num(share, nan=0.5)), -750.0, 750.0)
-    low = np.where(failures > 0, special.expit(_boundary(outside, np.full_like(middle, -750.0), middle)), 0.0)
-    high = np.where(passes > 0, special.expit(_boundary(outside, np.full_like(middle, 750.0), middle)), 1.0)
+    low = np.where(
+        failures > 0, special.expit(_bisect_boundary(outside, np.full_like(middle, -750.0), middle)), 0.0
+    )
+    high = np.where(
+        passes > 0, special.expit(_bisect_boundary(outside, np.full_like(middle, 750.0), middle)), 1.0
+    )
     return Estimate(share, low, high)
 
 
-def updated(running: Running, failures: int, number: int) -> Running:
+def update_sequence(running: SequentialState, failures: int, number: int) -> SequentialState:
     """Return `running` after `number` further scenarios, of which `failures` failed.
 
     The interval is the intersection of all intervals so far, which covers as well, since these cover
@@ -113,19 +121,19 @@ def updated(running: Running, failures: int, number: int) -> Running:
     return running._replace(failures=failures, number=number, low=low, high=high)
 
 
-def enough(running: Running, width: float) -> bool:
+def is_narrow_enough(running: SequentialState, width: float) -> bool:
     """Return whether the interval is at most `width` wide."""
     return running.high - running.low <= width
 
 
-def scenarios_needed(probability: float, width: float, level: float = LEVEL) -> int:
+def estimate_sequence_scenarios(probability: float, width: float, level: float = CONFIDENCE_LEVEL) -> int:
     """Estimate the number of scenarios, 1 to 2**62, at which `confidence_sequence` is `width` wide.
 
     `probability` is the expected share of failures; progress bars use the result. Raise ValueError unless
     0 <= probability <= 1, width > 0 and 0 < level < 1.
     """
     if not (0 <= probability <= 1 and width > 0):
-        raise ValueError(f"probability, width: found {probability}, {width}, allowed 0 to 1, above 0")
+        raise ValueError(f"probability, width: found {probability}, {width}, expected 0 to 1, above 0")
     numbers = np.unique(np.round(2.0 ** np.arange(0, 62.01, 0.05)))
     failures = np.round(probability * numbers)
     is_narrow = confidence_sequence(failures, numbers, level).width <= width
@@ -133,13 +141,15 @@ def scenarios_needed(probability: float, width: float, level: float = LEVEL) -> 
     return int(numbers[min(np.max(np.nonzero(~is_narrow)[0], initial=-1) + 1, len(numbers) - 1)])
 
 
-def number_to_decide(failures: int, number: int, allowed: float, level: float = LEVEL) -> int | None:
+def estimate_deciding_scenarios(
+    failures: int, number: int, allowed: float, level: float = CONFIDENCE_LEVEL
+) -> int | None:
     """Estimate the number of scenarios at which `binomial_interval` lies on one side of `allowed`.
 
     The share of failures is assumed to remain as it is so far, or 0 without scenarios. Return None if a
     billion scenarios are not enough. Raise ValueError as `binomial_interval` does.
     """
-    _counts(failures, number, level)
+    _check_counts(failures, number, level)
     share = failures / number if number else 0.0
     numbers = np.unique(np.ceil(1.01 ** np.arange(2083)))
     _, low, high = binomial_interval(np.round(share * numbers), numbers, level)
@@ -149,7 +159,7 @@ def number_to_decide(failures: int, number: int, allowed: float, level: float = 
     return int(numbers[index]) if index < len(numbers) else None
 
 
-def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -> Estimate:
+def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDENCE_LEVEL) -> Estimate:
     """Return the interval of the probability from independent scramblings of a Sobol sequence.
 
     `failures` (..., replicates) are counts among `number` points each. Each share of failures has mean p, so
@@ -163,7 +173,8 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
       around n p, all R may show the same one. With the distance d of n p from it, this has the probability
       (1 - d)^R, at most (1 - level) / 2 for d >= 1 - ((1 - level) / 2)^(1/R). This d over n is the least half
       width.
-    - Fewer than `FEW` failures (or successes) are too skewed for Student's distribution. The interval then
+    - Fewer than `MIN_STUDENT_FAILURES` failures (or successes) are too skewed for Student's distribution. The
+        interval then
       also contains the exact binomial interval of all points. That interval is conservative if the counts
       spread less than those of independent points; if they spread more, Student's interval is the wider one.
     - Without any failure there is no spread. If counts spread no more than those of independent points, a
@@ -174,10 +185,10 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
     Raise ValueError for less than two replicates, and as `binomial_interval` does. Source on randomised
     replicates: Owen 1997, "Scrambled net variance for integrals of smooth functions".
     """
-    failures, _ = _counts(failures, number, level)
+    failures, _ = _check_counts(failures, number, level)
     replicates = failures.shape[-1] if failures.ndim else 0
     if replicates < 2:
-        raise ValueError(f"replicates: found {replicates}, allowed 2 or more")
+        raise ValueError(f"replicates: found {replicates}, expected 2 or more")
     tail = (1.0 - level) / 2.0
     mean = np.mean(failures, axis=-1) / number
     spread = np.std(failures, axis=-1, ddof=1) / number / np.sqrt(replicates)
@@ -186,7 +197,7 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
     low, high = np.maximum(mean - half, 0.0), np.minimum(mean + half, 1.0)
 
     total, points = np.sum(failures, axis=-1), float(number * replicates)
-    few = np.minimum(total, points - total) < FEW
+    few = np.minimum(total, points - total) < MIN_STUDENT_FAILURES
     _, exact_low, exact_high = binomial_interval(total, points, level)
     low = np.where(few, np.minimum(low, exact_low), low)
     high = np.where(few, np.maximum(high, exact_high), high)
@@ -199,7 +210,7 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = LEVEL) -
 
 
 def lognormal_interval(
-    estimates: np.ndarray, reached: np.ndarray, least: np.ndarray, level: float = LEVEL
+    estimates: np.ndarray, reached: np.ndarray, least: np.ndarray, level: float = CONFIDENCE_LEVEL
 ) -> tuple[float, float]:
     """Return the interval of the mean of a lognormal distribution from independent samples of it.
 
@@ -228,24 +239,24 @@ def lognormal_interval(
     return float(min(np.exp(centre - half), 1.0)), float(min(np.exp(centre + half), 1.0))
 
 
-def _counts(failures: ArrayLike, number: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
+def _check_counts(failures: ArrayLike, number: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the counts as broadcast arrays. Raise ValueError if a count or the level is out of range."""
     failures, number = np.broadcast_arrays(np.asarray(failures, float), np.asarray(number, float))
     if not 0.0 < level < 1.0:
-        raise ValueError(f"level: found {level}, allowed between 0 and 1")
+        raise ValueError(f"level: found {level}, expected between 0 and 1")
     if not np.all((failures >= 0) & (failures <= number)):
-        raise ValueError("failures: found less than 0 or more than scenarios, allowed 0 to their number")
+        raise ValueError("failures: found less than 0 or more than scenarios, expected 0 to their number")
     return failures, number
 
 
-def _share(failures: np.ndarray, number: np.ndarray) -> np.ndarray:
+def _compute_share(failures: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Return the share of failures, nan without scenarios."""
     return np.where(number > 0, failures / np.maximum(number, 1.0), np.nan)
 
 
-def _boundary(outside, beyond: np.ndarray, within: np.ndarray) -> np.ndarray:
+def _bisect_boundary(outside, beyond: np.ndarray, within: np.ndarray) -> np.ndarray:
     """Return by bisection the point from `within` towards `beyond` at which `outside` becomes true."""
-    for _ in range(_STEPS):
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (beyond + within)
         is_outside = outside(middle)
         beyond, within = np.where(is_outside, middle, beyond), np.where(is_outside, within, middle)

@@ -30,16 +30,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from tuning.statistics.intervals import LEVEL, binomial_interval, lognormal_interval
+from tuning.statistics.intervals import CONFIDENCE_LEVEL, binomial_interval, lognormal_interval
 
-Performance = Callable[[np.ndarray], np.ndarray]
+PerformanceFunction = Callable[[np.ndarray], np.ndarray]
 
-SHARE = 0.1  # conditional probability of each level; the optimum is flat between 0.1 and 0.3
-STEPS = round(1.0 / SHARE)  # scenarios of each chain, with its start
-ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted
-FIRST_SIGMA, LEAST_SIGMA = 0.6, 1e-4
-LEVELS = 12  # default limit on the number of levels
-WORST = 10  # number of worst scenarios in the result
+LEVEL_PROBABILITY = 0.1  # conditional probability of each level; the optimum is flat between 0.1 and 0.3
+CHAIN_LENGTH = round(1.0 / LEVEL_PROBABILITY)  # scenarios of each chain, with its start
+TARGET_ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted
+INITIAL_SIGMA, MIN_SIGMA = 0.6, 1e-4
+MAX_LEVELS = 12  # default limit on the number of levels
+MAX_WORST_SCENARIOS = 10  # number of worst scenarios in the result
 
 
 class SubsetSimulation(NamedTuple):
@@ -58,7 +58,7 @@ class SubsetSimulation(NamedTuple):
     worst_values: np.ndarray  # their performance, infinite if not finite, (worst,)
 
 
-class _State(NamedTuple):
+class _SubsetState(NamedTuple):
     """State of all replicates at one level."""
 
     points: np.ndarray  # (steps, replicates, chains, inputs), above the replicate's last threshold
@@ -70,7 +70,7 @@ class _State(NamedTuple):
     estimates: np.ndarray  # estimate of the replicates that are not `open`, (replicates,)
 
 
-class _Worst(NamedTuple):
+class _WorstScenarios(NamedTuple):
     """Worst distinct scenarios so far."""
 
     points: np.ndarray  # (worst, inputs)
@@ -79,14 +79,14 @@ class _Worst(NamedTuple):
 
 
 def subset_simulation(
-    performance: Performance,
+    performance: PerformanceFunction,
     inputs: int,
     limit: float,
     seed: int,
     samples: int = 1000,
     replicates: int = 10,
-    level: float = LEVEL,
-    levels: int = LEVELS,
+    level: float = CONFIDENCE_LEVEL,
+    levels: int = MAX_LEVELS,
 ) -> SubsetSimulation:
     """Estimate the probability that performance(u) > limit, for `inputs` independent standard normals u.
 
@@ -111,39 +111,39 @@ def subset_simulation(
     Raises:
         ValueError: if an argument is out of its range.
     """
-    _check(inputs, limit, seed, samples, replicates, level, levels)
+    _check_arguments(inputs, limit, seed, samples, replicates, level, levels)
     rng = np.random.default_rng(seed)
     # A scenario fails if it reaches the next number above the limit.
     failing = float(np.nextafter(limit, np.inf))
-    worst = _Worst(np.empty((0, inputs)), np.empty(0), 0)
+    worst = _WorstScenarios(np.empty((0, inputs)), np.empty(0), 0)
 
-    points = rng.standard_normal((STEPS, replicates, samples // STEPS, inputs))
+    points = rng.standard_normal((CHAIN_LENGTH, replicates, samples // CHAIN_LENGTH, inputs))
     values = np.empty(points.shape[:-1])
-    for step in range(STEPS):
-        values[step], worst = _evaluated(performance, points[step], worst)
+    for step in range(CHAIN_LENGTH):
+        values[step], worst = _evaluate_points(performance, points[step], worst)
     zero = np.zeros(replicates)
-    state = _State(
-        points, values, zero + 1.0, zero + np.log(FIRST_SIGMA), zero, np.ones(replicates, bool), zero
+    state = _SubsetState(
+        points, values, zero + 1.0, zero + np.log(INITIAL_SIGMA), zero, np.ones(replicates, bool), zero
     )
     thresholds = []
     while np.any(state.open):
         running = state.open
         last = len(thresholds) + 1 == levels
-        threshold, state = _levelled(state, failing, independent=not thresholds, last=last)
+        threshold, state = _choose_level(state, failing, independent=not thresholds, last=last)
         thresholds.append(np.where(running, np.minimum(threshold, limit), np.nan))
         if np.any(state.open):
-            state, worst = _chained(state, threshold, performance, worst, rng)
+            state, worst = _run_chains(state, threshold, performance, worst, rng)
 
-    return _summary(state, thresholds, worst, failing, level)
+    return _build_result(state, thresholds, worst, failing, level)
 
 
-def to_uniform(normals: np.ndarray) -> np.ndarray:
+def convert_to_uniform(normals: np.ndarray) -> np.ndarray:
     """Convert standard normals to uniform numbers above 0 and below 1, for the inputs' quantile functions."""
     return np.clip(special.ndtr(normals), np.finfo(float).tiny, 1.0 - 2.0**-53)
 
 
-def _summary(
-    state: _State, thresholds: list[np.ndarray], worst: _Worst, failing: float, level: float
+def _build_result(
+    state: _SubsetState, thresholds: list[np.ndarray], worst: _WorstScenarios, failing: float, level: float
 ) -> SubsetSimulation:
     """Return the result of all replicates after their last level."""
     formula = np.sqrt(state.variance)
@@ -172,7 +172,9 @@ def _summary(
     )
 
 
-def _levelled(state: _State, failing: float, independent: bool, last: bool) -> tuple[np.ndarray, _State]:
+def _choose_level(
+    state: _SubsetState, failing: float, independent: bool, last: bool
+) -> tuple[np.ndarray, _SubsetState]:
     """Return the next threshold of each replicate, (replicates,), and the state with its probability.
 
     The threshold is the value that a tenth of the points reach, or `failing` if more than a tenth reach that,
@@ -188,7 +190,7 @@ def _levelled(state: _State, failing: float, independent: bool, last: bool) -> t
     threshold = np.full(replicates, failing) if last else np.minimum(threshold, failing)
     exceeds = state.values >= threshold[:, None]
     share = np.mean(exceeds, axis=(0, 2))
-    correlation = np.zeros(replicates) if independent else _correlation(exceeds, share)
+    correlation = np.zeros(replicates) if independent else _compute_chain_correlation(exceeds, share)
     with np.errstate(divide="ignore"):
         squared = (1.0 - share) * (1.0 + correlation) / (share * steps * chains)
     ends = state.open & (threshold >= failing)
@@ -202,7 +204,7 @@ def _levelled(state: _State, failing: float, independent: bool, last: bool) -> t
     )
 
 
-def _correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
+def _compute_chain_correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return gamma of Au and Beck 2001, eq. 27-29, the increase of the variance by correlation along chains.
 
     It is 2 sum_k (1 - k / steps) rho(k) over the lags k, with the autocorrelation rho of the indicator
@@ -217,20 +219,20 @@ def _correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.where(variance > 0.0, total / np.where(variance > 0.0, variance, 1.0), 0.0)
 
 
-def _chained(
-    state: _State,
+def _run_chains(
+    state: _SubsetState,
     threshold: np.ndarray,
-    performance: Performance,
-    worst: _Worst,
+    performance: PerformanceFunction,
+    worst: _WorstScenarios,
     rng: np.random.Generator,
-) -> tuple[_State, _Worst]:
+) -> tuple[_SubsetState, _WorstScenarios]:
     """Run the Markov chains of the next level, which stay above the threshold of their replicate.
 
     sigma adapts to the acceptance rate of all chains of its replicate, with decreasing steps, as in
     Papaioannou et al. 2015. The chains of replicates that have ended also run, without effect.
     """
     steps, replicates, _, inputs = state.points.shape
-    seeds = np.stack([_seeds(state.values[:, r], threshold[r], rng) for r in range(replicates)])
+    seeds = np.stack([_choose_chain_starts(state.values[:, r], threshold[r], rng) for r in range(replicates)])
     rows = np.arange(replicates)[:, None]
     points = np.moveaxis(state.points, 1, 0).reshape(replicates, -1, inputs)[rows, seeds]
     values = np.moveaxis(state.values, 1, 0).reshape(replicates, -1)[rows, seeds]
@@ -239,20 +241,20 @@ def _chained(
     for step in range(1, steps):
         sigma = np.exp(log_sigma)[:, None, None]
         proposed = np.sqrt(1.0 - sigma**2) * points + sigma * rng.standard_normal(points.shape)
-        proposed_values, worst = _evaluated(performance, proposed, worst)
+        proposed_values, worst = _evaluate_points(performance, proposed, worst)
         accepted = proposed_values >= threshold[:, None]
         points = np.where(accepted[..., None], proposed, points)
         values = np.where(accepted, proposed_values, values)
         all_points.append(points)
         all_values.append(values)
-        excess = np.mean(accepted, axis=1) - ACCEPTANCE
-        log_sigma = np.clip(log_sigma + excess / np.sqrt(step), np.log(LEAST_SIGMA), 0.0)
+        excess = np.mean(accepted, axis=1) - TARGET_ACCEPTANCE
+        log_sigma = np.clip(log_sigma + excess / np.sqrt(step), np.log(MIN_SIGMA), 0.0)
     return state._replace(
         points=np.stack(all_points), values=np.stack(all_values), log_sigma=log_sigma
     ), worst
 
 
-def _seeds(values: np.ndarray, threshold: float, rng: np.random.Generator) -> np.ndarray:
+def _choose_chain_starts(values: np.ndarray, threshold: float, rng: np.random.Generator) -> np.ndarray:
     """Return the indices of the points (steps, chains) at which a replicate's chains start, in random order.
 
     Each point that reaches the threshold is used once, or several times if there are fewer than chains.
@@ -265,7 +267,9 @@ def _seeds(values: np.ndarray, threshold: float, rng: np.random.Generator) -> np
     return rng.permutation(np.resize(rng.permutation(reaching), chains))
 
 
-def _evaluated(performance: Performance, points: np.ndarray, worst: _Worst) -> tuple[np.ndarray, _Worst]:
+def _evaluate_points(
+    performance: PerformanceFunction, points: np.ndarray, worst: _WorstScenarios
+) -> tuple[np.ndarray, _WorstScenarios]:
     """Evaluate points (replicates, chains, inputs), infinite if not finite, and update the worst scenarios.
 
     Among equally bad scenarios, the one nearest to the origin ranks as the worst, since it is the likeliest.
@@ -275,22 +279,28 @@ def _evaluated(performance: Performance, points: np.ndarray, worst: _Worst) -> t
     values = np.where(np.isfinite(values), values, np.inf)
     candidates = np.concatenate([worst.points, batch])
     candidate_values = np.concatenate([worst.values, values])
-    order = np.lexsort((np.sum(candidates**2, axis=1), -candidate_values))[:WORST]
+    order = np.lexsort((np.sum(candidates**2, axis=1), -candidate_values))[:MAX_WORST_SCENARIOS]
     total = worst.evaluations + len(values)
-    return values.reshape(points.shape[:-1]), _Worst(candidates[order], candidate_values[order], total)
+    return values.reshape(points.shape[:-1]), _WorstScenarios(
+        candidates[order], candidate_values[order], total
+    )
 
 
-def _check(inputs, limit, seed, samples, replicates, level, levels) -> None:
+def _check_arguments(inputs, limit, seed, samples, replicates, level, levels) -> None:
     """Raise ValueError if an argument of `subset_simulation` is out of its range."""
     allowed = {
         "inputs": (inputs, inputs >= 1, "1 or more"),
         "limit": (limit, np.isfinite(limit), "a finite number"),
         "seed": (seed, seed >= 0, "0 or more"),
-        "samples": (samples, samples > 0 and samples % STEPS == 0, f"a multiple of {STEPS} above 0"),
+        "samples": (
+            samples,
+            samples > 0 and samples % CHAIN_LENGTH == 0,
+            f"a multiple of {CHAIN_LENGTH} above 0",
+        ),
         "replicates": (replicates, replicates >= 2, "2 or more"),
         "level": (level, 0.0 < level < 1.0, "between 0 and 1"),
         "levels": (levels, levels >= 1, "1 or more"),
     }
     for name, (found, good, words) in allowed.items():
         if not good:
-            raise ValueError(f"{name}: found {found!r}, allowed {words}")
+            raise ValueError(f"{name}: found {found!r}, expected {words}")

@@ -5,6 +5,6 @@ The values allowed for options are defined here, without importing JAX, which mu
 
 SAMPLINGS = ("random", "sobol")
 PRECISIONS = ("float64", "float32")
-MOST = 2**32  # largest number of scenarios; the noise's random keys have 32 bits for the index
-LARGEST_CHUNK = 2**20  # largest number of scenarios of a chunk
-LARGEST_SEED = 2**63 - 1
+MAX_SCENARIOS = 2**32  # largest number of scenarios; the noise's random keys have 32 bits for the index
+MAX_CHUNK_SIZE = 2**20  # largest number of scenarios of a chunk
+MAX_SEED = 2**63 - 1

@@ -13,17 +13,17 @@ import jax
 import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.uncertainty import extremes
-from jaxhil.rig_models import rig_model
-from jaxhil.simulation.environment import on_half_the_cores
+from jaxhil.mechanism.uncertainty import draw_extremes
+from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.gain_file import LoadedGains
-from tuning.sweeps.columns import read_of, rows_of
-from tuning.sweeps.draws import drawn_scenarios
-from tuning.sweeps.manifest import Manifest, loaded_gains
+from jaxhil.simulation.jax_environment import use_half_the_cores
+from tuning.sweeps.columns import build_rows, select_read_fields
+from tuning.sweeps.draws import draw_scenarios
+from tuning.sweeps.manifest import Manifest, load_gains
 
 Rows = dict[str, np.ndarray]
-PERIOD = "rig.control_period"
+CONTROL_PERIOD_KEY = "rig.control_period"
 
 
 class Sweep(NamedTuple):
@@ -31,16 +31,16 @@ class Sweep(NamedTuple):
 
     manifest: Manifest
     mechanism: AnyMechanism  # mechanism in the gain file
-    loop: Any  # loop for all possible draws (`widest_loop`)
+    loop: Any  # loop for all possible draws (`build_widest_loop`)
     gains: dict[str, float]  # gains in the gain file
 
     @property
     def model(self) -> RigModel:
         """Return the model of the mechanism's rig."""
-        return rig_model(self.mechanism)
+        return choose_rig_model(self.mechanism)
 
 
-class _Batch(NamedTuple):
+class _ScenarioBatch(NamedTuple):
     """Scenarios to run."""
 
     first: int  # index of the first scenario
@@ -50,17 +50,17 @@ class _Batch(NamedTuple):
 
 def build_sweep(manifest: Manifest) -> Sweep:
     """Build the sweep of a manifest; raise `InputError` if its gain file is invalid."""
-    loaded = loaded_gains(manifest)
-    return Sweep(manifest, loaded.mechanism, widest_loop(loaded, manifest.works), loaded.gains)
+    loaded = load_gains(manifest)
+    return Sweep(manifest, loaded.mechanism, build_widest_loop(loaded, manifest.works), loaded.gains)
 
 
-def widest_loop(loaded: LoadedGains, works: bool) -> Any:
+def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
     """Return the loop for all possible draws; with `works`, mechanical works are computed exactly."""
-    draws = extremes(loaded.mechanism)
-    if PERIOD in draws:
+    draws = draw_extremes(loaded.mechanism)
+    if CONTROL_PERIOD_KEY in draws:
         # Reversed, the longest delay meets the shortest period, which needs the longest delay line.
-        draws[PERIOD] = draws[PERIOD][::-1]
-    model = rig_model(loaded.mechanism)
+        draws[CONTROL_PERIOD_KEY] = draws[CONTROL_PERIOD_KEY][::-1]
+    model = choose_rig_model(loaded.mechanism)
     scenarios = model.scenarios(loaded.mechanism, draws)
     return model.loop(loaded.mechanism, loaded.compensator, scenarios, energies=works, exact=works)
 
@@ -70,25 +70,28 @@ def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = Non
 
     A run that fails or becomes non-finite gives a row with that status.
     """
-    return _begin(sweep, _draw(sweep, first, number, precision))()
+    return _begin_evaluation(sweep, _draw_batch(sweep, first, number, precision))()
 
 
-def run_parts(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
+def run_chunks(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
     """Yield the number and rows of each part; the next part is computed while the caller uses them."""
     running = None
     for part in parts:
         # The next part is queued behind the running one, so that no core is idle. The first part starts the
         # threads of JAX, which must be allowed to use all cores.
-        with on_half_the_cores(0) if running is not None else nullcontext():
-            begun = part, _begin(sweep, _draw(sweep, *sweep.manifest.part_rows(part), None))
+        with use_half_the_cores(0) if running is not None else nullcontext():
+            begun = (
+                part,
+                _begin_evaluation(sweep, _draw_batch(sweep, *sweep.manifest.chunk_range(part), None)),
+            )
         if running is not None:
-            yield _finished(running)
+            yield _finish_chunk(running)
         running = begun
     if running is not None:
-        yield _finished(running)
+        yield _finish_chunk(running)
 
 
-def in_precision(scenarios: Any, precision: str) -> Any:
+def convert_precision(scenarios: Any, precision: str) -> Any:
     """Convert the scenarios' floating-point numbers, and thereby the program, to the precision."""
 
     def cast(leaf: Any) -> Any:
@@ -102,22 +105,22 @@ def in_precision(scenarios: Any, precision: str) -> Any:
     return jax.tree.map(cast, scenarios)
 
 
-def _draw(sweep: Sweep, first: int, number: int, precision: str | None) -> _Batch:
+def _draw_batch(sweep: Sweep, first: int, number: int, precision: str | None) -> _ScenarioBatch:
     manifest = sweep.manifest
-    draws, scenarios = drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
-    return _Batch(first, draws, in_precision(scenarios, precision or manifest.precision))
+    draws, scenarios = draw_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
+    return _ScenarioBatch(first, draws, convert_precision(scenarios, precision or manifest.precision))
 
 
-def _begin(sweep: Sweep, batch: _Batch) -> Callable[[], Rows]:
+def _begin_evaluation(sweep: Sweep, batch: _ScenarioBatch) -> Callable[[], Rows]:
     """Start the computation of a batch; return a function that waits for its rows."""
     manifest = sweep.manifest
-    limit, works = manifest.largest_error, manifest.works
-    read = partial(read_of, sweep.mechanism, works)
+    limit, works = manifest.error_limit, manifest.works
+    read = partial(select_read_fields, sweep.mechanism, works)
     outcome = sweep.model.begin_evaluation(sweep.loop, sweep.gains, batch.scenarios, manifest.chunk, read)
-    return lambda: rows_of(sweep.mechanism, *batch, outcome(), limit, works)
+    return lambda: build_rows(sweep.mechanism, *batch, outcome(), limit, works)
 
 
-def _finished(running: tuple[int, Callable[[], Rows]]) -> tuple[int, Rows]:
+def _finish_chunk(running: tuple[int, Callable[[], Rows]]) -> tuple[int, Rows]:
     part, rows = running
-    with on_half_the_cores(0):
+    with use_half_the_cores(0):
         return part, rows()

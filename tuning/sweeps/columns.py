@@ -10,45 +10,56 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from jaxhil.contact.laws import KEYS, contact_law
+from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
-from jaxhil.mechanism.uncertainty import PHASE, dimensions
-from jaxhil.rig_models import rig_model
-from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST, unlike_ideal
-from jaxhil.simulation.metrics import DIVERGED, NON_FINITE, NOT_REACHED, OK, STATUS_NAMES, TIMEOUT
+from jaxhil.mechanism.uncertainty import PHASE_KEY, count_dimensions
+from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation.contact_bounds import (
+    MAX_DURATION_RATIO,
+    MAX_PEAK_FORCE_RATIO,
+    MIN_DURATION_RATIO,
+    is_contact_out_of_bounds,
+)
+from jaxhil.simulation.metrics import CONTACT_STATUS_NAMES, DIVERGED, NON_FINITE, NOT_REACHED, OK, TIMEOUT
 from jaxhil.simulation.outcome import Outcome
 
-GOOD, BEYOND, UNLIKE, SATURATED = "good", "error beyond limit", "unlike the ideal contact", "saturated"
-UNLIKENESS = (
-    f"a real peak force beyond {MOST_FORCE:g} times, or a duration beyond {SHORTEST:g} to {LONGEST:g} times "
+GOOD, BEYOND_LIMIT, UNLIKE_IDEAL, SATURATED = (
+    "good",
+    "error beyond limit",
+    "unlike the ideal contact",
+    "saturated",
+)
+UNLIKE_IDEAL_MEANING = (
+    f"a real peak force beyond {MAX_PEAK_FORCE_RATIO:g} times, or a duration beyond "
+    f"{MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times "
     "that of the ideal contact"
 )
-SATURATION = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
-STATUSES = tuple(STATUS_NAMES.values())
+SATURATED_MEANING = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
+CONTACT_STATUSES = tuple(CONTACT_STATUS_NAMES.values())
 # From harmless to worst; every status of a failed run is an outcome.
-OUTCOMES = (
+SCENARIO_OUTCOMES = (
     GOOD,
-    BEYOND,
-    UNLIKE,
+    BEYOND_LIMIT,
+    UNLIKE_IDEAL,
     SATURATED,
-    *(STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)),
+    *(CONTACT_STATUS_NAMES[s] for s in (NOT_REACHED, TIMEOUT, DIVERGED, NON_FINITE)),
 )
 
-Kind = Literal["integer", "input", "number", "flag", "text"]
+ColumnKind = Literal["integer", "input", "number", "flag", "text"]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Column of the store."""
 
     name: str
-    kind: Kind  # inputs are in float64, numbers in the sweep's precision
+    kind: ColumnKind  # inputs are in float64, numbers in the sweep's precision
     unit: str  # SI; "" for none, "1" for a ratio
     meaning: str
 
 
-class PerContact(NamedTuple):
+class ContactMetric(NamedTuple):
     """Metric of every contact."""
 
     name: str  # name of its column, without the contact's number
@@ -56,34 +67,34 @@ class PerContact(NamedTuple):
     meaning: str
 
 
-PER_CONTACT = (
-    PerContact("restitution", "1", "rebound speed over approach speed"),
-    PerContact("reference_restitution", "1", "that of the same contact in space"),
-    PerContact("error", "1", "restitution less the reference's"),
-    PerContact("peak_force", "N", "largest real contact force"),
-    PerContact("reference_peak_force", "N", "that of the ideal contact"),
-    PerContact("peak_command", "N", "largest force on the numerical model"),
-    PerContact("peak_ratio", "1", "peak command over the reference's peak force"),
-    PerContact("position_shortfall", "m", "most that the motion simulator's limits took off its command"),
-    PerContact("duration", "s", "time in touch"),
-    PerContact("reference_duration", "s", "that of the ideal contact; infinite if it never ends"),
-    PerContact("approach_velocity", "m/s", "speed at which the contact was entered"),
-    PerContact("energy_in", "J", "kinetic energy of the numerical model before the contact"),
-    PerContact("energy_out", "J", "kinetic energy of the numerical model after the contact"),
+CONTACT_METRICS = (
+    ContactMetric("restitution", "1", "rebound speed over approach speed"),
+    ContactMetric("reference_restitution", "1", "that of the same contact in space"),
+    ContactMetric("error", "1", "restitution less the reference's"),
+    ContactMetric("peak_force", "N", "largest real contact force"),
+    ContactMetric("reference_peak_force", "N", "that of the ideal contact"),
+    ContactMetric("peak_command", "N", "largest force on the numerical model"),
+    ContactMetric("peak_ratio", "1", "peak command over the reference's peak force"),
+    ContactMetric("position_shortfall", "m", "most that the motion simulator's limits took off its command"),
+    ContactMetric("duration", "s", "time in touch"),
+    ContactMetric("reference_duration", "s", "that of the ideal contact; infinite if it never ends"),
+    ContactMetric("approach_velocity", "m/s", "speed at which the contact was entered"),
+    ContactMetric("energy_in", "J", "kinetic energy of the numerical model before the contact"),
+    ContactMetric("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
 # Metrics that six-axis episodes share with contacts; two errors replace the restitution error.
-PER_EPISODE = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
-PER_EPISODE = (*PER_EPISODE, "duration", "reference_duration", "approach_velocity")
-ERRORS_IN_SPACE = {
+EPISODE_METRICS = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
+EPISODE_METRICS = (*EPISODE_METRICS, "duration", "reference_duration", "approach_velocity")
+SIX_AXIS_ERRORS = {
     "energy_error": "kinetic energy gained beyond that in space, over that of the approach",
     "twist_error": "deviation of the twist from that in space, over the change there",
 }
-WORKS = (
-    PerContact("work_in", "J", "work done on the mechanism by the real contact force"),
-    PerContact("work_out", "J", "work returned by the mechanism"),
+WORK_METRICS = (
+    ContactMetric("work_in", "J", "work done on the mechanism by the real contact force"),
+    ContactMetric("work_out", "J", "work returned by the mechanism"),
 )
 # Metrics that are also stored for a contact that did not end, up to the end of the run.
-KNOWN_UNENDED = (
+UNENDED_METRICS = (
     "peak_force",
     "peak_command",
     "position_shortfall",
@@ -104,7 +115,7 @@ _UNITS = {
 }
 
 
-class Slot(NamedTuple):
+class ContactColumns(NamedTuple):
     """Columns of one contact, or of one error of an episode."""
 
     number: int  # number of the contact or episode, from 1
@@ -112,31 +123,35 @@ class Slot(NamedTuple):
     status: str  # column of its status
 
 
-def slots(mechanism: AnyMechanism) -> list[Slot]:
+def list_contact_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
     """Return the slots of an outcome's rows: every contact, or every error of every episode."""
-    model = rig_model(mechanism)
-    return error_slots(model.errors, model.runs(mechanism))
+    model = choose_rig_model(mechanism)
+    return list_error_columns(model.errors, model.runs(mechanism))
 
 
-def error_slots(errors: Iterable[str], runs: int) -> list[Slot]:
+def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]:
     """Return the slots of every error of `runs` contacts or episodes."""
     numbers = range(1, runs + 1)
-    return [Slot(number, f"{error}_{number}", f"status_{number}") for error in errors for number in numbers]
+    return [
+        ContactColumns(number, f"{error}_{number}", f"status_{number}")
+        for error in errors
+        for number in numbers
+    ]
 
 
-def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
+def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
     """Return the columns of a sweep over `mechanism` in their order."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
-        Column(name, "input", unit_of(mechanism, path), f"{path}, drawn")
-        for path in dimensions(mechanism)
-        for name in input_names(mechanism, path)
+        Column(name, "input", find_key_unit(mechanism, path), f"{path}, drawn")
+        for path in count_dimensions(mechanism)
+        for name in list_input_columns(mechanism, path)
     ]
-    run = rig_model(mechanism).run_name
-    for number in sorted({slot.number for slot in slots(mechanism)}):
+    run = choose_rig_model(mechanism).run_name
+    for number in sorted({slot.number for slot in list_contact_columns(mechanism)}):
         columns += [
             Column(f"{metric.name}_{number}", "number", metric.unit, f"{run} {number}: {metric.meaning}")
-            for metric in _stored(mechanism, works)
+            for metric in _list_stored_metrics(mechanism, works)
         ]
         columns.append(Column(f"status_{number}", "text", "", f"{run} {number}: how it ended"))
     return [
@@ -146,26 +161,27 @@ def sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
             "outcome",
             "text",
             "",
-            f"good, or why the scenario counts as failed; {UNLIKE}: {UNLIKENESS}; {SATURATED}: {SATURATION}",
+            f"good, or why the scenario counts as failed; {UNLIKE_IDEAL}: {UNLIKE_IDEAL_MEANING}; "
+            f"{SATURATED}: {SATURATED_MEANING}",
         ),
         Column("failed", "flag", "", "whether the scenario counts as failed"),
     ]
 
 
-def texts_of(column: str) -> tuple[str, ...]:
+def list_allowed_texts(column: str) -> tuple[str, ...]:
     """Return the allowed texts of a text column; rows hold indices into them."""
-    return OUTCOMES if column == "outcome" else STATUSES
+    return SCENARIO_OUTCOMES if column == "outcome" else CONTACT_STATUSES
 
 
-def _stored(mechanism: AnyMechanism, works: bool) -> list[PerContact]:
+def _list_stored_metrics(mechanism: AnyMechanism, works: bool) -> list[ContactMetric]:
     """Return the metrics that are stored for every contact."""
-    if rig_model(mechanism).axes == 1:
-        return [*PER_CONTACT, *(WORKS if works else ())]
-    errors = [PerContact(name, "1", meaning) for name, meaning in ERRORS_IN_SPACE.items()]
-    return [*errors, *(metric for metric in PER_CONTACT if metric.name in PER_EPISODE)]
+    if choose_rig_model(mechanism).axes == 1:
+        return [*CONTACT_METRICS, *(WORK_METRICS if works else ())]
+    errors = [ContactMetric(name, "1", meaning) for name, meaning in SIX_AXIS_ERRORS.items()]
+    return [*errors, *(metric for metric in CONTACT_METRICS if metric.name in EPISODE_METRICS)]
 
 
-def unit_of(mechanism: AnyMechanism, path: str) -> str:
+def find_key_unit(mechanism: AnyMechanism, path: str) -> str:
     """Return the SI unit of a key of the mechanism file."""
     table, _, key = path.rpartition(".")
     name = table.removeprefix("contact.")
@@ -174,10 +190,10 @@ def unit_of(mechanism: AnyMechanism, path: str) -> str:
     else:
         contact = mechanism.contact.get(name) if name != table else None
     if contact is not None and key in ("stiffness", "damping"):
-        law = contact_law(contact.law)
+        law = find_contact_law(contact.law)
         return law.stiffness_unit if key == "stiffness" else law.damping_unit
-    if contact is not None and key in KEYS:
-        return KEYS[key].unit or ""
+    if contact is not None and key in CONTACT_KEYS:
+        return CONTACT_KEYS[key].unit or ""
     if isinstance(mechanism, SixAxisMechanism):
         return numeric_keys_of(mechanism)[path].unit
     if key in ("noise_std", "quantum"):
@@ -185,25 +201,30 @@ def unit_of(mechanism: AnyMechanism, path: str) -> str:
     return _UNITS.get(key, "")
 
 
-def input_names(mechanism: AnyMechanism, path: str) -> list[str]:
+def list_input_columns(mechanism: AnyMechanism, path: str) -> list[str]:
     """Return the columns of a drawn key: the path itself, or one name per entry, counted from 1."""
-    if path == PHASE and isinstance(mechanism, Mechanism):
+    if path == PHASE_KEY and isinstance(mechanism, Mechanism):
         shape: tuple[int, ...] = (mechanism.approach.contacts,)
     else:
         shape = np.shape(value_at(mechanism, path))
     return [path + "".join(f"_{entry + 1}" for entry in index) for index in np.ndindex(*shape)]
 
 
-def read_of(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
-    """Return the outcome with the fields that `rows_of` reads, and None for all others."""
-    names = {"status", "restitution", "approach_velocity", *(m.name for m in _stored(mechanism, works))}
+def select_read_fields(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
+    """Return the outcome with the fields that `build_rows` reads, and None for all others."""
+    names = {
+        "status",
+        "restitution",
+        "approach_velocity",
+        *(m.name for m in _list_stored_metrics(mechanism, works)),
+    }
     metrics = outcome.metrics
     unread_metrics: Any = dict.fromkeys(set(metrics._fields) - names)
     unread: Any = dict.fromkeys(("chatter", "wanted", "good", "unlike"))
     return outcome._replace(metrics=metrics._replace(**unread_metrics), **unread)
 
 
-def rows_of(
+def build_rows(
     mechanism: AnyMechanism,
     first: int,
     draws: Mapping[str, np.ndarray],
@@ -212,13 +233,13 @@ def rows_of(
     limit: float,
     works: bool,
 ) -> dict[str, np.ndarray]:
-    """Return one array (number,) per column; missing metrics are NaN, texts are indices (`texts_of`)."""
-    metrics, contacts = outcome.metrics, slots(mechanism)
+    """Return one array (number,) per column; missing metrics are NaN, texts are indices."""
+    metrics, contacts = outcome.metrics, list_contact_columns(mechanism)
     number = metrics.status.shape[-1]
     rows = {"index": np.arange(first, first + number)}
     for path, values in draws.items():
         entries = np.reshape(values, (number, -1)).T
-        rows.update(zip(input_names(mechanism, path), entries, strict=True))
+        rows.update(zip(list_input_columns(mechanism, path), entries, strict=True))
     status = np.asarray(metrics.status[: len(contacts)])
     ended, reached = status == OK, status != NOT_REACHED
     values = {
@@ -227,30 +248,30 @@ def rows_of(
         "reference_peak_force": outcome.reference_peak_force,
         "reference_duration": outcome.reference_duration,
         "peak_ratio": outcome.peak_ratio,
-        **_energies(scenarios, metrics),
+        **_compute_energies(scenarios, metrics),
     }
-    names = [metric.name for metric in _stored(mechanism, works)]
-    codes = np.searchsorted(sorted(STATUS_NAMES), status).astype(np.int8)
+    names = [metric.name for metric in _list_stored_metrics(mechanism, works)]
+    codes = np.searchsorted(sorted(CONTACT_STATUS_NAMES), status).astype(np.int8)
     for index, slot in enumerate(contacts):
         for name in set(names) & set(values):
-            valid = reached[index] if name in KNOWN_UNENDED else ended[index]
+            valid = reached[index] if name in UNENDED_METRICS else ended[index]
             rows[f"{name}_{slot.number}"] = np.where(valid, values[name][index], np.nan)
         rows[slot.error] = np.where(ended[index], outcome.error[index], np.nan)
         rows[slot.status] = codes[index]
     period = np.asarray(scenarios.control_period)
-    columns = {**rows, **judge(rows, contacts, force_range(scenarios), period, limit)}
-    names = [column.name for column in sweep_columns(mechanism, works)]
+    columns = {**rows, **classify_outcomes(rows, contacts, find_force_range(scenarios), period, limit)}
+    names = [column.name for column in list_sweep_columns(mechanism, works)]
     return {name: columns[name] for name in names if name in columns}
 
 
-def force_range(scenarios: Any) -> np.ndarray:
+def find_force_range(scenarios: Any) -> np.ndarray:
     """Return the largest force [N] that the sensor reads (number,), the least of three channels."""
     if hasattr(scenarios, "sensor"):
         return np.min(np.asarray(scenarios.sensor.errors.range)[:3], axis=0)
     return np.asarray(scenarios.force_sensor.range)
 
 
-def _energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
+def _compute_energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
     """Return the kinetic energy [J] before and after each contact; empty in six axes."""
     if not hasattr(scenarios, "equivalent_mass"):
         return {}
@@ -259,9 +280,9 @@ def _energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
     return {"energy_in": half_mass * metrics.approach_velocity**2, "energy_out": half_mass * rebound**2}
 
 
-def judge(
+def classify_outcomes(
     rows: Mapping[str, np.ndarray],
-    made: Sequence[Slot],
+    made: Sequence[ContactColumns],
     force_range: np.ndarray,
     period: np.ndarray,
     limit: float,
@@ -270,7 +291,7 @@ def judge(
 
     Args:
         rows: columns by name. Stores of an earlier version lack the ideal contact's peak force and duration,
-            so that no row is `UNLIKE`.
+            so that no row is `UNLIKE_IDEAL`.
         made: contacts or episodes.
         force_range: range of the force sensor [N], per row or of all rows.
         period: control period [s], per row or of all rows.
@@ -280,7 +301,7 @@ def judge(
     def stacked(names: Iterable[str]) -> np.ndarray:
         return np.stack([rows[name] for name in names])
 
-    status = np.array(sorted(STATUS_NAMES))[stacked(slot.status for slot in made)]
+    status = np.array(sorted(CONTACT_STATUS_NAMES))[stacked(slot.status for slot in made)]
     error = stacked(slot.error for slot in made)
     peak = stacked(f"peak_force_{slot.number}" for slot in made)
     size = np.where(status == OK, np.abs(error), -1)
@@ -290,32 +311,34 @@ def judge(
     saturated = np.any(beyond_range, axis=0)
     for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
         saturated = saturated | (rows[name] > 0)
-    unlike = _unlike(rows, {slot.number for slot in made}, period)
-    outcome = _outcomes(status, ~(np.abs(worst) <= limit), unlike, saturated)
-    return {"worst_error": worst, "outcome": outcome, "failed": outcome != OUTCOMES.index(GOOD)}
+    unlike = _find_unlike(rows, {slot.number for slot in made}, period)
+    outcome = _choose_worst_outcomes(status, ~(np.abs(worst) <= limit), unlike, saturated)
+    return {"worst_error": worst, "outcome": outcome, "failed": outcome != SCENARIO_OUTCOMES.index(GOOD)}
 
 
-def _unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
+def _find_unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
     """Return which rows have a real contact that is too hard, too short or too long."""
     unlike = np.zeros(len(rows["index"]), bool)
     for number in numbers:
         ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]
         if ideal[0] is not None and ideal[1] is not None:
             force, duration = rows[f"peak_force_{number}"], rows[f"duration_{number}"]
-            unlike |= unlike_ideal(force, ideal[0], duration, ideal[1], period.astype(duration.dtype))
+            unlike |= is_contact_out_of_bounds(
+                force, ideal[0], duration, ideal[1], period.astype(duration.dtype)
+            )
     return unlike
 
 
-def _outcomes(
+def _choose_worst_outcomes(
     status: np.ndarray, beyond: np.ndarray, unlike: np.ndarray, saturated: np.ndarray
 ) -> np.ndarray:
-    """Return the worst outcome that applies to every scenario, as index into `OUTCOMES`."""
-    outcome = np.where(beyond, OUTCOMES.index(BEYOND), OUTCOMES.index(GOOD))
-    outcome = np.where(unlike, OUTCOMES.index(UNLIKE), outcome)
-    outcome = np.where(saturated, OUTCOMES.index(SATURATED), outcome)
-    for code, name in STATUS_NAMES.items():
+    """Return the worst outcome that applies to every scenario, as index into `SCENARIO_OUTCOMES`."""
+    outcome = np.where(beyond, SCENARIO_OUTCOMES.index(BEYOND_LIMIT), SCENARIO_OUTCOMES.index(GOOD))
+    outcome = np.where(unlike, SCENARIO_OUTCOMES.index(UNLIKE_IDEAL), outcome)
+    outcome = np.where(saturated, SCENARIO_OUTCOMES.index(SATURATED), outcome)
+    for code, name in CONTACT_STATUS_NAMES.items():
         if code != OK:
             outcome = np.where(
-                np.any(status == code, axis=0), np.maximum(outcome, OUTCOMES.index(name)), outcome
+                np.any(status == code, axis=0), np.maximum(outcome, SCENARIO_OUTCOMES.index(name)), outcome
             )
     return outcome.astype(np.int8)

@@ -3,7 +3,8 @@
 Scenario i and its sensors' noise do not depend on chunks, devices, number of scenarios or interruptions.
 
 - `random`: independent draws, from counter-based generators (`jaxhil.mechanism.uncertainty.draw`).
-- `sobol`: R = `REPLICATES` independently scrambled Sobol sequences; scenario i is point i // R of sequence
+- `sobol`: R = `SOBOL_REPLICATES` independently scrambled Sobol sequences; scenario i is point i // R of
+    sequence
   i % R. The means of the R sequences are independent and identically distributed, which gives an interval
   (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised quasi-Monte Carlo).
 """
@@ -14,40 +15,42 @@ from typing import Any
 import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.uncertainty import at_points, dimensions, draw
-from jaxhil.rig_models import rig_model
+from jaxhil.mechanism.uncertainty import count_dimensions, draw, draw_at_points
+from jaxhil.rig_models import choose_rig_model
 
-REPLICATES = 16
-BITS = 30  # bits of a Sobol point's coordinate
+SOBOL_REPLICATES = 16
+SOBOL_BITS = 30  # bits of a Sobol point's coordinate
 
 
-def drawn_scenarios(
+def draw_scenarios(
     mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
 ) -> tuple[dict[str, np.ndarray], Any]:
     """Return the draws, by dotted path as of `draw`, and scenarios `first` to `first + number - 1`."""
     if sampling == "random":
         draws = draw(mechanism, number, seed, first)
     else:
-        draws = at_points(mechanism, sobol_points(sum(dimensions(mechanism).values()), seed, first, number))
-    return draws, rig_model(mechanism).scenarios(mechanism, draws, seed, first)
+        draws = draw_at_points(
+            mechanism, draw_sobol_points(sum(count_dimensions(mechanism).values()), seed, first, number)
+        )
+    return draws, choose_rig_model(mechanism).scenarios(mechanism, draws, seed, first)
 
 
-def sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:
+def draw_sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:
     """Return points `first` to `first + number - 1` of the interleaved sequences, (number, dimension).
 
     Coordinates are within 0 to 1, exclusively: each is the middle of its cell of width 2**-30.
     """
     points = np.empty((number, dimension))
-    for replicate in range(REPLICATES):
-        offset = (replicate - first) % REPLICATES
+    for replicate in range(SOBOL_REPLICATES):
+        offset = (replicate - first) % SOBOL_REPLICATES
         if offset < number:
-            rows = len(range(offset, number, REPLICATES))
-            begin = (first + offset) // REPLICATES
-            points[offset::REPLICATES] = _sequence(dimension, seed, replicate).rows(begin, rows)
+            rows = len(range(offset, number, SOBOL_REPLICATES))
+            begin = (first + offset) // SOBOL_REPLICATES
+            points[offset::SOBOL_REPLICATES] = _get_sequence(dimension, seed, replicate).rows(begin, rows)
     return points
 
 
-class _Sequence:
+class _SobolSequence:
     """Scrambled Sobol sequence with random access; sequential reads need no fast-forward."""
 
     def __init__(self, dimension: int, seed: int, replicate: int):
@@ -55,7 +58,7 @@ class _Sequence:
         from scipy.stats import qmc
 
         generator = np.random.default_rng([seed, replicate])
-        self._engine = qmc.Sobol(dimension, scramble=True, bits=BITS, rng=generator)
+        self._engine = qmc.Sobol(dimension, scramble=True, bits=SOBOL_BITS, rng=generator)
 
     def rows(self, begin: int, number: int) -> np.ndarray:
         """Return points `begin` to `begin + number - 1`, (number, dimension)."""
@@ -63,10 +66,10 @@ class _Sequence:
             self._engine.reset()
         if begin > self._engine.num_generated:
             self._engine.fast_forward(begin - self._engine.num_generated)
-        return _quiet_random(self._engine, number) + 2.0 ** -(BITS + 1)
+        return _draw_without_warning(self._engine, number) + 2.0 ** -(SOBOL_BITS + 1)
 
 
-def _quiet_random(engine, number: int) -> np.ndarray:
+def _draw_without_warning(engine, number: int) -> np.ndarray:
     """Return the next points without SciPy's warning about a first batch that is no power of two."""
     if number == 0:
         return np.empty((0, engine.d))
@@ -76,6 +79,6 @@ def _quiet_random(engine, number: int) -> np.ndarray:
     return np.concatenate([head, engine.random(number - 1)]) if number > 1 else head
 
 
-@lru_cache(maxsize=4 * REPLICATES)
-def _sequence(dimension: int, seed: int, replicate: int) -> _Sequence:
-    return _Sequence(dimension, seed, replicate)
+@lru_cache(maxsize=4 * SOBOL_REPLICATES)
+def _get_sequence(dimension: int, seed: int, replicate: int) -> _SobolSequence:
+    return _SobolSequence(dimension, seed, replicate)

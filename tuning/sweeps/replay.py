@@ -7,27 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation.motion import Piece, scenario_motion
+from jaxhil.simulation.motion_curves import RunMotion, compute_scenario_motion
+from tuning.sweeps.chunk_file import list_different_columns
 from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
-from tuning.sweeps.draws import drawn_scenarios
-from tuning.sweeps.manifest import loaded_gains
-from tuning.sweeps.parts import same_rows
-from tuning.sweeps.store import Store, read_row
+from tuning.sweeps.draws import draw_scenarios
+from tuning.sweeps.manifest import load_gains
+from tuning.sweeps.store import SweepStore, read_row
 
 if TYPE_CHECKING:
     from jaxhil.sixdof.recording import Recorded
 
 
-class Replay(NamedTuple):
+class ScenarioReplay(NamedTuple):
     """Stored and recomputed row of a scenario."""
 
     sweep: Sweep
     stored: dict[str, np.ndarray]  # stored row, arrays of length 1
     again: dict[str, np.ndarray]  # recomputed row
-    different: list[str]  # names of the columns that differ
+    different_columns: list[str]  # names of the columns that differ
 
 
-def replay(store: Store, index: int) -> Replay:
+def replay_scenario(store: SweepStore, index: int) -> ScenarioReplay:
     """Run scenario `index` again, alone, in the program that ran its chunk.
 
     Raise `InputError` for an index that the store does not hold.
@@ -35,27 +35,27 @@ def replay(store: Store, index: int) -> Replay:
     stored = read_row(store, index)
     sweep = build_sweep(store.manifest)
     again = run_chunk(sweep, index, 1)
-    return Replay(sweep, stored, again, same_rows(stored, again))
+    return ScenarioReplay(sweep, stored, again, list_different_columns(stored, again))
 
 
-def motion_of(sweep: Sweep, index: int) -> list[Piece]:
+def compute_motion(sweep: Sweep, index: int) -> list[RunMotion]:
     """Return the motion of a one-axis scenario at every tick, for plots, in float64."""
-    loaded = loaded_gains(sweep.manifest)
+    loaded = load_gains(sweep.manifest)
     gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
-    lane = jax.tree.map(np.asarray, _scenario(sweep, index))
-    return scenario_motion(loaded._replace(gains=gains), lane)
+    lane = jax.tree.map(np.asarray, _draw_scenario(sweep, index))
+    return compute_scenario_motion(loaded._replace(gains=gains), lane)
 
 
-def recorded(sweep: Sweep, index: int) -> "Recorded":
+def record_six_axes(sweep: Sweep, index: int) -> "Recorded":
     """Record every tick of a six-axis scenario."""
     from jaxhil.sixdof.recording import record_scenario
 
     assert isinstance(sweep.mechanism, SixAxisMechanism)
-    lane = jax.tree.map(jnp.asarray, _scenario(sweep, index))
+    lane = jax.tree.map(jnp.asarray, _draw_scenario(sweep, index))
     return record_scenario(sweep.mechanism, sweep.loop, sweep.gains, lane)
 
 
-def _scenario(sweep: Sweep, index: int) -> Any:
+def _draw_scenario(sweep: Sweep, index: int) -> Any:
     """Return the scenario as a batch of one lane, in float64."""
     manifest = sweep.manifest
-    return drawn_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]
+    return draw_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]

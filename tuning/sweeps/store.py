@@ -8,8 +8,8 @@
 
 `DIR/parts` is a Parquet dataset for pandas, DuckDB or Arrow; units are in the fields' metadata. Parts are
 written atomically (under another name, flushed to disk, then renamed) and have a checksum
-(`tuning.sweeps.parts`). After any interruption the same code can compute the missing parts, and the rows are
-those of an uninterrupted sweep.
+(`tuning.sweeps.chunk_file`). After any interruption the same code can compute the missing parts, and the rows
+are those of an uninterrupted sweep.
 
 A folder that holds other files than a store is never changed.
 """
@@ -23,147 +23,163 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import is_temporary, lock, make_folder, open_plain, remove_stale, write_whole, writing
-from jaxhil.simulation.environment import on_half_the_cores
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import (
+    is_temporary,
+    lock_file,
+    make_folder,
+    open_regular,
+    remove_stale,
+    report_write_errors,
+    write_atomically,
+)
+from jaxhil.simulation.jax_environment import use_half_the_cores
 from tuning import terminal
-from tuning.sweeps.manifest import NAME, Manifest, differences, encode, other_code, read_manifest
-from tuning.sweeps.parts import decode_part, encode_part
+from tuning.sweeps.chunk_file import decode_chunk, encode_chunk
+from tuning.sweeps.manifest import (
+    MANIFEST_FILE,
+    Manifest,
+    encode_manifest,
+    list_code_differences,
+    list_input_differences,
+    read_manifest,
+)
 
-PARTS = "parts"
+CHUNK_FOLDER = "parts"
 PLOTS = ("errors.png", "failures.png", "convergence.png")  # plots made from the rows
-STUDIES = "studies"
-VERDICT = "verdict.json"
-LOCK = ".lock"
-PART = re.compile(r"part-(\d{6,})\.parquet")
+STUDY_FOLDER = "studies"
+VERDICT_FILE = "verdict.json"
+LOCK_FILE = ".lock"
+CHUNK_FILE_PATTERN = re.compile(r"part-(\d{6,})\.parquet")
 
 
-class Store(NamedTuple):
+class SweepStore(NamedTuple):
     """Open store."""
 
     folder: Path
     manifest: Manifest
 
-    def part_path(self, part: int) -> Path:
+    def chunk_path(self, part: int) -> Path:
         """Return the path of a part's file."""
-        return self.folder / PARTS / f"part-{part:06d}.parquet"
+        return self.folder / CHUNK_FOLDER / f"part-{part:06d}.parquet"
 
 
-def open_store(folder: Path, manifest: Manifest, resume: bool) -> Store:
+def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
     """Create the store of `manifest`, or with `resume` open the existing one.
 
     Temporary files of an interrupted run are removed. Raise `InputError` if the folder holds a store that is
     not to be resumed, or other files, if its store was made with other inputs or by other code, or if it
     cannot be written.
     """
-    where = one_line(str(folder))
+    where = to_one_line(str(folder))
     exists = _is_store(folder)
     if exists and not resume:
-        raise InputError(f"{where}: found a sweep, allowed an empty folder, or --resume")
+        raise InputError(f"{where}: found a sweep, expected an empty folder, or --resume")
     old = read_manifest(folder) if exists else None
-    if old and (differing := differences(old, manifest)):
+    if old and (differing := list_input_differences(old, manifest)):
         raise InputError(f"{where}: was made with other inputs: {'; '.join(differing[:3])}")
-    if old and (differing := other_code(old, manifest)):
+    if old and (differing := list_code_differences(old, manifest)):
         allowed = "a new folder, or --resume with the version that made this one"
         raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}: allowed {allowed}")
-    with writing(folder):
+    with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    with writing(folder / PARTS):
-        make_folder(folder / PARTS)
-        for path in (folder, folder / PARTS, folder / STUDIES):
+    with report_write_errors(folder / CHUNK_FOLDER):
+        make_folder(folder / CHUNK_FOLDER)
+        for path in (folder, folder / CHUNK_FOLDER, folder / STUDY_FOLDER):
             if path.is_dir() and (path == folder or not path.is_symlink()):
                 remove_stale(path)
     if old is None:
-        with writing(folder / NAME):
-            write_whole(folder / NAME, encode(manifest))
-    return Store(folder, old or manifest)
+        with report_write_errors(folder / MANIFEST_FILE):
+            write_atomically(folder / MANIFEST_FILE, encode_manifest(manifest))
+    return SweepStore(folder, old or manifest)
 
 
-def read_store(folder: Path) -> Store:
+def read_store(folder: Path) -> SweepStore:
     """Open the existing store in `folder`; raise `InputError` if there is none."""
-    return Store(folder, read_manifest(folder))
+    return SweepStore(folder, read_manifest(folder))
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_store(folder: Path) -> Iterator[None]:
     """Lock the store for writing.
 
     Raise `InputError` if another process holds the lock or the folder holds other files than a store.
     """
     _is_store(folder)
-    with writing(folder):
+    with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as locks:
-        with writing(folder / LOCK):
+        with report_write_errors(folder / LOCK_FILE):
             try:
-                locks.enter_context(lock(folder / LOCK))
+                locks.enter_context(lock_file(folder / LOCK_FILE))
             except BlockingIOError:
                 reason = "another sweep is writing to this store"
-                raise InputError(f"{one_line(str(folder))}: {reason}") from None
+                raise InputError(f"{to_one_line(str(folder))}: {reason}") from None
         yield
 
 
-def write_part(store: Store, part: int, rows: Mapping[str, np.ndarray]) -> None:
+def write_chunk(store: SweepStore, part: int, rows: Mapping[str, np.ndarray]) -> None:
     """Write a part atomically; raise `InputError` if it cannot be written."""
-    path = store.part_path(part)
+    path = store.chunk_path(part)
     # The next part is prepared on the other half of the cores at the same time.
-    with on_half_the_cores(1), writing(path):
-        write_whole(path, encode_part(store.manifest, rows))
+    with use_half_the_cores(1), report_write_errors(path):
+        write_atomically(path, encode_chunk(store.manifest, rows))
 
 
-def read_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
+def read_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
     """Read the rows of a part; return None if it is missing, damaged, or of another sweep."""
     try:
-        with open_plain(store.part_path(part)) as file:
+        with open_regular(store.chunk_path(part)) as file:
             content = file.read()
     except OSError:
         return None
-    return decode_part(store.manifest, part, content)
+    return decode_chunk(store.manifest, part, content)
 
 
-def kept_part(store: Store, part: int) -> dict[str, np.ndarray] | None:
+def read_intact_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
     """Read the rows of a part; return None if it is missing.
 
     Raise `InputError` if it is damaged or of another sweep.
     """
-    rows, path = read_part(store, part), store.part_path(part)
+    rows, path = read_chunk(store, part), store.chunk_path(part)
     if rows is None and os.path.lexists(path):
-        reason = "found damage, or a part of something else, allowed as it was written"
+        reason = "found damage, or a part of something else, expected as it was written"
         raise InputError(
-            f"{one_line(str(store.folder))}: {PARTS}/{path.name}: {reason} (`jaxhil sweep --resume` makes it)"
+            f"{to_one_line(str(store.folder))}: {CHUNK_FOLDER}/{path.name}: {reason} (`jaxhil sweep "
+            "--resume` makes it)"
         )
     return rows
 
 
-def write_verdict(store: Store, document: Mapping[str, Any]) -> None:
+def write_verdict(store: SweepStore, document: Mapping[str, Any]) -> None:
     """Write the verdict atomically; raise `InputError` if it cannot be written."""
-    path = store.folder / VERDICT
-    with writing(path):
-        write_whole(path, terminal.as_json(document).encode("ascii"))
+    path = store.folder / VERDICT_FILE
+    with report_write_errors(path):
+        write_atomically(path, terminal.format_json(document).encode("ascii"))
 
 
-def remove_parts(store: Store, first: int) -> None:
+def remove_chunks(store: SweepStore, first: int) -> None:
     """Remove the parts from number `first` on; raise `InputError` if one cannot be removed."""
-    with writing(store.folder / PARTS), os.scandir(store.folder / PARTS) as entries:
+    with report_write_errors(store.folder / CHUNK_FOLDER), os.scandir(store.folder / CHUNK_FOLDER) as entries:
         for entry in entries:
-            name = PART.fullmatch(entry.name)
+            name = CHUNK_FILE_PATTERN.fullmatch(entry.name)
             if name and int(name[1]) >= first and entry.is_file(follow_symlinks=False):
                 os.unlink(entry)
 
 
-def read_row(store: Store, index: int) -> dict[str, Any]:
+def read_row(store: SweepStore, index: int) -> dict[str, Any]:
     """Read one row, arrays of length 1; raise `InputError` for an index that the store does not hold."""
     manifest = store.manifest
-    where = one_line(str(store.folder))
+    where = to_one_line(str(store.folder))
     if not 0 <= index < manifest.scenarios:
-        raise InputError(f"{where}: index: found {index}, allowed 0 to {manifest.scenarios - 1}")
+        raise InputError(f"{where}: index: found {index}, expected 0 to {manifest.scenarios - 1}")
     part, row = divmod(index, manifest.chunk)
-    rows = kept_part(store, part)
+    rows = read_intact_chunk(store, part)
     if rows is None:
         if manifest.until_width is not None:
-            raise InputError(f"{where}: index: found {index}, allowed those before the sweep stopped")
-        name = store.part_path(part).name
-        raise InputError(f"{where}: {PARTS}/{name}: missing (`jaxhil sweep --resume` makes it)")
+            raise InputError(f"{where}: index: found {index}, expected those before the sweep stopped")
+        name = store.chunk_path(part).name
+        raise InputError(f"{where}: {CHUNK_FOLDER}/{name}: missing (`jaxhil sweep --resume` makes it)")
     return {name: values[row : row + 1] for name, values in rows.items()}
 
 
@@ -175,16 +191,18 @@ def _is_store(folder: Path) -> bool:
     """
     try:
         names = set(os.listdir(folder)) if os.path.lexists(folder) else set()
-        if NAME in names:
+        if MANIFEST_FILE in names:
             return True
-        foreign = names - {LOCK, PARTS} or (set(os.listdir(folder / PARTS)) if PARTS in names else set())
+        foreign = names - {LOCK_FILE, CHUNK_FOLDER} or (
+            set(os.listdir(folder / CHUNK_FOLDER)) if CHUNK_FOLDER in names else set()
+        )
         foreign = {name for name in foreign if not is_temporary(name)}
     except OSError as error:
-        reason = one_line(error.strerror or str(error), 100)
-        raise InputError(f"{one_line(str(folder))}: cannot be read: {reason}") from None
+        reason = to_one_line(error.strerror or str(error), 100)
+        raise InputError(f"{to_one_line(str(folder))}: cannot be read: {reason}") from None
     if foreign:
         allowed = "an empty folder, or a sweep's and --resume"
         raise InputError(
-            f"{one_line(str(folder))}: found {shown(min(foreign))} and no sweep, allowed {allowed}"
+            f"{to_one_line(str(folder))}: found {format_value(min(foreign))} and no sweep, expected {allowed}"
         )
     return False

@@ -15,17 +15,21 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
-from jaxhil.files import make_folder, open_plain, write_whole, writing
+from jaxhil.files import make_folder, open_regular, report_write_errors, write_atomically
 from jaxhil.rig import digest
 from tuning.statistics.subset_simulation import SubsetSimulation
-from tuning.sweeps.manifest import LARGEST, Manifest
-from tuning.sweeps.store import STUDIES, Store
-from tuning.sweeps.studies import REPLICATES, SAMPLES, ErrorIndices, InputIndices
+from tuning.sweeps.manifest import MAX_FILE_BYTES, Manifest
+from tuning.sweeps.store import STUDY_FOLDER, SweepStore
+from tuning.sweeps.studies import SUBSET_REPLICATES, SUBSET_SAMPLES, ErrorIndices, InputIndices
 
-SCHEMA = "jaxhil/study/1"
+STUDY_SCHEMA = "jaxhil/study/1"
 # Value of null in the numbers of a record, and in fields that differ from their record.
-NULLS: dict[Any, float | None] = {InputIndices: math.nan, ErrorIndices: None, SubsetSimulation: math.inf}
-FIELD_NULLS = {"thresholds": math.nan}
+NULL_VALUES: dict[Any, float | None] = {
+    InputIndices: math.nan,
+    ErrorIndices: None,
+    SubsetSimulation: math.inf,
+}
+FIELD_NULL_VALUES = {"thresholds": math.nan}
 
 
 class IndicesRequest(NamedTuple):
@@ -34,73 +38,73 @@ class IndicesRequest(NamedTuple):
     number: int
 
 
-class RareRequest(NamedTuple):
+class RareFailureRequest(NamedTuple):
     """Arguments of `tuning.sweeps.studies.rare_failure`."""
 
     limit: float  # limit of the restitution error [1]
-    samples: int = SAMPLES  # samples per level and replicate
-    replicates: int = REPLICATES  # number of independent runs
+    samples: int = SUBSET_SAMPLES  # samples per level and replicate
+    replicates: int = SUBSET_REPLICATES  # number of independent runs
 
 
-Request = IndicesRequest | RareRequest
-Found = ErrorIndices | SubsetSimulation
+StudyRequest = IndicesRequest | RareFailureRequest
+StudyResult = ErrorIndices | SubsetSimulation
 
 
-def study_path(store: Store, request: Request) -> Path:
+def study_path(store: SweepStore, request: StudyRequest) -> Path:
     """Return the path of the file of a study with these arguments."""
     if isinstance(request, IndicesRequest):
-        return store.folder / STUDIES / f"drivers-{request.number}.json"
+        return store.folder / STUDY_FOLDER / f"drivers-{request.number}.json"
     name = f"rare-{float(request.limit)!r}-{request.replicates}x{request.samples}.json"
-    return store.folder / STUDIES / name
+    return store.folder / STUDY_FOLDER / name
 
 
-def write_study(store: Store, request: Request, found: Found) -> None:
+def write_study(store: SweepStore, request: StudyRequest, found: StudyResult) -> None:
     """Write the result of a study; raise `InputError` if it cannot be written."""
     path = study_path(store, request)
-    with writing(path):
-        content = encode(store.manifest, request, found)
+    with report_write_errors(path):
+        content = encode_study(store.manifest, request, found)
         make_folder(path.parent)
-        write_whole(path, content)
+        write_atomically(path, content)
 
 
-def read_study(store: Store, request: Request) -> Any:
+def read_study(store: SweepStore, request: StudyRequest) -> Any:
     """Read the result of a study; return None if it is missing, damaged, or of another sweep."""
     try:
-        with open_plain(study_path(store, request)) as file:
-            content = file.read(LARGEST + 1)
+        with open_regular(study_path(store, request)) as file:
+            content = file.read(MAX_FILE_BYTES + 1)
     except OSError:
         return None
-    return decode(store.manifest, request, content) if len(content) <= LARGEST else None
+    return decode_study(store.manifest, request, content) if len(content) <= MAX_FILE_BYTES else None
 
 
-def encode(manifest: Manifest, request: Request, found: Found) -> bytes:
+def encode_study(manifest: Manifest, request: StudyRequest, found: StudyResult) -> bytes:
     """Return the content of a study's file; raise ValueError for values that JSON lacks."""
-    document = {**_label(manifest, request), "result": _plain(found, None)}
+    document = {**_describe_study(manifest, request), "result": _convert_to_plain(found, None)}
     document["sha256"] = digest(document)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
 
 
-def decode(manifest: Manifest, request: Request, content: bytes) -> Any:
-    """Return the result that `encode` encoded; None if the content is damaged or of another study."""
+def decode_study(manifest: Manifest, request: StudyRequest, content: bytes) -> Any:
+    """Return the result that `encode_study` encoded; None if the content is damaged or of another study."""
     kind = ErrorIndices if isinstance(request, IndicesRequest) else SubsetSimulation
     try:
         document = json.loads(content)
         valid = document.pop("sha256") == digest(document)
         content_of_result = document.pop("result")
-        result = _restored(kind, content_of_result, None)
-        valid = valid and _plain(result, None) == content_of_result
+        result = _restore_records(kind, content_of_result, None)
+        valid = valid and _convert_to_plain(result, None) == content_of_result
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError, msgspec.MsgspecError):
         # A file of another program can be wrong in any way.
         return None
-    if not valid or document != _label(manifest, request):
+    if not valid or document != _describe_study(manifest, request):
         return None
-    return result if isinstance(request, IndicesRequest) or _fits(result, request) else None
+    return result if isinstance(request, IndicesRequest) or _has_matching_shapes(result, request) else None
 
 
-def _label(manifest: Manifest, request: Request) -> dict[str, Any]:
+def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]:
     """Return the entries of a study's file besides its result and the digest."""
     return {
-        "schema": SCHEMA,
+        "schema": STUDY_SCHEMA,
         "study": "drivers" if isinstance(request, IndicesRequest) else "rare",
         "sweep_sha256": manifest.sha256,
         "seed": manifest.seed,
@@ -109,39 +113,45 @@ def _label(manifest: Manifest, request: Request) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any, null: float | None) -> Any:
+def _convert_to_plain(value: Any, null: float | None) -> Any:
     """Convert records to mappings, arrays to lists, and the non-finite number `null` to None."""
     if hasattr(value, "_fields"):
-        null = NULLS[type(value)]
-        return {name: _plain(field, FIELD_NULLS.get(name, null)) for name, field in value._asdict().items()}
+        null = NULL_VALUES[type(value)]
+        return {
+            name: _convert_to_plain(field, FIELD_NULL_VALUES.get(name, null))
+            for name, field in value._asdict().items()
+        }
     if isinstance(value, (tuple, list)):
-        return [_plain(element, null) for element in value]
+        return [_convert_to_plain(element, null) for element in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist(), null)
+        return _convert_to_plain(value.tolist(), null)
     if isinstance(value, float) and (value == null or (math.isnan(value) and null is math.nan)):
         return None
     return value
 
 
-def _restored(kind: Any, value: Any, null: float | None) -> Any:
-    """Convert the result of `_plain` back to a `kind`; raise ValueError or TypeError if it does not fit."""
+def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
+    """Convert the result of `_convert_to_plain` to a `kind`. Raise ValueError or TypeError on a misfit."""
     if hasattr(kind, "_fields"):
-        hints, null = get_type_hints(kind), NULLS[kind]
+        hints, null = get_type_hints(kind), NULL_VALUES[kind]
         if value.keys() != hints.keys():
             raise ValueError("other fields")
         return kind(
-            **{name: _restored(hints[name], value[name], FIELD_NULLS.get(name, null)) for name in hints}
+            **{
+                name: _restore_records(hints[name], value[name], FIELD_NULL_VALUES.get(name, null))
+                for name in hints
+            }
         )
     if kind is np.ndarray:
         array = np.array(value, float)
         array[np.isnan(array)] = null
         return array
     if element := get_args(kind):
-        return tuple(_restored(element[0], item, null) for item in value)
+        return tuple(_restore_records(element[0], item, null) for item in value)
     return msgspec.convert(null if value is None else value, kind)
 
 
-def _fits(rare: SubsetSimulation, request: RareRequest) -> bool:
+def _has_matching_shapes(rare: SubsetSimulation, request: RareFailureRequest) -> bool:
     """Return whether the shapes of the result's arrays agree with the request and with each other."""
     shape = (request.replicates,)
     fits = rare.estimates.shape == rare.formula_coefficients.shape == rare.thresholds.shape[1:] == shape

@@ -13,24 +13,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.statistics.intervals import Running, binomial_interval, replicate_interval, updated
-from tuning.statistics.quantiles import BINS, binned_estimate, binned_quantile, counts, replicate_quantile
-from tuning.sweeps import MOST
-from tuning.sweeps.columns import BEYOND, GOOD, OUTCOMES, SATURATED
+from tuning.statistics.intervals import (
+    SequentialState,
+    binomial_interval,
+    replicate_interval,
+    update_sequence,
+)
+from tuning.statistics.quantiles import (
+    BIN_COUNT,
+    binned_estimate,
+    binned_quantile,
+    count_in_bins,
+    replicate_quantile,
+)
+from tuning.sweeps import MAX_SCENARIOS
+from tuning.sweeps.columns import BEYOND_LIMIT, GOOD, SATURATED, SCENARIO_OUTCOMES
 
-WORST = 10
-ORDERS = (0.5, 0.95, 0.99, 0.999)
+MAX_WORST_SCENARIOS = 10
+QUANTILE_ORDERS = (0.5, 0.95, 0.99, 0.999)
 
 
 class Tally(NamedTuple):
     """Statistics of the scenarios so far."""
 
-    outcomes: tuple[int, ...]  # number of scenarios of each of `OUTCOMES`
+    outcomes: tuple[int, ...]  # number of scenarios of each of `SCENARIO_OUTCOMES`
     whole: int  # number of first scenarios that fill all replicates equally
     replicates: tuple[tuple[int, int], ...]  # per replicate, scenarios and failures
     errors: tuple[tuple[int, ...], ...]  # per replicate, error bins (`tuning.statistics.quantiles.counts`)
     worst: tuple[tuple[int, float, int], ...]  # worst scenarios first: rank of the outcome, |error|, index
-    looks: Running | None = None  # confidence sequence, if the tally is evaluated part by part
+    looks: SequentialState | None = None  # confidence sequence, if the tally is evaluated part by part
 
     @property
     def scenarios(self) -> int:
@@ -38,7 +49,7 @@ class Tally(NamedTuple):
 
     @property
     def failed(self) -> int:
-        return self.scenarios - self.outcomes[OUTCOMES.index(GOOD)]
+        return self.scenarios - self.outcomes[SCENARIO_OUTCOMES.index(GOOD)]
 
     @property
     def left_out(self) -> int:
@@ -46,7 +57,7 @@ class Tally(NamedTuple):
         return self.scenarios - sum(number for number, _ in self.replicates)
 
 
-class Probability(NamedTuple):
+class ProbabilityEstimate(NamedTuple):
     """Estimated probability with a 95 % interval."""
 
     value: float  # estimate [1]
@@ -55,7 +66,7 @@ class Probability(NamedTuple):
     method: str  # name of the interval's method
 
 
-class Quantile(NamedTuple):
+class QuantileEstimate(NamedTuple):
     """Quantile of |error| over the scenarios, with a 95 % interval."""
 
     order: float  # share of the scenarios that do not exceed the quantile [1]
@@ -64,33 +75,37 @@ class Quantile(NamedTuple):
     high: float  # high end of the interval [1]
 
 
-def empty_tally(replicates: int, scenarios: int = MOST, looked_at: bool = False) -> Tally:
+def build_empty_tally(replicates: int, scenarios: int = MAX_SCENARIOS, looked_at: bool = False) -> Tally:
     """Return the tally of no rows, for a sweep of `scenarios`.
 
     With `looked_at`, rows are added in order of the index, and the interval is valid at any stopping time.
     """
     return Tally(
-        (0,) * len(OUTCOMES),
+        (0,) * len(SCENARIO_OUTCOMES),
         scenarios // replicates * replicates,
         ((0, 0),) * replicates,
-        ((0,) * BINS,) * replicates,
+        ((0,) * BIN_COUNT,) * replicates,
         (),
-        Running() if looked_at else None,
+        SequentialState() if looked_at else None,
     )
 
 
-def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
+def add_to_tally(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
     """Return the tally with more rows, which need `index`, `outcome`, `failed` and `worst_error`."""
     index, outcome, failed = rows["index"], rows["outcome"], rows["failed"]
-    outcomes = np.bincount(outcome, minlength=len(OUTCOMES))
-    replicates, errors = _replicates(tally, rows)
+    outcomes = np.bincount(outcome, minlength=len(SCENARIO_OUTCOMES))
+    replicates, errors = _add_to_replicates(tally, rows)
     # Scenarios that are good or beyond the limit are ranked by their error only.
-    badness = np.where(outcome <= OUTCOMES.index(BEYOND), 0, outcome)
+    badness = np.where(outcome <= SCENARIO_OUTCOMES.index(BEYOND_LIMIT), 0, outcome)
     error = np.nan_to_num(np.abs(rows["worst_error"].astype(float)), nan=-1.0, posinf=np.inf)
     # Only candidates for the worst scenarios are sorted.
     size = np.where(badness > 0, np.inf, error)
-    few = np.flatnonzero(size >= np.partition(size, -WORST)[-WORST] if len(size) > WORST else size >= -1)
-    first = few[np.lexsort((index[few], -error[few], -badness[few].astype(int)))[:WORST]]
+    few = np.flatnonzero(
+        size >= np.partition(size, -MAX_WORST_SCENARIOS)[-MAX_WORST_SCENARIOS]
+        if len(size) > MAX_WORST_SCENARIOS
+        else size >= -1
+    )
+    first = few[np.lexsort((index[few], -error[few], -badness[few].astype(int)))[:MAX_WORST_SCENARIOS]]
     worst = [(int(badness[i]), float(error[i]), int(index[i])) for i in first]
     looks = tally.looks
     return Tally(
@@ -98,18 +113,22 @@ def add_rows(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
         tally.whole,
         replicates,
         errors,
-        tuple(sorted([*tally.worst, *worst], key=lambda entry: (-entry[0], -entry[1], entry[2]))[:WORST]),
-        None if looks is None else updated(looks, int(np.sum(failed)), len(failed)),
+        tuple(
+            sorted([*tally.worst, *worst], key=lambda entry: (-entry[0], -entry[1], entry[2]))[
+                :MAX_WORST_SCENARIOS
+            ]
+        ),
+        None if looks is None else update_sequence(looks, int(np.sum(failed)), len(failed)),
     )
 
 
-def error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
+def compute_error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the worst |error| of every scenario; infinite if a contact did not end."""
     size = np.abs(rows["worst_error"].astype(float))
-    return np.where((rows["outcome"] > OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
+    return np.where((rows["outcome"] > SCENARIO_OUTCOMES.index(SATURATED)) | np.isnan(size), np.inf, size)
 
 
-def failure_probability(tally: Tally) -> Probability:
+def estimate_failure_probability(tally: Tally) -> ProbabilityEstimate:
     """Estimate the probability that a scenario fails.
 
     The interval (`tuning.statistics.intervals`) is `binomial_interval` for independent draws,
@@ -121,44 +140,44 @@ def failure_probability(tally: Tally) -> Probability:
     value = float(np.sum(failures)) / number if number else float("nan")
     if tally.looks is not None:
         low, high = tally.looks.low, tally.looks.high
-        return Probability(value, low, high, "confidence sequence, valid under repeated looks")
+        return ProbabilityEstimate(value, low, high, "confidence sequence, valid under repeated looks")
     if len(numbers) == 1:
         _, low, high = binomial_interval(failures[0], number)
-        return Probability(value, float(low), float(high), "binomial, exact")
+        return ProbabilityEstimate(value, float(low), float(high), "binomial, exact")
     method = f"{len(numbers)} scrambled Sobol replicates"
-    if not _equal(numbers):
-        return Probability(value, 0.0, 1.0, f"{method}, of unequal size yet")
+    if not _is_balanced(numbers):
+        return ProbabilityEstimate(value, 0.0, 1.0, f"{method}, of unequal size yet")
     _, low, high = replicate_interval(failures, int(numbers[0]))
-    return Probability(value, float(low), float(high), method)
+    return ProbabilityEstimate(value, float(low), float(high), method)
 
 
-def error_quantiles(tally: Tally) -> list[Quantile]:
-    """Estimate the quantiles `ORDERS` of the worst |error|, with intervals as in `failure_probability`."""
+def estimate_error_quantiles(tally: Tally) -> list[QuantileEstimate]:
+    """Estimate the quantiles `QUANTILE_ORDERS` of the worst |error|, with confidence intervals."""
     errors = np.array(tally.errors)
     quantiles = []
-    for order in ORDERS:
+    for order in QUANTILE_ORDERS:
         if len(errors) == 1:
             interval = binned_quantile(errors[0], order, sequential=tally.looks is not None)
-        elif _equal(np.sum(errors, axis=1)):
+        elif _is_balanced(np.sum(errors, axis=1)):
             interval = replicate_quantile(errors, order)
         else:
             interval = binned_estimate(np.sum(errors, axis=0), order), 0.0, np.inf
-        quantiles.append(Quantile(order, *(float(number) for number in interval)))
+        quantiles.append(QuantileEstimate(order, *(float(number) for number in interval)))
     return quantiles
 
 
-def _replicates(tally: Tally, rows: Mapping[str, np.ndarray]):
+def _add_to_replicates(tally: Tally, rows: Mapping[str, np.ndarray]):
     """Return (scenarios, failures) and error bins of every replicate with the rows added."""
     used = rows["index"] < tally.whole
     replicate = rows["index"][used] % len(tally.replicates)
-    sizes, failed = error_sizes(rows)[used], rows["failed"][used]
+    sizes, failed = compute_error_sizes(rows)[used], rows["failed"][used]
     replicates, errors = [], []
     for number, ((n, k), bins) in enumerate(zip(tally.replicates, tally.errors, strict=True)):
         mask = replicate == number
         replicates.append((n + int(np.sum(mask)), k + int(np.sum(failed[mask]))))
-        errors.append(tuple((np.array(bins) + counts(sizes[mask])).tolist()))
+        errors.append(tuple((np.array(bins) + count_in_bins(sizes[mask])).tolist()))
     return tuple(replicates), tuple(errors)
 
 
-def _equal(numbers: np.ndarray) -> bool:
+def _is_balanced(numbers: np.ndarray) -> bool:
     return bool(numbers[0] > 0 and np.all(numbers == numbers[0]))

@@ -2,7 +2,7 @@
 
 The slope of e against e* measures the response of a compensator to dissipation that it was not tuned for. An
 elastic mechanism alone, with e* = 1 always, does not show it. The perturbation of scenario i dissipates like
-an oscillator with e* = exp(-pi zeta_i), whose damping ratios zeta_i cover [0, `LARGEST_RATIO`] evenly, in
+an oscillator with e* = exp(-pi zeta_i), whose damping ratios zeta_i cover [0, `MAX_DAMPING_RATIO`] evenly, in
 terms of the mechanism's contact law (`ContactLaw.perturb_damping`).
 """
 
@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Mechanism, value_at
 
-LARGEST_RATIO = 0.15  # damping ratio: e* = 0.62
+MAX_DAMPING_RATIO = 0.15  # damping ratio: e* = 0.62
 
 
 def perturb_damping(
@@ -27,9 +27,9 @@ def perturb_damping(
     """
     number = len(next(iter(draws.values())))
     # Multiples of the golden ratio keep the damping ratio uncorrelated with the order of the draws.
-    ratio = LARGEST_RATIO * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
-    contact, law = mechanism.contact, contact_law(mechanism.contact.law)
-    mass = _mass(mechanism, draws)[:, None]
+    ratio = MAX_DAMPING_RATIO * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
+    contact, law = mechanism.contact, find_contact_law(mechanism.contact.law)
+    mass = _compute_masses(mechanism, draws)[:, None]
     velocity = np.broadcast_to(draws.get("approach.velocity", mechanism.approach.velocity), (number,))[
         :, None
     ]
@@ -39,8 +39,10 @@ def perturb_damping(
         nominal = np.asarray(value_at(mechanism, f"contact.{key}"), float)
         values = draws.get(f"contact.{key}", np.broadcast_to(nominal, (number, *nominal.shape)))
         if key == "stiffness":
-            return _entries(np.asarray(values).reshape(number, len(contact.stiffness), -1)[:, :, 0], entries)
-        return _entries(values, entries) * law.damped if key == "damping" else np.asarray(values)
+            return _repeat_last_entry(
+                np.asarray(values).reshape(number, len(contact.stiffness), -1)[:, :, 0], entries
+            )
+        return _repeat_last_entry(values, entries) * law.damped if key == "damping" else np.asarray(values)
 
     key, values = law.perturb_damping(drawn, ratio, mass, velocity)
     # The list gets as many entries as the draws have.
@@ -50,7 +52,7 @@ def perturb_damping(
     return perturbed, {**draws, f"contact.{key}": values}
 
 
-def _mass(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Float[np.ndarray, "draws"]:
+def _compute_masses(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Float[np.ndarray, "draws"]:
     number = len(next(iter(draws.values())))
     bodies = mechanism.bodies
 
@@ -63,6 +65,6 @@ def _mass(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Float[np.nda
     return chaser * target / (chaser + target)
 
 
-def _entries(values: np.ndarray, entries: int) -> np.ndarray:
+def _repeat_last_entry(values: np.ndarray, entries: int) -> np.ndarray:
     """Return (draws, entries), the last entry repeated."""
     return values[:, np.minimum(np.arange(entries), values.shape[1] - 1)]

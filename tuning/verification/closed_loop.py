@@ -15,35 +15,45 @@ from jaxtyping import Array
 
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, Signals
 from jaxhil.rig.gain_file import GainFile
-from jaxhil.simulation.building import build_loop
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants
+from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.recording import as_arrays, begin
-from jaxhil.simulation.rollout import noise_ahead, stretch_length, turn_over
+from jaxhil.simulation.recording import convert_gains, start_batch
+from jaxhil.simulation.rollout import begin_next_contacts, draw_segment_noise, segment_length
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.tick import Model, RunState, actuate, contact_force, integrate, next_state, sense
-from jaxhil.simulation.watch import build_rules, record_contact
-from tuning.verification.stops import Stop, Witness
+from jaxhil.simulation.tick import (
+    ModelState,
+    RunState,
+    actuate,
+    compute_contact,
+    integrate,
+    sense,
+    update_state,
+)
+from jaxhil.simulation.watch import build_end_conditions, record_contact
+from tuning.verification.stops import ControllerStop, RecordingController
 
 
-def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -> tuple[Metrics, Stop | None]:
+def run_closed_loop(
+    loaded: LoadedGains, gain_file: GainFile, batch: Scenario
+) -> tuple[Metrics, ControllerStop | None]:
     """Run the batch's first lane with the runtime's controller built from `gain_file`.
 
     Return its metrics (slots, 1), and the first stop by the controller's guards or its watchdog, if any.
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
-    gains = as_arrays(loaded.gains)
+    gains = convert_gains(loaded.gains)
     # The run begins with the JAX controller in the loop, whose program is compiled already.
-    rig, run = _first_lane(begin(loop, gains, batch))
-    program = _compiled(dataclasses.replace(loop, compensator=OnTheRig(loop.compensator)))
+    rig, run = _select_first_lane(start_batch(loop, gains, batch))
+    program = _compile_loop(dataclasses.replace(loop, compensator=ExternalController(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
-    controller = Witness(gain_file)
+    controller = RecordingController(gain_file)
     started = False
     # A tripped controller commands no force, so that no contact would end.
     while np.any(run.active) and not controller.controller.tripped:
-        for _ in range(stretch_length(loop)):
+        for _ in range(segment_length(loop)):
             signals, plant_signals = program.sense(rig, run)
             force, position, velocity, measured, age = (float(leaf[0]) for leaf in jax.device_get(signals))
             if age == 0 and started:
@@ -65,11 +75,11 @@ def run_closed_loop(loaded: LoadedGains, gain_file: GainFile, batch: Scenario) -
     return jax.device_get(run.metrics), controller.stop()
 
 
-class OnTheRig(Compensator):
+class ExternalController(Compensator):
     """Placeholder in the loop for a controller that runs outside it.
 
     The law itself commands the history before a run's first tick, and its initial state does not change.
-    Afterwards the commands come from outside, as `Sent`.
+    Afterwards the commands come from outside, as `SentCommand`.
     """
 
     law: Compensator
@@ -87,12 +97,12 @@ class OnTheRig(Compensator):
         raise NotImplementedError("the controller runs outside the loop")
 
     def position_command(self, gains, state, position, velocity, acceleration):
-        if isinstance(state, Sent):
+        if isinstance(state, SentCommand):
             return state.position, state.state
         return self.law.position_command(gains, state, position, velocity, acceleration)
 
 
-class Sent(NamedTuple):
+class SentCommand(NamedTuple):
     """Position command [m] from outside, and the unchanged state of the law."""
 
     position: Array
@@ -100,30 +110,32 @@ class Sent(NamedTuple):
 
 
 @jax.jit
-def _first_lane(started: tuple[RigConstants, RunState]) -> tuple[RigConstants, RunState]:
+def _select_first_lane(started: tuple[RigConstants, RunState]) -> tuple[RigConstants, RunState]:
     return jax.tree.map(lambda leaf: leaf[..., :1] if leaf.ndim else leaf, started)
 
 
-class _Program(NamedTuple):
+class _LoopProgram(NamedTuple):
     """Steps of one loop, which are compiled at the first call."""
 
     sense: Callable[..., tuple[Signals, PlantSignals]]
-    integrate: Callable[..., Model]
+    integrate: Callable[..., ModelState]
     advance: Callable[..., RunState]
     turn_over: Callable[..., RunState]
 
 
 @lru_cache(maxsize=32)
-def _compiled(loop: Loop) -> _Program:
-    return _Program(*(jax.jit(partial(step, loop)) for step in (_sense, _integrate, _advance, _turn_over)))
+def _compile_loop(loop: Loop) -> _LoopProgram:
+    return _LoopProgram(
+        *(jax.jit(partial(step, loop)) for step in (_sense, _integrate, _advance, _turn_over))
+    )
 
 
 def _sense(loop: Loop, rig: RigConstants, run: RunState) -> tuple[Signals, PlantSignals]:
-    noise = jax.tree.map(lambda leaf: leaf[0], noise_ahead(loop, rig, run, 1))
+    noise = jax.tree.map(lambda leaf: leaf[0], draw_segment_noise(loop, rig, run, 1))
     return sense(loop, rig, run.state, run.tick, noise)
 
 
-def _integrate(loop: Loop, rig: RigConstants, run: RunState, command: Array) -> Model:
+def _integrate(loop: Loop, rig: RigConstants, run: RunState, command: Array) -> ModelState:
     return integrate(loop, rig, run.state, command)
 
 
@@ -140,13 +152,13 @@ def _advance(
     """Compute stages 3 to 6 of a tick with the force command and the position sent to the drives."""
     state, now = run.state, run.tick
     model = integrate(loop, rig, state, command)
-    actuated = actuate(loop, rig, gains, state, now, model, Sent(sent, state.controller))
-    contact = contact_force(loop, rig, state, actuated.interval)
-    rules, shortfall = build_rules(rig.scenario), state.plant.shortfall
+    actuated = actuate(loop, rig, gains, state, now, model, SentCommand(sent, state.controller))
+    contact = compute_contact(loop, rig, state, actuated.interval)
+    rules, shortfall = build_end_conditions(rig.scenario), state.plant.shortfall
     watch = record_contact(loop, rules, run.watch, signals, plant_signals, command, shortfall)
-    state = next_state(state, now, plant_signals, model, actuated, contact)
+    state = update_state(state, now, plant_signals, model, actuated, contact)
     return run._replace(state=state, watch=watch, tick=now + 1)
 
 
 def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> RunState:
-    return turn_over(loop, rig, gains, run, skip_flight=False)
+    return begin_next_contacts(loop, rig, gains, run, skip_flight=False)

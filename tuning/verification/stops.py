@@ -1,7 +1,7 @@
 """Stops of runs by the limits of a gain file: fault, value, limit, contact and time, in numbers and words.
 
-`Witness` is the rig's controller with a record of its inputs, from which it determines its stop. `find_stop`
-runs it on a recorded run, and `passing_limits` returns limits under which that run passes.
+`RecordingController` is the rig's controller with a record of its inputs, from which it determines its stop.
+`find_stop` runs it on a recorded run, and `find_passing_limits` returns limits under which that run passes.
 """
 
 import math
@@ -17,11 +17,11 @@ from jaxhil.rig.limits import LIMITS, NO_LIMITS
 from jaxhil.rig.watchdog import Watchdog
 
 if TYPE_CHECKING:  # It imports JAX, which takes a second; an early error need not wait for that.
-    from jaxhil.simulation.recording import Lane
+    from jaxhil.simulation.recording import LaneRecord
 
-WATCHDOG = faults.RESTITUTION | faults.ENERGY_BALANCE | faults.CONTACT_TOO_LONG
+WATCHDOG_FAULTS = faults.RESTITUTION | faults.ENERGY_BALANCE | faults.CONTACT_TOO_LONG
 # Name of the limit of each fault that has one; two names are the lower and the upper limit.
-LIMITS_OF: Mapping[int, tuple[str, ...]] = {
+FAULT_LIMITS: Mapping[int, tuple[str, ...]] = {
     faults.FORCE_OUT_OF_RANGE: ("force_range",),
     faults.POSITION_OUT_OF_RANGE: ("measured_lowest", "measured_highest"),
     faults.FORCE_STUCK: ("force_stuck_travel",),
@@ -35,12 +35,12 @@ LIMITS_OF: Mapping[int, tuple[str, ...]] = {
     faults.ENERGY_BALANCE: ("energy_balance",),
     faults.CONTACT_TOO_LONG: ("longest_contact",),
 }
-WIDER = 1.25  # proposed limit over the value that the run needs
-MOST_LIMITS = 24  # largest number of changes of limits that are tried until a run passes
+LIMIT_WIDENING = 1.25  # proposed limit over the value that the run needs
+MAX_LIMIT_CHANGES = 24  # largest number of changes of limits that are tried until a run passes
 STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 
 
-class Stop(msgspec.Struct, frozen=True, kw_only=True):
+class ControllerStop(msgspec.Struct, frozen=True, kw_only=True):
     """First stop of a run, or first other action of the controller on a fault."""
 
     fault: str  # name of the fault, as in `jaxhil.rig.faults`
@@ -56,7 +56,7 @@ class Stop(msgspec.Struct, frozen=True, kw_only=True):
     text: str  # description with all of the above
 
 
-class Tick(NamedTuple):
+class TickInputs(NamedTuple):
     """Inputs of the controller at a tick, and its command of the tick before."""
 
     begins: bool  # whether the next contact was announced before the tick
@@ -68,13 +68,13 @@ class Tick(NamedTuple):
     measured: float  # measured position [m]
 
 
-class Witness:
+class RecordingController:
     """Controller of the rig with a record of its inputs up to the first fault on which it acted."""
 
     def __init__(self, gain_file: GainFile):
         self.controller = Controller(gain_file)
         self._gain_file = gain_file
-        self._ticks: list[Tick] = []
+        self._ticks: list[TickInputs] = []
         self._motions: dict[int, tuple[float, float, float]] = {}  # motion of the numerical model by tick
         self._force, self._sent = 0.0, math.nan
         self._begins = self._announced = False
@@ -90,7 +90,7 @@ class Witness:
         self.controller.next_contact()
         if not self.stopped:
             self._begins = self._announced = True
-        self._look()
+        self._record_faults()
 
     def start(self, position: float, velocity: float) -> None:
         """Set the controller's position and velocity at the start of a run, before its first tick."""
@@ -100,10 +100,12 @@ class Witness:
         """Return the controller's force [N] of a tick."""
         if not self.stopped:
             status = STATUS_NUMBERS[self.controller.law_status]
-            self._ticks.append(Tick(self._begins, self._force, status, force, position, velocity, measured))
+            self._ticks.append(
+                TickInputs(self._begins, self._force, status, force, position, velocity, measured)
+            )
             self._announced = self._begins = False
         self._force = self.controller.step(force, position, velocity, measured)
-        self._look()
+        self._record_faults()
         return self._force
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
@@ -111,10 +113,10 @@ class Witness:
         if not self.stopped:
             self._motions[len(self._ticks) - 1] = (position, velocity, acceleration)
         sent = self.controller.position_command(position, velocity, acceleration)
-        self._look()
+        self._record_faults()
         return sent
 
-    def stop(self) -> Stop | None:
+    def stop(self) -> ControllerStop | None:
         """Return the first stop or other action of the controller on a fault; None if there was none."""
         if not self.stopped:
             return None
@@ -126,7 +128,7 @@ class Witness:
         contact = watchdog.contacts + (0 if audited else 1)
         tick = len(self._ticks) - 1
         time = tick * self._gain_file.control_period
-        by = "watchdog" if fault.bit & WATCHDOG else "guard"
+        by = "watchdog" if fault.bit & WATCHDOG_FAULTS else "guard"
         tripped = self.controller.tripped
         unit = None if limit is None else LIMITS[limit].unit
         stated = "" if limit is None else f", {limit} {allowed:.4g}{'' if unit == '1' else f' {unit}'}"
@@ -135,12 +137,12 @@ class Witness:
             f"{'after' if audited else 'in or before'} contact {contact}, by the {by}'s check {fault.name}: "
             f"{words or fault.condition.removeprefix('watchdog: ')}{stated}"
         )
-        return Stop(
+        return ControllerStop(
             fault=fault.name, by=by, tripped=tripped, contact=contact, tick=tick, time=time, found=found,
             limit=limit, allowed=allowed, unit=unit, text=text,
         )  # fmt: skip
 
-    def _look(self) -> None:
+    def _record_faults(self) -> None:
         """Store the first faults on which the controller acts; `LAW_IN_DOUBT` changes no command."""
         if not self._acting:
             self._acting = self.controller.cause or self.controller.faults & ~faults.LAW_IN_DOUBT
@@ -161,7 +163,7 @@ class Witness:
 
     def _measured(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
         """Return the value compared with the fault's limit, that limit's name, and the value as text."""
-        names = LIMITS_OF.get(fault)
+        names = FAULT_LIMITS.get(fault)
         if not names:
             return None, None, ""
         if fault == faults.RESTITUTION:
@@ -237,9 +239,9 @@ class Witness:
         return force, before, sent
 
 
-def find_stop(gain_file: GainFile, lane: "Lane") -> Stop | None:
+def find_stop(gain_file: GainFile, lane: "LaneRecord") -> ControllerStop | None:
     """Return the first stop in a recorded run, whose last contact is audited too; None if there is none."""
-    witness = Witness(gain_file)
+    witness = RecordingController(gain_file)
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
     for tick, (*signals, age) in enumerate(readings):
         if age == 0 and tick > 0:
@@ -256,20 +258,20 @@ def find_stop(gain_file: GainFile, lane: "Lane") -> Stop | None:
     return witness.stop()
 
 
-def passing_limits(gain_file: GainFile, lane: "Lane") -> dict[str, float] | None:
+def find_passing_limits(gain_file: GainFile, lane: "LaneRecord") -> dict[str, float] | None:
     """Return names and values of limits with which a recorded run passes; None if it cannot pass."""
     limits, changed = dict(gain_file.limits), {}
-    for _ in range(MOST_LIMITS):
+    for _ in range(MAX_LIMIT_CHANGES):
         stop = find_stop(gain_file._replace(limits=limits), lane)
         if stop is None:
             return changed
         if stop.limit is None or stop.found is None:
             return None
-        limits[stop.limit] = changed[stop.limit] = _widened(stop.limit, stop.found)
+        limits[stop.limit] = changed[stop.limit] = _widen_limit(stop.limit, stop.found)
     return None
 
 
-def advice(passing: Mapping[str, float] | None) -> str:
+def describe_limit_changes(passing: Mapping[str, float] | None) -> str:
     """Return a text with the changes of limits with which a run passes."""
     if not passing:
         return "no other limits let it pass"
@@ -277,10 +279,10 @@ def advice(passing: Mapping[str, float] | None) -> str:
     return f"tune better gains, or {changes} lets this run pass, and others like it"
 
 
-def _widened(name: str, found: float) -> float:
+def _widen_limit(name: str, found: float) -> float:
     """Return a limit beyond the found value, rounded outward to two digits."""
     outward = -1.0 if name.endswith("_lowest") else 1.0
-    value = found + outward * (WIDER - 1) * abs(found)
+    value = found + outward * (LIMIT_WIDENING - 1) * abs(found)
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1) if value else 1.0
     rounded = outward * math.ceil(outward * value / unit) * unit
     limit = LIMITS[name]

@@ -12,62 +12,62 @@ from jaxtyping import Bool, Float, Int
 
 from jaxhil.simulation.metrics import OK
 from tuning.statistics.intervals import binomial_interval
-from tuning.watchdog.audited import Audited, Rules, audit_contacts, first_reached
-from tuning.watchdog.expectation import Expectation, Features, expected_restitution
-from tuning.watchdog.extent import Extent, extent_of
-from tuning.watchdog.recorded import Chunk
+from tuning.watchdog.audit import AuditedContacts, AuditRules, audit_contacts, find_first_true
+from tuning.watchdog.expectation import ContactFeatures, Expectation, expected_restitution
+from tuning.watchdog.recording import RecordedRuns
+from tuning.watchdog.signal_extremes import SignalExtremes, find_signal_extremes
 
 # Multiples of the limit: a run with errors up to the first is good, beyond the second it must be stopped.
-GOOD_ERROR, BAD_ERROR = 0.5, 1.0
-NOTICED = 0.95  # share of alarms that defines the error from which contacts are noticed
-FEW = 20  # least number of contacts for such a share
+GOOD_ERROR_FACTOR, BAD_ERROR_FACTOR = 0.5, 1.0
+MIN_DETECTED_SHARE = 0.95  # share of alarms that defines the error from which contacts are noticed
+MIN_DETECTED_CONTACTS = 20  # least number of contacts for such a share
 
 
-class JudgedRuns(NamedTuple):
+class EvaluatedRuns(NamedTuple):
     """Evaluation of recorded runs."""
 
     index: Int[np.ndarray, "lanes"]  # index of each run in its sweep
     error: Float[np.ndarray, "slots lanes"]  # restitution error; NaN if the contact did not end
     reference: Float[np.ndarray, "slots lanes"]  # restitution e* of the ideal contact
     status: Int[np.ndarray, "slots lanes"]  # status of each contact, as in `jaxhil.simulation.metrics`
-    audited: Audited  # the watchdog's audit of each contact
-    extent: Extent  # extreme values of the signals
+    audited: AuditedContacts  # the watchdog's audit of each contact
+    extent: SignalExtremes  # extreme values of the signals
 
 
-def judge_chunk(chunk: Chunk, rules: Rules, free_distance: float) -> JudgedRuns:
-    """Evaluate recorded runs; `free_distance` [m] is that of `extent_of`."""
+def evaluate_runs(chunk: RecordedRuns, rules: AuditRules, free_distance: float) -> EvaluatedRuns:
+    """Evaluate recorded runs; `free_distance` [m] is that of `find_signal_extremes`."""
     contacts, slots = chunk.contacts, len(chunk.contacts.status)
-    return JudgedRuns(
+    return EvaluatedRuns(
         chunk.first + np.arange(contacts.status.shape[1]),
         contacts.error,
         contacts.reference,
         contacts.status,
         audit_contacts(chunk.signals, rules, slots),
-        extent_of(chunk.signals, rules.period, rules.clearance, free_distance, rules.settling),
+        find_signal_extremes(chunk.signals, rules.period, rules.clearance, free_distance, rules.settling),
     )
 
 
-def good_runs(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
+def find_good_runs(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
     """Return the runs whose contacts all ended, with errors within the limit."""
     return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
 
 
-def reached(runs: JudgedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
+def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
     """Return the contacts that the rig would reach, since no earlier contact of the run had to be stopped."""
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
-    first = first_reached(bad)
+    first = find_first_true(bad)
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
 
 
-def features_of(audited: Audited) -> Features:
+def extract_features(audited: AuditedContacts) -> ContactFeatures:
     """Return the features of the expectation, 0 if a contact gave no estimate."""
-    return Features(
+    return ContactFeatures(
         np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
     )
 
 
-def watchdog_rates(
-    runs: JudgedRuns,
+def compute_alarm_rates(
+    runs: EvaluatedRuns,
     expectation: Expectation,
     limits: Mapping[str, float | None],
     limit: float,
@@ -80,17 +80,17 @@ def watchdog_rates(
     stops it. A run must be stopped if a contact does not end or has an error beyond the limit; it is missed
     if the watchdog has not tripped by the end of that contact. The intervals are valid for independent
     scenarios, even if the number of failures decides their number; Sobol points are spread more evenly. The
-    result also holds the error from which contacts are noticed (`noticed_from`).
+    result also holds the error from which contacts are noticed (`find_detectable_error`).
     """
-    alarmed = alarms(runs, expectation, limits, mass)
-    first_alarm = first_reached(alarmed)
-    stopped = np.any(alarmed, axis=0) | guard_trips(runs.extent, limits)
-    good = chosen & good_runs(runs, GOOD_ERROR * limit)
-    bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR * limit)
-    first_bad = first_reached(bad)
+    alarmed = find_alarms(runs, expectation, limits, mass)
+    first_alarm = find_first_true(alarmed)
+    stopped = np.any(alarmed, axis=0) | find_guard_trips(runs.extent, limits)
+    good = chosen & find_good_runs(runs, GOOD_ERROR_FACTOR * limit)
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR_FACTOR * limit)
+    first_bad = find_first_true(bad)
     bad_runs = chosen & np.any(bad, axis=0)
-    use = reached(runs, limit) & (runs.status == OK) & chosen
-    expected = expected_restitution(expectation, features_of(runs.audited), mass)
+    use = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen
+    expected = expected_restitution(expectation, extract_features(runs.audited), mass)
     difference = np.abs((expected - runs.reference)[use])
     return {
         "limit": limit,
@@ -98,19 +98,19 @@ def watchdog_rates(
         "terms": [term for term, value in expectation.coefficients.items() if value],
         "expectation_rms": float(np.sqrt(np.mean(difference**2))) if len(difference) else None,
         "expectation_largest": float(np.max(difference)) if len(difference) else None,
-        "false_alarms": _rate(stopped[good]),
-        "missed_alarms": _rate(first_alarm[bad_runs] > first_bad[bad_runs]),
-        "noticed_from": noticed_from(runs.error[use], alarmed[use]),
+        "false_alarms": _compute_alarm_rate(stopped[good]),
+        "missed_alarms": _compute_alarm_rate(first_alarm[bad_runs] > first_bad[bad_runs]),
+        "noticed_from": find_detectable_error(runs.error[use], alarmed[use]),
         "held_out_runs": int(np.sum(chosen)),
     }
 
 
-def alarms(
-    runs: JudgedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
+def find_alarms(
+    runs: EvaluatedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
 ) -> Bool[np.ndarray, "slots lanes"]:
     """Return the contacts for which the watchdog raises an alarm."""
     audited = runs.audited
-    expected = expected_restitution(expectation, features_of(audited), mass)
+    expected = expected_restitution(expectation, extract_features(audited), mass)
     margin, balance, longest = (
         np.inf if limits[name] is None else float(limits[name] or 0.0)
         for name in ("restitution_margin", "energy_balance", "longest_contact")
@@ -124,7 +124,7 @@ def alarms(
     return audited.begun & ~quiet & ~(audited.approach == 0)
 
 
-def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
+def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
     """Return the runs that a guard other than the watchdog would stop, or whose readings it would flag."""
 
     def limit(name: str, unlimited: float = np.inf) -> float:
@@ -146,7 +146,7 @@ def guard_trips(extent: Extent, limits: Mapping[str, float | None]) -> Bool[np.n
     )
 
 
-def noticed_from(
+def find_detectable_error(
     error: Float[np.ndarray, "contacts"], alarmed: Bool[np.ndarray, "contacts"]
 ) -> dict[str, Any]:
     """Return the least |error| from which 95 % of the contacts raise an alarm.
@@ -157,7 +157,7 @@ def noticed_from(
     size = np.abs(error)
     order = np.argsort(-size)
     number = np.arange(1, len(size) + 1)
-    enough = (np.cumsum(alarmed[order]) >= NOTICED * number) & (number >= FEW)
+    enough = (np.cumsum(alarmed[order]) >= MIN_DETECTED_SHARE * number) & (number >= MIN_DETECTED_CONTACTS)
     largest = float(size[order[0]]) if len(size) else None
     if not np.any(enough):
         return {"error": None, "contacts": 0, "largest": largest}
@@ -165,7 +165,7 @@ def noticed_from(
     return {"error": float(size[order[last]]), "contacts": last + 1, "largest": largest}
 
 
-def _rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
+def _compute_alarm_rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:
     number, count = len(alarmed), int(np.sum(alarmed))
     _, low, high = binomial_interval(count, number)
     rate = count / number if number else None

@@ -13,15 +13,21 @@ from jaxtyping import Bool, Float
 
 from jaxhil.simulation.metrics import OK
 from tuning.statistics.intervals import binomial_interval
-from tuning.watchdog.alarms import GOOD_ERROR, JudgedRuns, features_of, good_runs, reached
+from tuning.watchdog.alarms import (
+    GOOD_ERROR_FACTOR,
+    EvaluatedRuns,
+    extract_features,
+    find_good_runs,
+    find_reached_contacts,
+)
 from tuning.watchdog.expectation import Expectation, expected_restitution
 
-BEYOND = 1.25  # factor on the largest value among some runs, as a bound for other runs
+UNSEEN_RUN_FACTOR = 1.25  # factor on the largest value among some runs, as a bound for other runs
 # Least margin, and margin of a good expectation, over the limit [1].
-LEAST, PLACE = 0.25, 0.75
+MIN_MARGIN_SHARE, USUAL_MARGIN_SHARE = 0.25, 0.75
 
 
-class Margin(NamedTuple):
+class RestitutionMargin(NamedTuple):
     """Restitution margin and the runs that determine it."""
 
     value: float  # margin [1]
@@ -29,41 +35,47 @@ class Margin(NamedTuple):
     runs: Bool[np.ndarray, "lanes"]  # runs that determine the margin
 
 
-def restitution_margin(
-    runs: JudgedRuns,
+def choose_restitution_margin(
+    runs: EvaluatedRuns,
     expectation: Expectation,
     limit: float,
     mass: float,
     fitted: Bool[np.ndarray, "lanes"],
     false_alarms: float,
-) -> Margin:
+) -> RestitutionMargin:
     """Return the restitution margin.
 
-    It is `PLACE` times the limit, less if the expectation's error exceeds the rest, but so large that at most
-    the share `false_alarms` of good runs is stopped. An error e - e* beyond the limit is detected if the
-    expectation's error is below limit - margin. A small share of good runs needs more runs than the fit of
-    the expectation; in that case every second run is used besides the `fitted` ones.
+    It is `USUAL_MARGIN_SHARE` times the limit, less if the expectation's error exceeds the rest, but so large
+    that at most the share `false_alarms` of good runs is stopped. An error e - e* beyond the limit is
+    detected if the expectation's error is below limit - margin. A small share of good runs needs more runs
+    than the fit of the expectation; in that case every second run is used besides the `fitted` ones.
     """
-    expected = expected_restitution(expectation, features_of(runs.audited), mass)
+    expected = expected_restitution(expectation, extract_features(runs.audited), mass)
     difference = runs.audited.restitution - expected
-    use = reached(runs, limit) & (runs.status == OK) & fitted
+    use = find_reached_contacts(runs, limit) & (runs.status == OK) & fitted
     # This includes the difference between the audit's and the loop's restitution.
     deviation = np.abs((difference - runs.error)[use])
-    narrow = float(np.clip(limit - BEYOND * np.max(deviation, initial=0.0), LEAST * limit, PLACE * limit))
-    good = good_runs(runs, GOOD_ERROR * limit)
+    narrow = float(
+        np.clip(
+            limit - UNSEEN_RUN_FACTOR * np.max(deviation, initial=0.0),
+            MIN_MARGIN_SHARE * limit,
+            USUAL_MARGIN_SHARE * limit,
+        )
+    )
+    good = find_good_runs(runs, GOOD_ERROR_FACTOR * limit)
     audited = runs.audited.begun & (runs.audited.approach > 0)
     furthest = np.max(np.where(audited, np.abs(difference), 0.0), axis=0)
-    if _passing(furthest[good & fitted], false_alarms) <= narrow:
-        return Margin(narrow, None, fitted)
+    if _find_passing_margin(furthest[good & fitted], false_alarms) <= narrow:
+        return RestitutionMargin(narrow, None, fitted)
     used = fitted | (runs.index % 2 == 1)
     wide = furthest[good & used]
     # The largest of n values is exceeded by a further one with probability 1/(n + 1).
     few = (len(wide) + 1) * false_alarms < 1
-    margin = max(narrow, (BEYOND if few else 1.0) * _passing(wide, false_alarms))
-    return Margin(margin, narrow if margin > narrow else None, used)
+    margin = max(narrow, (UNSEEN_RUN_FACTOR if few else 1.0) * _find_passing_margin(wide, false_alarms))
+    return RestitutionMargin(margin, narrow if margin > narrow else None, used)
 
 
-def _passing(furthest: Float[np.ndarray, "runs"], share: float) -> float:
+def _find_passing_margin(furthest: Float[np.ndarray, "runs"], share: float) -> float:
     """Return the least margin that, with 95 % confidence, at most a `share` of runs exceeds.
 
     With too few runs for that it is the largest of these runs.

@@ -23,8 +23,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import deflection
-from jaxhil.laws.shared.delay_line import Delay, DelayLine, delayed, empty, split
-from jaxhil.laws.shared.estimates import (
+from jaxhil.laws.shared.delay_line import (
+    DelayInPeriods,
+    DelayLine,
+    empty_delay_line,
+    read_delayed,
+    split_delay,
+)
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    apply_lead_filter,
+    build_lead_filter,
+    lead_amplification,
+)
+from jaxhil.laws.shared.nominal_values import (
     DEAD_ZONE,
     FORCE_DELAY,
     STIFFNESS,
@@ -32,29 +47,20 @@ from jaxhil.laws.shared.estimates import (
     peak_force,
     typical_stiffness,
 )
-from jaxhil.laws.shared.lead_filter import (
-    LEAD_FILTER,
-    PHASE_LEAD,
-    LeadFilter,
-    LeadState,
-    lead,
-    lead_amplification,
-    lead_filter,
-)
-from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_gain
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, rig_gain
 from jaxhil.mechanism.structs import Mechanism
 
-NEAR_1 = 15.0, 0.9  # frequency [Hz] up to which |Q| is at least the second number
+PASSBAND = 15.0, 0.9  # frequency [Hz] up to which |Q| is at least the second number
 
 
-def _widest(mechanism: Mechanism) -> float:
+def _max_bandwidth(mechanism: Mechanism) -> float:
     """Return the bandwidth [Hz] at which Q's pole is 0; beyond it the output alternates from tick to tick."""
     return 1 / (math.pi * mechanism.rig.control_period)
 
 
 def _nominal_bandwidth(mechanism: Mechanism) -> float:
-    frequency, gain = NEAR_1
-    widest, delay = _widest(mechanism), force_delay(mechanism)
+    frequency, gain = PASSBAND
+    widest, delay = _max_bandwidth(mechanism), force_delay(mechanism)
     without_lag = 1 / (2 * math.pi * delay) if delay > 0 else widest
     return min(max(frequency / math.sqrt(1 / gain**2 - 1), without_lag), widest)
 
@@ -80,7 +86,7 @@ class Prepared(NamedTuple):
     lead: LeadFilter
     pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1)) [1]
     share: Float[Array, "*batch"]  # of Q's input [1]
-    delay: Delay  # of the positions, to align them with the force
+    delay: DelayInPeriods  # of the positions, to align them with the force
 
 
 class DeadZoneObserver(Compensator):
@@ -96,7 +102,7 @@ class DeadZoneObserver(Compensator):
             "observer_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m), typical_stiffness
         ),
         rig_gain(
-            "observer_bandwidth", lambda m: 0.1 * _nominal_bandwidth(m), _widest, _nominal_bandwidth,
+            "observer_bandwidth", lambda m: 0.1 * _nominal_bandwidth(m), _max_bandwidth, _nominal_bandwidth,
             logarithmic=True,
         ),
         rig_gain(
@@ -117,36 +123,36 @@ class DeadZoneObserver(Compensator):
         return Prepared(
             gains,
             constants.clearance,
-            lead_filter(gains, constants),
+            build_lead_filter(gains, constants),
             (2 - corner) * scale,
             corner * scale,
-            split(gains["identification_delay"], period),
+            split_delay(gains["identification_delay"], period),
         )
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        return DeadZoneObserverState(LeadState(zeros, zeros), zeros, zeros, empty(ring, zeros))
+        return DeadZoneObserverState(LeadState(zeros, zeros), zeros, zeros, empty_delay_line(ring, zeros))
 
     def restart(self, gains, state, begins, fresh):
         return state._replace(
-            lead=cleared(state.lead, begins),
+            lead=clear_lanes(state.lead, begins),
             withheld=jnp.where(begins, 0, state.withheld),
             observed=jnp.where(begins, 0, state.observed),
         )
 
     def step(self, prepared, state, signals, tick):
         gains = prepared.gains
-        aligned, line = delayed(prepared.delay, state.line, signals, tick)
+        aligned, line = read_delayed(prepared.delay, state.line, signals, tick)
         force = gains["observer_stiffness"] * deflection(aligned, prepared.clearance)
         most = gains["observer_limit"]
         withheld = jnp.where(force > most, most, jnp.where(force < -most, -most, force))
         observed = prepared.pole * state.observed + prepared.share * (withheld + state.withheld)
-        command, lead_state = lead(prepared.lead, state.lead, signals.force_measured + observed)
+        command, lead_state = apply_lead_filter(prepared.lead, state.lead, signals.force_measured + observed)
         return command, DeadZoneObserverState(lead_state, withheld, observed, line)
 
     def noise_amplification(self, gains, constants):
         # The observed force does not depend on the force readings.
-        return lead_amplification(lead_filter(gains, constants))
+        return lead_amplification(build_lead_filter(gains, constants))
 
 
 COMPENSATOR = DeadZoneObserver()

@@ -23,9 +23,15 @@ from jaxhil.laws.impulse_ledger.onset_detection.rig import LEVEL, SETTLING
 from jaxhil.laws.impulse_ledger.onset_detection.simulation import FreeFlight
 from jaxhil.laws.impulse_ledger.reference_trajectory import simulation as reference_trajectory
 from jaxhil.laws.impulse_ledger.reference_trajectory.simulation import Reference
-from jaxhil.laws.shared import estimates
-from jaxhil.laws.shared.delay_line import Delay, DelayLine, delayed, empty, split
-from jaxhil.laws.simulation_base import Compensator, Constants, Gain, Gains, rig_gain
+from jaxhil.laws.shared import nominal_values
+from jaxhil.laws.shared.delay_line import (
+    DelayInPeriods,
+    DelayLine,
+    empty_delay_line,
+    read_delayed,
+    split_delay,
+)
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, rig_gain
 
 USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter where the mechanism has less
 VELOCITY_GAIN = 105.0  # 1/s
@@ -46,10 +52,12 @@ GAINS: tuple[Gain, ...] = (
         "equivalent_mass", lambda m: 10 * m.bodies.mass, lambda m: m.bodies.mass,
         lambda m: 0.1 * m.bodies.mass,
     ),
-    _from_file("identification_delay", lambda m: 2 * estimates.force_delay(m) + 0.02, estimates.force_delay),
+    _from_file(
+        "identification_delay", lambda m: 2 * nominal_values.force_delay(m) + 0.02, nominal_values.force_delay
+    ),
     _from_file("delay_spread", lambda m: rig.LARGEST_DELAY_SPREAD, specified.delay_spread),
     _from_file(
-        "force_noise", lambda m: m.rig.force_sensor.noise_std + estimates.peak_force(m),
+        "force_noise", lambda m: m.rig.force_sensor.noise_std + nominal_values.peak_force(m),
         lambda m: m.rig.force_sensor.noise_std,
     ),
     _prior("force_noise_floor", 2e-3, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
@@ -107,8 +115,8 @@ class Prepared(NamedTuple):
     """Gains and constants, computed once per run."""
 
     gains: Gains  # of the batch shape
-    constants: Constants
-    delay: Delay  # of the delay line
+    constants: KnownConstants
+    delay: DelayInPeriods  # of the delay line
     share: Float[Array, "*batch"]  # weight of the previous sample, for the rest of the delay [1]
 
 
@@ -125,9 +133,9 @@ class ImpulseLedger(Compensator):
 
     name: ClassVar[str] = "impulse_ledger"
     knows: ClassVar[tuple[str, ...]] = (
-        estimates.EQUIVALENT_MASS,
-        estimates.FORCE_DELAY,
-        estimates.FORCE_NOISE,
+        nominal_values.EQUIVALENT_MASS,
+        nominal_values.FORCE_DELAY,
+        nominal_values.FORCE_NOISE,
     )
     anticipates: ClassVar[bool] = True
     estimates_delay: ClassVar[bool] = True
@@ -139,7 +147,7 @@ class ImpulseLedger(Compensator):
         full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
         delay = full["identification_delay"]
         whole = delay > period
-        line = split(jnp.where(whole, delay - period, 0), period)
+        line = split_delay(jnp.where(whole, delay - period, 0), period)
         return Prepared(full, constants, line, jnp.where(whole, 1, delay / period))
 
     def init(self, gains, constants, ring):
@@ -147,7 +155,7 @@ class ImpulseLedger(Compensator):
         prior = contact_model.prior(zeros, tuple([zeros] * len(rig.SPREADS)), zeros)
         estimate = contact_model.begin(*prior)
         return LedgerState(
-            line=empty(ring, zeros),
+            line=empty_delay_line(ring, zeros),
             aligned=Aligned(zeros, zeros),
             flight=FreeFlight(*[zeros] * len(FreeFlight._fields)),
             in_contact=zeros > 0,
@@ -167,7 +175,7 @@ class ImpulseLedger(Compensator):
 
     def step(self, prepared, state, signals, tick):
         gains, (period, clearance) = prepared.gains, prepared.constants
-        newest, line = delayed(prepared.delay, state.line, signals, tick)
+        newest, line = read_delayed(prepared.delay, state.line, signals, tick)
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
         reading = Reading(signals.force_measured, position - state.delay * velocity, velocity)
         begins = signals.age == 0

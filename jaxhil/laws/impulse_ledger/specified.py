@@ -3,7 +3,7 @@
 import math
 
 from jaxhil.laws.impulse_ledger.rig import LARGEST_DELAY_SPREAD
-from jaxhil.laws.shared.estimates import typical_stiffness
+from jaxhil.laws.shared.nominal_values import typical_stiffness
 from jaxhil.mechanism.structs import Mechanism, value_at
 
 

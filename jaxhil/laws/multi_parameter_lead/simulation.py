@@ -15,7 +15,8 @@ from typing import ClassVar
 
 from jaxhil.errors import InputError
 from jaxhil.laws.phase_lead.simulation import PhaseLead
-from jaxhil.laws.shared.estimates import (
+from jaxhil.laws.shared.lead_filter import LEAD_FILTER, LeadFilter
+from jaxhil.laws.shared.nominal_values import (
     CONTACT_FREQUENCY,
     FORCE_DELAY,
     SIMULATOR_LAG,
@@ -23,8 +24,7 @@ from jaxhil.laws.shared.estimates import (
     force_delay,
     simulator_lag,
 )
-from jaxhil.laws.shared.lead_filter import LEAD_FILTER, LeadFilter
-from jaxhil.laws.simulation_base import Constants, Gain, Gains, rig_gain
+from jaxhil.laws.simulation_base import Gain, Gains, KnownConstants, rig_gain
 from jaxhil.mechanism.structs import Mechanism
 
 
@@ -47,7 +47,7 @@ def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[
         ("restitution", restitution, 0.0),
     ):
         if not least < value < math.inf:
-            raise InputError(f"pole_placement: {name}: found {value!r}, allowed finite numbers > {least!r}")
+            raise InputError(f"pole_placement: {name}: found {value!r}, expected finite numbers > {least!r}")
     decrement = -math.log(restitution)
     ratio = decrement / math.hypot(math.pi, decrement)
     root = frequency * complex(-ratio, math.sqrt(1 - ratio**2))
@@ -56,12 +56,12 @@ def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[
     return wanted.real - rate * root.real, rate
 
 
-def _nominal(mechanism: Mechanism) -> tuple[float, float]:
+def _nominal_gains(mechanism: Mechanism) -> tuple[float, float]:
     delay = force_delay(mechanism) + simulator_lag(mechanism)
     return pole_placement(contact_frequency(mechanism), delay, 1.0)
 
 
-def multi_parameter_filter(gains: Gains, constants: Constants) -> LeadFilter:
+def multi_parameter_filter(gains: Gains, constants: KnownConstants) -> LeadFilter:
     """Return the coefficients of a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
@@ -84,16 +84,16 @@ class MultiParameterLead(PhaseLead):
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "force_gain",
-            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[0]),
+            lower=lambda mechanism: min(0.0, 2 * _nominal_gains(mechanism)[0]),
             upper=lambda mechanism: 2.0,
-            nominal=lambda mechanism: _nominal(mechanism)[0],
+            nominal=lambda mechanism: _nominal_gains(mechanism)[0],
             neutral=1.0,
         ),
         rig_gain(
             "force_rate_gain",
-            lower=lambda mechanism: min(0.0, 2 * _nominal(mechanism)[1]),
-            upper=lambda mechanism: 2 * max(0.0, _nominal(mechanism)[1]) + 0.02,
-            nominal=lambda mechanism: _nominal(mechanism)[1],
+            lower=lambda mechanism: min(0.0, 2 * _nominal_gains(mechanism)[1]),
+            upper=lambda mechanism: 2 * max(0.0, _nominal_gains(mechanism)[1]) + 0.02,
+            nominal=lambda mechanism: _nominal_gains(mechanism)[1],
             neutral=0.0,
         ),
         LEAD_FILTER,

@@ -4,15 +4,15 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from jaxhil.laws.shared.estimates import FORCE_DELAY
 from jaxhil.laws.shared.lead_filter import (
     LEAD_FILTER,
     PHASE_LEAD,
     LeadState,
-    lead,
+    apply_lead_filter,
+    build_lead_filter,
     lead_amplification,
-    lead_filter,
 )
+from jaxhil.laws.shared.nominal_values import FORCE_DELAY
 from jaxhil.laws.simulation_base import Compensator, Gain
 
 
@@ -26,7 +26,7 @@ class PhaseLead(Compensator):
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER)
 
     def prepare(self, gains, constants):
-        return lead_filter(gains, constants)
+        return build_lead_filter(gains, constants)
 
     def noise_amplification(self, gains, constants):
         return lead_amplification(self.prepare(gains, constants))
@@ -36,7 +36,7 @@ class PhaseLead(Compensator):
         return LeadState(zeros, zeros)
 
     def step(self, prepared, state, signals, tick):
-        return lead(prepared, state, signals.force_measured)
+        return apply_lead_filter(prepared, state, signals.force_measured)
 
 
 COMPENSATOR = PhaseLead()

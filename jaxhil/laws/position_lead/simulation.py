@@ -13,7 +13,7 @@ delay plus the waiting time of the command. The delay of the force measurement i
 
 from typing import ClassVar
 
-from jaxhil.laws.shared.estimates import SIMULATOR_DYNAMICS, simulator_inverse
+from jaxhil.laws.shared.nominal_values import SIMULATOR_DYNAMICS, simulator_inverse
 from jaxhil.laws.simulation_base import Compensator, Gain, rig_gain
 
 

@@ -20,15 +20,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import deflection
-from jaxhil.laws.shared.delay_line import Delay, DelayLine, delayed, empty, split
-from jaxhil.laws.shared.estimates import (
-    FORCE_DELAY,
-    critical_damping,
-    force_delay,
-    is_damped,
-    noise_level,
-    peak_force,
-    typical_stiffness,
+from jaxhil.laws.shared.delay_line import (
+    DelayInPeriods,
+    DelayLine,
+    empty_delay_line,
+    read_delayed,
+    split_delay,
 )
 from jaxhil.laws.shared.gates.simulation import gate, share_beyond
 from jaxhil.laws.shared.lead_filter import (
@@ -36,12 +33,21 @@ from jaxhil.laws.shared.lead_filter import (
     PHASE_LEAD,
     LeadFilter,
     LeadState,
-    lead,
+    apply_lead_filter,
+    build_lead_filter,
     lead_amplification,
-    lead_filter,
 )
-from jaxhil.laws.shared.recursive_least_squares.simulation import Identified, update
-from jaxhil.laws.simulation_base import Compensator, Gain, Gains, cleared, rig_gain
+from jaxhil.laws.shared.nominal_values import (
+    FORCE_DELAY,
+    critical_damping,
+    force_delay,
+    is_damped,
+    noise_bound,
+    peak_force,
+    typical_stiffness,
+)
+from jaxhil.laws.shared.recursive_least_squares.simulation import ContactEstimate, update_estimate
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, rig_gain
 
 
 def _stiffness_covariance(mechanism) -> float:
@@ -54,7 +60,7 @@ def _damping_covariance(mechanism) -> float:
     return 1 / mechanism.approach.velocity**2
 
 
-def _never(mechanism) -> bool:
+def _never_tuned(mechanism) -> bool:
     """Return False: tuning this gain would reduce the error by less than a fifth and hinder the search."""
     return False
 
@@ -69,7 +75,7 @@ class ResponseErrorState(NamedTuple):
     aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
     contact_share: Float[Array, "*batch"]  # share of the last period in contact [1]
     force_share: Float[Array, "*batch"]  # share of the last period with a force above the threshold [1]
-    identified: Identified  # stiffness and damping
+    identified: ContactEstimate  # stiffness and damping
     line: DelayLine  # measured positions
 
 
@@ -83,7 +89,7 @@ class Prepared(NamedTuple):
     # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
     rate_pole: Float[Array, "*batch"]
     rate_gain: Float[Array, "*batch"]  # of that filter [1/s]
-    delay: Delay  # of the positions, to align them with the force
+    delay: DelayInPeriods  # of the positions, to align them with the force
 
 
 class ResponseError(Compensator):
@@ -94,7 +100,7 @@ class ResponseError(Compensator):
     waits_for_contact: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = (
         PHASE_LEAD,
-        LEAD_FILTER._replace(tuned=_never),
+        LEAD_FILTER._replace(tuned=_never_tuned),
         rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
         rig_gain(
             "response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0,
@@ -102,27 +108,27 @@ class ResponseError(Compensator):
         ),
         rig_gain(
             "initial_stiffness", lambda m: 0.0, lambda m: 5 * typical_stiffness(m),
-            lambda m: 0.0, tuned=_never,
+            lambda m: 0.0, tuned=_never_tuned,
         ),
-        rig_gain("initial_damping", lambda m: 0.0, critical_damping, lambda m: 0.0, tuned=_never),
+        rig_gain("initial_damping", lambda m: 0.0, critical_damping, lambda m: 0.0, tuned=_never_tuned),
         rig_gain(
             "stiffness_covariance", lambda m: 1e-3 * _stiffness_covariance(m),
             lambda m: 1e1 * _stiffness_covariance(m), _stiffness_covariance, logarithmic=True,
         ),
         rig_gain(
             "damping_covariance", lambda m: 0.0, lambda m: 10 * _damping_covariance(m),
-            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=_never,
+            lambda m: _damping_covariance(m) if is_damped(m) else 0.0, tuned=_never_tuned,
         ),
-        rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
+        rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never_tuned),
         rig_gain(
-            "contact_threshold", lambda m: 0.0, lambda m: max(peak_force(m), noise_level(m)),
-            lambda m: max(0.01 * peak_force(m), noise_level(m)), tuned=_never,
+            "contact_threshold", lambda m: 0.0, lambda m: max(peak_force(m), noise_bound(m)),
+            lambda m: max(0.01 * peak_force(m), noise_bound(m)), tuned=_never_tuned,
         ),
         rig_gain("identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02, force_delay),
         rig_gain(
             "velocity_filter", lambda m: 0.5 * m.rig.control_period,
             lambda m: 20 * m.rig.control_period, lambda m: 2 * m.rig.control_period,
-            logarithmic=True, tuned=_never,
+            logarithmic=True, tuned=_never_tuned,
         ),
     )  # fmt: skip
 
@@ -134,29 +140,29 @@ class ResponseError(Compensator):
             gains,
             period,
             constants.clearance,
-            lead_filter(gains, constants),
+            build_lead_filter(gains, constants),
             (smoothing - period) * scale,
             2 * scale,
-            split(gains["identification_delay"], period),
+            split_delay(gains["identification_delay"], period),
         )
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        identified = Identified(
+        identified = ContactEstimate(
             zeros + gains["initial_stiffness"],
             zeros + gains["initial_damping"],
             zeros,
             zeros + gains["stiffness_covariance"],
             zeros + gains["damping_covariance"],
         )
-        led, line = LeadState(zeros, zeros), empty(ring, zeros)
+        led, line = LeadState(zeros, zeros), empty_delay_line(ring, zeros)
         return ResponseErrorState(led, zeros, zeros, zeros, zeros, zeros, zeros, identified, line)
 
     def restart(self, gains, state, begins, fresh):
         old = state.identified
         fresh = begins & fresh
         return state._replace(
-            lead=cleared(state.lead, begins),
+            lead=clear_lanes(state.lead, begins),
             contact_share=jnp.where(begins, 0, state.contact_share),
             force_share=jnp.where(begins, 0, state.force_share),
             identified=old._replace(
@@ -173,7 +179,7 @@ class ResponseError(Compensator):
         begins = signals.age == 0
         stride = period * signals.velocity_desired
         before = jnp.where(begins, measured - stride, state.position)
-        aligned, line = delayed(prepared.delay, state.line, signals, tick)
+        aligned, line = read_delayed(prepared.delay, state.line, signals, tick)
         aligned_before = jnp.where(begins, aligned - stride, state.aligned)
 
         def rate(position, position_before, velocity_before):
@@ -191,7 +197,7 @@ class ResponseError(Compensator):
         size, size_before = jnp.abs(force), jnp.abs(state.lead.force)
         excess, excess_before = (jnp.where(f > threshold, f - threshold, 0) for f in (size, size_before))
         force_share = share_beyond(excess, excess_before, size - size_before)
-        identified = update(
+        identified = update_estimate(
             state.identified,
             gains["forgetting"],
             (gains["stiffness_covariance"], gains["damping_covariance"]),
@@ -200,7 +206,7 @@ class ResponseError(Compensator):
             force,
             contact_gate * gate(force_share, state.force_share),
         )
-        led, lead_state = lead(prepared.lead, state.lead, force)
+        led, lead_state = apply_lead_filter(prepared.lead, state.lead, force)
         response = gains["response_error"] * identified.stiffness * (
             signals.position_desired - measured
         ) + gains["response_error_damping"] * identified.damping * (signals.velocity_desired - velocity)
@@ -221,7 +227,7 @@ class ResponseError(Compensator):
         # This is the lead filter's share alone. The noise of k_hat is smaller in F_c by (x_d - x_a)/depth and
         # by the square root of the number of samples that the identification remembers. Only at the beginning
         # of a contact, when k_hat depends on a few shallow samples, is F_c noisier.
-        return lead_amplification(lead_filter(gains, constants))
+        return lead_amplification(build_lead_filter(gains, constants))
 
     def identified(self, state):
         return state.identified.stiffness, state.identified.damping

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxhil.laws.shared.ring_buffer import look_back, write
+from jaxhil.laws.shared.ring_buffer import look_back, write_sample
 from jaxhil.laws.simulation_base import Signals
 
 
-class Delay(NamedTuple):
+class DelayInPeriods(NamedTuple):
     """Delay in control periods."""
 
     lookback: Int[Array, "*batch"]  # whole periods
@@ -26,25 +26,27 @@ class DelayLine(NamedTuple):
     ring: Float[Array, "samples *batch"]  # readings [m]
 
 
-def split(delay: Array, period: Array) -> Delay:
+def split_delay(delay: Array, period: Array) -> DelayInPeriods:
     """Convert a delay [s] >= 0 to periods, with a tolerance of 1e-9 below a whole number."""
     periods = delay / period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
-    return Delay(whole.astype(jnp.int32), periods - whole, period)
+    return DelayInPeriods(whole.astype(jnp.int32), periods - whole, period)
 
 
-def empty(ring: int, zeros: Float[Array, "*batch"]) -> DelayLine:
+def empty_delay_line(ring: int, zeros: Float[Array, "*batch"]) -> DelayLine:
     """Return a line of `ring` samples, a power of two; no sample is read before it is written."""
     return DelayLine(zeros, zeros, jnp.zeros((ring, *zeros.shape), zeros.dtype))
 
 
-def delayed(delay: Delay, line: DelayLine, signals: Signals, tick: Array) -> tuple[Array, DelayLine]:
+def read_delayed(
+    delay: DelayInPeriods, line: DelayLine, signals: Signals, tick: Array
+) -> tuple[Array, DelayLine]:
     """Return the measured position [m] one delay ago, and the line with this tick's reading."""
     measured, age = signals.position_measured, signals.age
     begins = age == 0
     first_position = jnp.where(begins, measured, line.first_position)
     first_velocity = jnp.where(begins, signals.velocity_desired, line.first_velocity)
-    ring = write(line.ring, tick, measured)
+    ring = write_sample(line.ring, tick, measured)
     newer, older = look_back(ring, tick, delay.lookback), look_back(ring, tick, delay.lookback + 1)
     recalled = newer - delay.fraction * (newer - older)
     ticks = (age - delay.lookback).astype(measured.dtype) - delay.fraction

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.laws.shared.estimates import force_delay
-from jaxhil.laws.simulation_base import Constants, Gains, rig_gain
+from jaxhil.laws.shared.nominal_values import force_delay
+from jaxhil.laws.simulation_base import Gains, KnownConstants, rig_gain
 
 PHASE_LEAD = rig_gain(
     "phase_lead",
@@ -43,7 +43,7 @@ class LeadFilter(NamedTuple):
     before: Array  # of the last force [1]
 
 
-def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
+def build_lead_filter(gains: Gains, constants: KnownConstants) -> LeadFilter:
     """Return the coefficients for T_1 = phase_lead + lead_filter and T_2 = lead_filter."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
@@ -52,7 +52,7 @@ def lead_filter(gains: Gains, constants: Constants) -> LeadFilter:
     return LeadFilter((slow - period) * scale, (fast + period) * scale, (period - fast) * scale)
 
 
-def lead(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
+def apply_lead_filter(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
     """Return the filter's output [N] for the force [N] of a tick, and its state."""
     output = filter_.pole * state.output + filter_.now * force + filter_.before * state.force
     return output, LeadState(force, output)

@@ -39,14 +39,14 @@ def look_back(
     return lax.cond(jnp.all(ticks == first), chosen(row), chosen(lane_by_lane), ring)
 
 
-def write(
+def write_sample(
     ring: Float[Array, "samples *batch"], tick: Int[Array, ""], value: Float[Array, "*batch"]
 ) -> Float[Array, "samples *batch"]:
     """Store `value` as the sample of `tick`."""
     return lax.dynamic_update_index_in_dim(ring, value, tick & (ring.shape[0] - 1), 0)
 
 
-def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
+def write_samples(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
     """Store each leaf of `values` in the same leaf of `rings`, one after the other.
 
     The compiler would merge independent writes into one loop over the whole rings.
@@ -57,7 +57,7 @@ def write_in_turn(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
         if written:
             oldest = (tick + 1) & (ring.shape[0] - 1)
             value = depend_on(value, lax.dynamic_index_in_dim(written[-1], oldest, 0, keepdims=False))
-        written.append(write(ring, tick, value))
+        written.append(write_sample(ring, tick, value))
     return jax.tree.unflatten(structure, written)
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from jaxhil.contact.laws import deflection
-from jaxhil.laws.shared.estimates import (
+from jaxhil.laws.shared.nominal_values import (
     CONTACT_FREQUENCY,
     FORCE_DELAY,
     SIMULATOR_LAG,
@@ -24,7 +24,7 @@ from jaxhil.laws.shared.estimates import (
     simulator_lag,
     typical_stiffness,
 )
-from jaxhil.laws.simulation_base import Compensator, Constants, Gain, Gains, rig_gain
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, rig_gain
 from jaxhil.mechanism.structs import Mechanism
 
 
@@ -73,7 +73,7 @@ class VirtualContact(Compensator):
         ),
     )  # fmt: skip
 
-    def prepare(self, gains: Gains, constants: Constants):
+    def prepare(self, gains: Gains, constants: KnownConstants):
         return gains, constants.clearance
 
     def step(self, prepared, state, signals, tick):

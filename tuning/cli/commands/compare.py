@@ -4,15 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxhil.files import write_whole, writing
+from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
 from jaxhil.rig import digest
-from jaxhil.simulation.environment import prepare, usable_cores
+from jaxhil.simulation.jax_environment import count_usable_cores, prepare_jax
 from tuning import terminal
+from tuning.api.compare import build_board, check_distinct_names, compare_each
 from tuning.cli.commands import checks
-from tuning.cli.commands.resuming import pieces_in, say_of_pieces
+from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
 from tuning.cli.options import Compare
-from tuning.front_door.compare import board, check_names, compare_each
 
 PLOTS = ("errors.png", "honesty.png")
 
@@ -26,21 +26,21 @@ def run(options: Compare) -> int:
     options.check()
     loaded = _load(options)
     folder = Path(options.output)
-    checks.output(folder)
+    checks.prepare_output_folder(folder)
     names = [entry.mechanism.name for entry in loaded]
-    checks.own_results(folder / "compare.json", "mechanisms", PLOTS, names)
-    prepare()
-    from tuning.benchmark.study import Failed
-    from tuning.transparency.pushes import PUSHES
+    checks.check_earlier_results(folder / "compare.json", "mechanisms", PLOTS, names)
+    prepare_jax()
+    from tuning.benchmark.comparison import LawFailure
+    from tuning.transparency.pushes import PUSH_DEFINITION
 
     laws = options.laws
     results: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
-    pieces = pieces_in(options.output, options.resume)
-    with terminal.progress(len(names) * len(laws), "results") as bar:
+    pieces = open_checkpoints(options.output, options.resume)
+    with terminal.show_progress(len(names) * len(laws), "results") as bar:
         try:
-            for result in compare_each(loaded, options, usable_cores(), bar, pieces):
-                if isinstance(result, Failed):
+            for result in compare_each(loaded, options, count_usable_cores(), bar, pieces):
+                if isinstance(result, LawFailure):
                     problems.append(f"{result.law}: {result.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
                 else:
@@ -52,24 +52,26 @@ def run(options: Compare) -> int:
     document = {
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "tuned": not options.untuned,
-        "transparency": PUSHES,
-        "mechanisms": [board(entry, options, results[entry.mechanism.name]).document for entry in loaded],
-        "timings": {"microseconds_per_tick": _costs(loaded[0], ordered)},
+        "transparency": PUSH_DEFINITION,
+        "mechanisms": [
+            build_board(entry, options, results[entry.mechanism.name]).document for entry in loaded
+        ],
+        "timings": {"microseconds_per_tick": _measure_tick_times(loaded[0], ordered)},
         "problems": problems,
         "interrupted": interrupted,
     }
-    document = terminal.finite(document)
+    document = terminal.to_json_data(document)
     document["sha256"] = digest(document)
     path = folder / "compare.json"
-    with writing(path):
-        write_whole(path, terminal.as_json(document).encode("ascii"))
+    with report_write_errors(path):
+        write_atomically(path, terminal.format_json(document).encode("ascii"))
     if finished_names and not interrupted:
         _draw(options, finished_names, ordered)
     if options.json:
         terminal.emit_json(document)
     else:
         _print(options, finished_names, ordered, document)
-    say_of_pieces(pieces)
+    warn_about_checkpoints(pieces)
     if interrupted:
         finished = sum(len(finished_laws) for finished_laws in ordered.values())
         progress = f"{finished} of {len(names) * len(laws)} results finished and kept"
@@ -82,20 +84,20 @@ def _load(options: Compare) -> list[LoadedMechanism]:
     """Load the mechanisms of the files and, with `--suites`, the standard suites."""
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
     loaded = [load(file, options.overrides, options.unset) for file in files or [None]]
-    check_names(loaded)
+    check_distinct_names(loaded)
     return loaded
 
 
-def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
+def _measure_tick_times(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
     """Return the time per tick [us] of every compensator with the first mechanism's gains."""
-    from tuning.benchmark.cost import microseconds_per_tick
-    from tuning.benchmark.study import LITERATURE
+    from tuning.benchmark.comparison import LITERATURE_GAINS
+    from tuning.benchmark.computing_time import measure_tick_time
 
     mechanism = loaded.mechanism
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     return {
-        result.law: microseconds_per_tick(
-            result.law, result.gains[LITERATURE], period, clearance, mechanism.approach.velocity
+        result.law: measure_tick_time(
+            result.law, result.gains[LITERATURE_GAINS], period, clearance, mechanism.approach.velocity
         )
         for result in ordered[mechanism.name]
     }
@@ -103,12 +105,12 @@ def _costs(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dic
 
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
     """Draw the plots of errors and transparency."""
-    from jaxhil.simulation.contact_plot import save
-    from tuning.plots.comparison import errors_plot, transparency_plot
+    from jaxhil.simulation.contact_plot import save_figure
+    from tuning.plots.comparison import plot_errors, plot_transparency
 
-    figures = errors_plot(names, ordered, options.limit), transparency_plot(names, ordered)
+    figures = plot_errors(names, ordered, options.limit), plot_transparency(names, ordered)
     for name, figure in zip(PLOTS, figures, strict=True):
-        save(figure, Path(options.output) / name)
+        save_figure(figure, Path(options.output) / name)
 
 
 def _print(
@@ -116,27 +118,28 @@ def _print(
 ) -> None:
     """Print the tables of all mechanisms, the costs, and the meaning of the columns."""
     from jaxhil.laws.compensators import COMPENSATORS
-    from jaxhil.simulation.contact_bounds import LONGEST, MOST_FORCE, SHORTEST
-    from tuning.benchmark.tables import leaderboard, least, mechanism_table
+    from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
+    from tuning.benchmark.tables import build_leaderboard, build_mechanism_table, describe_least_errors
 
     for name in names:
-        terminal.emit(mechanism_table(name, ordered[name]))
+        terminal.emit(build_mechanism_table(name, ordered[name]))
     if len(names) > 1:
-        terminal.emit(leaderboard(names, ordered), wrap=False)
-    if text := least(names, ordered):
+        terminal.emit(build_leaderboard(names, ordered), wrap=False)
+    if text := describe_least_errors(names, ordered):
         terminal.emit(text)
     costs = document["timings"]["microseconds_per_tick"]
     rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
     terminal.emit(
-        terminal.table(
+        terminal.build_table(
             "What a law must know beforehand, and what it costs",
             ["law", "known beforehand", "Python [us per tick]"],
             rows,
             texts=(0, 1),
         ),
         f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, that do not end, or",
-        f"whose real contact is beyond {MOST_FORCE:g} times the ideal peak force or {SHORTEST:g} to "
-        f"{LONGEST:g} times the ideal duration.",
+        f"whose real contact is beyond {MAX_PEAK_FORCE_RATIO:g} times the ideal peak force or "
+        f"{MIN_DURATION_RATIO:g} to "
+        f"{MAX_DURATION_RATIO:g} times the ideal duration.",
         f"early, late: transparency to {document['transparency']} (1: perfect, 0: blind).",
         "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
         "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",

@@ -5,11 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.rig.limits import LIMITS
 from tuning import terminal
+from tuning.api.export import ExportOptions, allowed_values, export
 from tuning.cli.options_rig import Export
-from tuning.front_door.export import ExportOptions, allowed_values, export
 
 
 def run(options: Export) -> int:
@@ -23,7 +23,7 @@ def run(options: Export) -> int:
         options.output,
         sweep=options.sweep,
         formats=formats or None,
-        limits=_replaced(options.limits),
+        limits=_parse_limits(options.limits),
         progress=True,
         **{field.name: getattr(options, field.name) for field in fields(ExportOptions)},
     )
@@ -34,44 +34,46 @@ def run(options: Export) -> int:
     return 0 if result.good else 1
 
 
-def _replaced(settings: tuple[str, ...]) -> dict[str, float | None]:
+def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
     """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
     replaced: dict[str, float | None] = {}
     for words in settings:
         name, _, text = words.partition("=")
         if name not in LIMITS:
             raise InputError(
-                f"--set: found {shown(words)}, allowed LIMIT=VALUE, LIMIT one of {', '.join(LIMITS)}"
+                f"--set: found {format_value(words)}, expected LIMIT=VALUE, LIMIT one of {', '.join(LIMITS)}"
             )
         try:
             value = None if text == "none" else float(text)
         except ValueError:
             value = math.nan
         if value is not None and not LIMITS[name].admits(value):
-            raise InputError(f"--set: found {shown(words)}, allowed {allowed_values(name)}")
+            raise InputError(f"--set: found {format_value(words)}, expected {allowed_values(name)}")
         replaced[name] = value
     return replaced
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
     """Print the limits, the alarm rates, the files and the verdict."""
-    from tuning.bundle.summary import alarm_rates, is_shown
+    from tuning.bundle.summary import describe_alarm_rates, is_user_limit
 
     tables = []
     if document["limits"]:
         rows = [
-            (name, terminal.figure(limit["value"], 6), limit["unit"])
+            (name, terminal.format_number(limit["value"], 6), limit["unit"])
             for name, limit in document["limits"].items()
-            if is_shown(name)
+            if is_user_limit(name)
         ]
-        tables.append(terminal.table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2)))
+        tables.append(
+            terminal.build_table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2))
+        )
     lines = [
         f"{'draw ' + str(number) if number else 'The nominal run'}, {end}: not compared from there on."
         for number, end in enumerate(document["ended"])
         if end
     ]
     if document["rates"]:
-        lines += [f"Watchdog: {text}" for text in alarm_rates(document["rates"])]
+        lines += [f"Watchdog: {text}" for text in describe_alarm_rates(document["rates"])]
     if document["bundle"]:
         lines += [
             f"wrote {len(sizes)} files, {sum(sizes.values()) / 1e6:.2g} MB, to {document['bundle']}",

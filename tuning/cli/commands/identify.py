@@ -5,51 +5,53 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import write_whole, writing
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.mechanism.conversion import KeyProblem
-from jaxhil.mechanism.file import from_builtins, load
+from jaxhil.mechanism.file import from_plain_data, load
 from jaxhil.mechanism.overrides import parse_override
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.rig import digest
-from jaxhil.simulation.sources import versions
+from jaxhil.simulation.source_fingerprint import dependency_versions
 from tuning import terminal
+from tuning.api import arguments
 from tuning.cli.commands import checks, identify_design
-from tuning.cli.commands.resuming import pieces_in, say_of_pieces
-from tuning.cli.options_identify import Identify
-from tuning.front_door import arguments
-from tuning.identification.records import UNNAMED, Campaign
+from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
+from tuning.cli.options_identify import IdentifyOptions
+from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
 
 SCHEMA = "jaxhil/identification/1"
-MOST_ORDER = 4
-MECHANISM, DOCUMENT = "mechanism.toml", "identification.json"
+MAX_ORDER = 4
+MECHANISM_FILE, DOCUMENT_FILE = "mechanism.toml", "identification.json"
 PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
 
-def run(options: Identify) -> int:
+def run(options: IdentifyOptions) -> int:
     """Identify, write and report; or only draft a mapping, design commands or check a mechanism.
 
     Return 1 if the model does not explain the rig, else 0.
     """
     logs = [Path(log) for log in options.logs]
     if options.guess:
-        return _guess(options, logs)
+        return _print_draft_mapping(options, logs)
     if options.design:
         return identify_design.run(options)
     _check_options(options)
     if options.check:
-        return _check(options, logs)
-    fixed, order = _fixed(options), _order(options)
+        return _check_mechanism(options, logs)
+    fixed, order = _parse_fixed_values(options), _parse_order(options)
     prior = None if options.prior is None else load(options.prior).mechanism
     folder = Path(options.output)
-    checks.output(folder)
-    name = UNNAMED if prior is None else prior.name
-    earlier = checks.own_results(folder / DOCUMENT, "estimates", (MECHANISM, *PLOTS), [name])
-    from tuning.identification.bootstrap import FITS
-    from tuning.identification.estimate import STAGES, Options, identify
+    checks.prepare_output_folder(folder)
+    name = DEFAULT_MECHANISM_NAME if prior is None else prior.name
+    earlier = checks.check_earlier_results(
+        folder / DOCUMENT_FILE, "estimates", (MECHANISM_FILE, *PLOTS), [name]
+    )
+    from tuning.identification.bootstrap import FITS_PER_CHUNK
+    from tuning.identification.identify import STAGE_COUNT, IdentificationOptions, identify
 
-    pieces = pieces_in(options.output, options.resume)
-    settings = Options(
+    pieces = open_checkpoints(options.output, options.resume)
+    settings = IdentificationOptions(
         order=order,
         law=options.law,
         fixed=fixed,
@@ -61,19 +63,19 @@ def run(options: Identify) -> int:
         scheduler=options.scheduler,
         kept=pieces,
     )
-    with terminal.stages(STAGES + 2 + -(-options.bootstrap // FITS)) as stages:
+    with terminal.show_stages(STAGE_COUNT + 2 + -(-options.bootstrap // FITS_PER_CHUNK)) as stages:
         stages.turn_to("reading the logs")
-        campaign = _of_stage(read_logs(logs, options.map, prior), options.stage)
+        campaign = _select_stage(read_logs(logs, options.map, prior), options.stage)
         if prior is None:
-            _refuse_other_logs(folder / DOCUMENT, earlier, campaign)
+            _refuse_other_logs(folder / DOCUMENT_FILE, earlier, campaign)
         result = identify(campaign, prior, settings, stages.turn_to)
-        document = _document(options, campaign, prior, result)
+        document = _build_document(options, campaign, prior, result)
         if result.mechanism is not None:
             _write(result.mechanism, result.verdict, document, folder)
             stages.turn_to("drawing")
             _draw(result, document, folder)
         pieces.remove()
-    say_of_pieces(pieces)
+    warn_about_checkpoints(pieces)
     terminal.warn([*campaign.notes, *result.notes])
     if options.json:
         terminal.emit_json(document)
@@ -82,18 +84,18 @@ def run(options: Identify) -> int:
     return 0 if result.good else 1
 
 
-def _check_options(options: Identify) -> None:
+def _check_options(options: IdentifyOptions) -> None:
     """Check the values and combinations of options. Raise `InputError`."""
-    arguments.limit(options.limit)
-    arguments.integers(0, seed=options.seed, bootstrap=options.bootstrap)
+    arguments.check_limit(options.limit)
+    arguments.check_integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
-        raise InputError(f"--hold-out: found {options.hold_out}, allowed a share from 0 to below 1")
+        raise InputError(f"--hold-out: found {options.hold_out}, expected a share from 0 to below 1")
     if options.bayes and options.prior is None:
-        raise InputError("--bayes: found no prior, allowed --prior with a normal entry in [uncertainty]")
+        raise InputError("--bayes: found no prior, expected --prior with a normal entry in [uncertainty]")
     for name in ("scheduler", "resume"):
         if getattr(options, name) and not options.bootstrap:
             raise InputError(
-                f"--{name}: found no --bootstrap, allowed beside one: its fits are what takes long"
+                f"--{name}: found no --bootstrap, expected beside one: its fits are what takes long"
             )
 
 
@@ -104,11 +106,11 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
     """
     from tuning.identification.mechanism_file import to_toml
 
-    from_builtins(mechanism, "identified mechanism")
-    with writing(folder / DOCUMENT):
-        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
-    with writing(folder / MECHANISM):
-        write_whole(folder / MECHANISM, to_toml(mechanism, verdict).encode())
+    from_plain_data(mechanism, "identified mechanism")
+    with report_write_errors(folder / DOCUMENT_FILE):
+        write_atomically(folder / DOCUMENT_FILE, terminal.format_json(document).encode("ascii"))
+    with report_write_errors(folder / MECHANISM_FILE):
+        write_atomically(folder / MECHANISM_FILE, to_toml(mechanism, verdict).encode())
 
 
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
@@ -121,16 +123,17 @@ def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) 
         return
     log, others = next(iter(sources)), f" and {len(sources) - 1} more" if len(sources) > 1 else ""
     raise InputError(
-        f"{one_line(str(path))}: found results of other logs ({shown(log)}{others}), expected those of the "
+        f"{to_one_line(str(path))}: found results of other logs ({format_value(log)}{others}), expected "
+        "those of the "
         "same logs, or none: name another folder by --output, or the mechanism by --prior"
     )
 
 
-def _guess(options: Identify, logs: list[Path]) -> int:
+def _print_draft_mapping(options: IdentifyOptions, logs: list[Path]) -> int:
     """Print a draft of the mapping of the logs' columns; return 0."""
-    from tuning.identification.logs.guess import draft
+    from tuning.identification.logs.mapping_draft import draft_mapping
 
-    text = draft(logs)
+    text = draft_mapping(logs)
     if options.json:
         terminal.emit_json({"mapping": text})
     else:
@@ -138,46 +141,46 @@ def _guess(options: Identify, logs: list[Path]) -> int:
     return 0
 
 
-def _check(options: Identify, logs: list[Path]) -> int:
+def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
     """Compare the logs with a mechanism, and print the result; return 1 if it does not explain them."""
     for name in ("order", "law", "fix", "bayes"):
-        if getattr(options, name) != getattr(Identify(), name):
-            raise InputError(f"--check: found --{name} beside it, allowed none: nothing is estimated")
+        if getattr(options, name) != getattr(IdentifyOptions(), name):
+            raise InputError(f"--check: found --{name} beside it, expected none: nothing is estimated")
     path = options.prior
     if path is None:
         if len(logs) < 2:
-            raise InputError("--check: found no mechanism, allowed one after the logs, or --prior")
+            raise InputError("--check: found no mechanism, expected one after the logs, or --prior")
         path = str(logs.pop())
     mechanism = load(path).mechanism
-    from tuning.identification.check import check
+    from tuning.identification.mechanism_check import check_against_mechanism
 
-    with terminal.stages(2) as stages:
+    with terminal.show_stages(2) as stages:
         stages.turn_to("reading the logs")
-        campaign = _of_stage(read_logs(logs, options.map, mechanism), options.stage)
+        campaign = _select_stage(read_logs(logs, options.map, mechanism), options.stage)
         stages.turn_to("setting them against the mechanism")
-        result = check(campaign, mechanism, options.limit)
-    document = _document(options, campaign, mechanism, result)
+        result = check_against_mechanism(campaign, mechanism, options.limit)
+    document = _build_document(options, campaign, mechanism, result)
     terminal.warn(campaign.notes)
     if options.json:
         terminal.emit_json(document)
     else:
         runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
         terminal.emit(
-            _left(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
+            _check_table(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
         )
     return 0 if result.good else 1
 
 
 def _draw(result, document: dict[str, Any], folder: Path) -> None:
     """Draw the plots, and delete those of an earlier run that this run does not draw."""
-    from jaxhil.simulation.contact_plot import save
-    from tuning.plots.identification import draw
+    from jaxhil.simulation.contact_plot import save_figure
+    from tuning.plots.identification import draw_identification
 
-    figures = draw(result, document["estimates"])
+    figures = draw_identification(result, document["estimates"])
     for name in PLOTS:
-        with writing(folder / name):
+        with report_write_errors(folder / name):
             if name in figures:
-                save(figures[name], folder / name)
+                save_figure(figures[name], folder / name)
             else:
                 (folder / name).unlink(missing_ok=True)
 
@@ -195,7 +198,7 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
         raise InputError(f"{error} (--map says what columns mean; --guess drafts one)") from None
 
 
-def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
+def _select_stage(campaign: Campaign, stage: str | None) -> Campaign:
     """Return the campaign with only the runs of one kind and those at rest."""
     if stage is None:
         return campaign
@@ -203,50 +206,54 @@ def _of_stage(campaign: Campaign, stage: str | None) -> Campaign:
     kinds = sorted({run.kind for run in campaign.runs} - {"rest"})
     if stage not in kinds:
         raise InputError(
-            f"--stage: found {shown(stage)}, allowed a kind that the logs have: {', '.join(kinds)}"
+            f"--stage: found {format_value(stage)}, expected a kind that the logs have: {', '.join(kinds)}"
         )
     return replace(campaign, runs=runs)
 
 
-def _order(options: Identify) -> int | None:
+def _parse_order(options: IdentifyOptions) -> int | None:
     """Return the order of the motion simulator, or None for 'auto'. Raise `InputError`."""
     if options.order == "auto":
         return None
-    if not options.order.isdecimal() or int(options.order) > MOST_ORDER:
-        raise InputError(f"--order: found {shown(options.order)}, allowed auto, or 0 to {MOST_ORDER}")
+    if not options.order.isdecimal() or int(options.order) > MAX_ORDER:
+        raise InputError(f"--order: found {format_value(options.order)}, expected auto, or 0 to {MAX_ORDER}")
     return int(options.order)
 
 
-def _fixed(options: Identify) -> dict[str, Any]:
+def _parse_fixed_values(options: IdentifyOptions) -> dict[str, Any]:
     """Return the values that the user fixed, by key. Raise `InputError`."""
     fixed: dict[str, Any] = {}
     for text in options.fix:
         try:
             path, value = parse_override(text)
         except KeyProblem as problem:
-            raise InputError(f"--fix {one_line(text, 60)}: {problem}") from None
-        if not _numbers(value):
+            raise InputError(f"--fix {to_one_line(text, 60)}: {problem}") from None
+        if not _is_number_or_list(value):
             allowed = "a number, or a list of them"
-            raise InputError(f"--fix {one_line(text, 60)}: found {shown(value)}, allowed {allowed}")
+            raise InputError(
+                f"--fix {to_one_line(text, 60)}: found {format_value(value)}, expected {allowed}"
+            )
         fixed[".".join(map(str, path))] = value
     return fixed
 
 
-def _numbers(value: Any) -> bool:
+def _is_number_or_list(value: Any) -> bool:
     """Return whether a value is a finite number or a non-empty list of them."""
     if isinstance(value, list):
-        return bool(value) and all(map(_numbers, value))
+        return bool(value) and all(map(_is_number_or_list, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, result) -> dict[str, Any]:
+def _build_document(
+    options: IdentifyOptions, campaign: Campaign, prior: Mechanism | None, result
+) -> dict[str, Any]:
     """Return the JSON document of an identification or a check."""
     kinds = [run.kind for run in campaign.runs]
     clock = campaign.timing.clock
     content = {
         "schema": SCHEMA,
-        "estimates": [_entry(estimate, prior) for estimate in result.estimates],
-        "combinations": [_entry(estimate, None) for estimate in result.combinations],
+        "estimates": [_estimate_entry(estimate, prior) for estimate in result.estimates],
+        "combinations": [_estimate_entry(estimate, None) for estimate in result.combinations],
         "confounded": [
             dict(zip(("one", "other", "correlation", "experiment"), pair, strict=True))
             for pair in result.confounded
@@ -272,13 +279,13 @@ def _document(options: Identify, campaign: Campaign, prior: Mechanism | None, re
         "sources": campaign.sources,
         "mechanism": result.mechanism,
         "seed": options.seed,
-        "versions": versions(),
+        "versions": dependency_versions(),
     }
-    plain = terminal.finite(content)
+    plain = terminal.to_json_data(content)
     return {**plain, "sha256": digest(plain)}
 
 
-def _entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
+def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
     """Return the JSON entry of an estimate, with the prior's value and the deviation from it in std."""
     expected = _prior_value(prior, estimate.key)
     return {
@@ -288,7 +295,7 @@ def _entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
         "low": estimate.low,
         "high": estimate.high,
         "unit": estimate.unit,
-        "known": estimate.told,
+        "known": estimate.is_fixed,
         "prior": expected,
         "deviation": None
         if expected is None or not estimate.std
@@ -313,35 +320,37 @@ def _prior_value(prior: Mechanism | None, key: str) -> float | None:
 def _print(document: dict[str, Any], folder: Path | None) -> None:
     """Print the estimates, the checks and the verdict."""
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
-    rows = [_row(entry) for entry in (*document["estimates"], *document["combinations"])]
+    rows = [_estimate_row(entry) for entry in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
-    items: list[Any] = [terminal.table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
-    items.append(_left(document, "What the model leaves"))
+    items: list[Any] = [terminal.build_table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
+    items.append(_check_table(document, "What the model leaves"))
     items += [
         f"{pair['one']} and {pair['other']} are hardly told apart (correlation {pair['correlation']:.3f}): "
         f"{pair['experiment']} would."
         for pair in document["confounded"]
     ]
     wrote = (
-        [] if folder is None else [f"Wrote {folder / MECHANISM}, {folder / DOCUMENT} and plots beside them"]
+        []
+        if folder is None
+        else [f"Wrote {folder / MECHANISM_FILE}, {folder / DOCUMENT_FILE} and plots beside them"]
     )
     terminal.emit(*items, f"{document['reason']}.", *wrote)
 
 
-def _left(document: dict[str, Any], title: str) -> Any:
+def _check_table(document: dict[str, Any], title: str) -> Any:
     """Return the table of checks."""
     rows = []
     for check in document["checks"]:
         finding = ", ".join(filter(None, (check["finding"], check["where"])))
         effects = [
-            terminal.figure(check[name] * check["there"], 2) if check["counts"] else "-"
+            terminal.format_number(check[name] * check["there"], 2) if check["counts"] else "-"
             for name in ("effect", "effect_on_error")
         ]
         rows.append([check["name"], finding, *effects])
-    return terminal.table(title, ["check", "found", "effect on e", "on e-e*"], rows, (0, 1))
+    return terminal.build_table(title, ["check", "found", "effect on e", "on e-e*"], rows, (0, 1))
 
 
-def _row(entry: dict[str, Any]) -> list[Any]:
+def _estimate_row(entry: dict[str, Any]) -> list[Any]:
     """Return the table row of an estimate, with as many digits as its uncertainty supports."""
     digits = 4
     if entry["std"] and entry["value"]:
@@ -349,7 +358,7 @@ def _row(entry: dict[str, Any]) -> list[Any]:
     deviation = entry["deviation"]
     return [
         entry["key"],
-        *(terminal.figure(float(entry[name]), digits) for name in ("value", "low", "high")),
+        *(terminal.format_number(float(entry[name]), digits) for name in ("value", "low", "high")),
         entry["unit"],
         entry["prior"],
         "-" if deviation is None else f"{deviation:+.1f} std",

@@ -8,55 +8,55 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line
-from jaxhil.files import write_whole, writing
+from jaxhil.errors import InputError, to_one_line
+from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import numeric_keys
 from jaxhil.rig import digest
-from jaxhil.simulation.environment import computing
-from jaxhil.simulation.sources import versions
+from jaxhil.simulation.jax_environment import jax_context
+from jaxhil.simulation.source_fingerprint import dependency_versions
 from tuning import terminal
+from tuning.api import arguments
 from tuning.cli.commands import checks
-from tuning.cli.options_identify import Identify
-from tuning.front_door import arguments
+from tuning.cli.options_identify import IdentifyOptions
 
 if TYPE_CHECKING:
-    from tuning.identification.design.excitation import Design, Excitation
+    from tuning.identification.design.excitation import Excitation, ExcitationDesign
 
 SCHEMA = "jaxhil/design/1"
-DOCUMENT = "design.json"
+DOCUMENT_FILE = "design.json"
 COMPENSATOR = "response_error"
 
 
-def run(options: Identify) -> int:
+def run(options: IdentifyOptions) -> int:
     """Write the commands of both runs and the predicted uncertainty; return 0."""
     mechanisms = [*options.logs, *([options.prior] if options.prior is not None else [])]
     if len(mechanisms) != 1:
-        raise InputError(f"--design: found {len(mechanisms)} mechanisms, allowed one, roughly known")
+        raise InputError(f"--design: found {len(mechanisms)} mechanisms, expected one, roughly known")
     if not 0.0 < options.stroke <= 1.0:
-        raise InputError(f"--stroke: found {options.stroke:g} m, allowed a number > 0 and <= 1 m")
-    arguments.integers(0, seed=options.seed)
+        raise InputError(f"--stroke: found {options.stroke:g} m, expected a number > 0 and <= 1 m")
+    arguments.check_integers(0, seed=options.seed)
     mechanism = load(mechanisms[0]).mechanism
     folder = Path(options.output)
-    checks.output(folder)
-    checks.own_results(folder / DOCUMENT, "predicted", ("free.csv", "press.csv"))
-    with computing(), terminal.stages(1) as stages:
+    checks.prepare_output_folder(folder)
+    checks.check_earlier_results(folder / DOCUMENT_FILE, "predicted", ("free.csv", "press.csv"))
+    with jax_context(), terminal.show_stages(1) as stages:
         from jaxhil.simulation.gain_choice import choose_gains
-        from tuning.identification.design.excitation import design, error_slopes
+        from tuning.identification.design.excitation import design_excitation, differentiate_error
 
         stages.turn_to("looking for the motions that tell most")
         gains = choose_gains(mechanism, COMPENSATOR, None)[1]
-        slopes_by = partial(error_slopes, mechanism, COMPENSATOR, gains)
-        result = design(mechanism, options.stroke, slopes_by, options.seed)
+        slopes_by = partial(differentiate_error, mechanism, COMPENSATOR, gains)
+        result = design_excitation(mechanism, options.stroke, slopes_by, options.seed)
     sensors = mechanism.rig.position_sensor, mechanism.rig.force_sensor
     if not all(sensor.noise_std or sensor.quantum for sensor in sensors):
         terminal.warn(["where the mechanism states no noise, 5 um and 0.5 N are assumed"])
-    document = _document(options, mechanism.name, result)
+    document = _build_document(options, mechanism.name, result)
     period = mechanism.rig.control_period
     for name, excitation in (("free", result.free), ("press", result.press)):
         _write(folder / f"{name}.csv", excitation, period)
-    with writing(folder / DOCUMENT):
-        write_whole(folder / DOCUMENT, terminal.as_json(document).encode("ascii"))
+    with report_write_errors(folder / DOCUMENT_FILE):
+        write_atomically(folder / DOCUMENT_FILE, terminal.format_json(document).encode("ascii"))
     if options.json:
         terminal.emit_json(document)
     else:
@@ -67,17 +67,17 @@ def run(options: Identify) -> int:
 def _write(path: Path, excitation: Excitation, period: float) -> None:
     """Write an excitation to a CSV file with the columns time [s] and position_desired [m]."""
     rows = [f"{period * n:.9g},{x:.9g}\n" for n, x in enumerate(excitation.position.tolist())]
-    with writing(path):
-        write_whole(path, "".join(["time,position_desired\n", *rows]).encode("ascii"))
+    with report_write_errors(path):
+        write_atomically(path, "".join(["time,position_desired\n", *rows]).encode("ascii"))
 
 
-def _document(options: Identify, name: str, design: Design) -> dict[str, Any]:
+def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesign) -> dict[str, Any]:
     """Return the JSON document of the design."""
     effects = np.sqrt(np.mean(design.slopes**2, axis=0)) * design.std
     numbers = zip(design.keys, design.values, design.std, effects, strict=True)
     content = {
         "schema": SCHEMA,
-        "mechanism": one_line(name),
+        "mechanism": to_one_line(name),
         "predicted": [
             {"key": key, "value": value, "std": std, "effect": effect, "unit": _unit(key)}
             for key, value, std, effect in numbers
@@ -98,9 +98,9 @@ def _document(options: Identify, name: str, design: Design) -> dict[str, Any]:
         },
         "stroke": options.stroke,
         "seed": options.seed,
-        "versions": versions(),
+        "versions": dependency_versions(),
     }
-    plain = terminal.finite(content)
+    plain = terminal.to_json_data(content)
     return {**plain, "sha256": digest(plain)}
 
 
@@ -118,7 +118,7 @@ def _print(document: dict[str, Any], folder: Path) -> None:
         [entry[name] for name in ("key", "value", "std", "unit", "effect")] for entry in document["predicted"]
     ]
     headings = ["number", "value", "std", "unit", "effect on e"]
-    items: list[Any] = [terminal.table("What logs of both runs will tell", headings, rows, (0, 3))]
+    items: list[Any] = [terminal.build_table("What logs of both runs will tell", headings, rows, (0, 3))]
     runs = document["runs"]
     items.append(
         f"Together they leave {document['error']:.2g} of e, flat spectra within the same limits "
@@ -126,5 +126,5 @@ def _print(document: dict[str, Any], folder: Path) -> None:
         f"{runs['press']['crest_factor']:.2f}."
     )
     files = ", ".join(str(folder / name) for name in ("free.csv", "press.csv"))
-    items.append(f"Wrote {files} and {folder / DOCUMENT}")
+    items.append(f"Wrote {files} and {folder / DOCUMENT_FILE}")
     terminal.emit(*items)

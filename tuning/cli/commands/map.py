@@ -5,40 +5,40 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import one_line
-from jaxhil.simulation.environment import prepare
+from jaxhil.errors import to_one_line
+from jaxhil.simulation.jax_environment import prepare_jax
 from tuning import terminal
+from tuning.api import mechanism_summary
+from tuning.api.map import DOCUMENT_FILE, PLOT, MapOptions, map
+from tuning.api.options import check_options
 from tuning.cli.commands import checks
-from tuning.cli.commands.choice import chosen, named
+from tuning.cli.commands.choice import load_named_mechanism, select_compensator
 from tuning.cli.options_report import Map
-from tuning.front_door import meaning
-from tuning.front_door.map import DOCUMENT, PLOT, MapOptions, map
-from tuning.front_door.options import check_options
 
 
 def run(options: Map) -> int:
     """Compute, write and report the map; return 0."""
     check_options(options)
-    mechanism = named(options)
+    mechanism = load_named_mechanism(options)
     target = Path(options.output)
-    checks.output(target)
-    prepare()
-    mechanism, compensator, gains = chosen(options, mechanism)
-    checks.own_results(target / DOCUMENT, "theory", [PLOT], [mechanism.name])
+    checks.prepare_output_folder(target)
+    prepare_jax()
+    mechanism, compensator, gains = select_compensator(options, mechanism)
+    checks.check_earlier_results(target / DOCUMENT_FILE, "theory", [PLOT], [mechanism.name])
     settings = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
     stability_map = map(
         mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **settings
     )
-    meaning.say(mechanism, None if options.json else terminal.emit_line)
+    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
     if options.json:
         terminal.emit_json(stability_map.document)
     else:
-        terminal.emit(*_lines(stability_map.document))
-        terminal.emit_line(f"Wrote {one_line(str(target / DOCUMENT))} and {PLOT}")
+        terminal.emit(*_describe_map(stability_map.document))
+        terminal.emit_line(f"Wrote {to_one_line(str(target / DOCUMENT_FILE))} and {PLOT}")
     return 0
 
 
-def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on the nominal point, its margins, and why theory is missing."""
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
@@ -51,12 +51,15 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
         within = "beyond" if nominal["margins"]["contact"] is None else "within"
         yield (
             f"Nominal: real peak force {nominal['peak_force_ratio']:.3f} times, duration "
-            f"{nominal['duration_ratio']:.3f} times the ideal contact's, {within} {_allowed(document)}."
+            f"{nominal['duration_ratio']:.3f} times the ideal contact's, {within} "
+            f"{_describe_bounds(document)}."
         )
     if (margins := nominal["margins"]["error"]) is not None:
-        yield from (f"{text}, within {limit:g}." for text in _margins(document, margins))
+        yield from (f"{text}, within {limit:g}." for text in _describe_margins(document, margins))
     if (margins := nominal["margins"]["contact"]) is not None:
-        yield from (f"{text}, within {_allowed(document)}." for text in _margins(document, margins))
+        yield from (
+            f"{text}, within {_describe_bounds(document)}." for text in _describe_margins(document, margins)
+        )
     growth = nominal["growth"]
     if growth is None:
         yield f"No spectral radius: {document['spectral_radius']['none_because']}."
@@ -72,19 +75,20 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"Derivative of the spectral radius, in SI units: {slopes}."
         if (margins := nominal["margins"]["spectral_radius"]) is not None:
             yield from (
-                f"{text}, with a spectral radius of at most 1." for text in _margins(document, margins)
+                f"{text}, with a spectral radius of at most 1."
+                for text in _describe_margins(document, margins)
             )
     if (reason := document["theory"]["none_because"]) is not None:
         yield f"No closed form beside it: {reason}."
 
 
-def _allowed(document: Mapping[str, Any]) -> str:
+def _describe_bounds(document: Mapping[str, Any]) -> str:
     """Return the bounds on real peak force and duration, in words."""
     force, *duration = document["bounds"].values()
     return f"{force:g} times the peak force and {duration[0]:g} to {duration[1]:g} times the duration"
 
 
-def _margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
+def _describe_margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
     """Yield the range of each key in which a condition holds."""
     for axis in "xy":
         margin, values = margins[axis], document[axis]["values"]

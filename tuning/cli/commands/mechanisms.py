@@ -3,9 +3,9 @@
 import math
 from typing import Any
 
-from jaxhil.contact.laws import contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.file import (
-    DEFAULT,
+    DEFAULT_MECHANISM,
     builtin_names,
     builtin_path,
     load,
@@ -13,21 +13,22 @@ from jaxhil.mechanism.file import (
     six_axis_names,
     suite_names,
 )
-from jaxhil.mechanism.json_schema import json_schema
+from jaxhil.mechanism.json_schema import build_json_schema
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning import terminal
-from tuning.cli.options import Mechanisms
+from tuning.cli.options import MechanismsOptions
 
 
-def run(options: Mechanisms) -> int:
+def run(options: MechanismsOptions) -> int:
     """Print the lists or the schema; return 0."""
     if options.schema:
-        terminal.emit_json(json_schema())
+        terminal.emit_json(build_json_schema())
         return 0
     titles = {"Built-in mechanisms": builtin_names(), "Standard suites": suite_names()}
     tables = {
-        title: [_entry(name, load(name).mechanism) for name in names] for title, names in titles.items()
+        title: [_mechanism_entry(name, load(name).mechanism) for name in names]
+        for title, names in titles.items()
     }
     six_axes = [_six_axis_entry(name) for name in six_axis_names()]
     if options.json:
@@ -37,42 +38,46 @@ def run(options: Mechanisms) -> int:
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():
         terminal.emit(
-            terminal.table(title, headings, [_row(entry) for entry in entries], texts=(0, 1, 4)),
+            terminal.build_table(
+                title, headings, [_mechanism_row(entry) for entry in entries], texts=(0, 1, 4)
+            ),
             *(f"{entry['name']}: {entry['source']}\n" for entry in entries),
         )
-    rows = [[*(entry[key] for key in COLUMNS), " ".join(entry["laws"])] for entry in six_axes]
+    rows = [[*(entry[key] for key in SIX_AXIS_COLUMNS), " ".join(entry["laws"])] for entry in six_axes]
     terminal.emit(
-        terminal.table(
+        terminal.build_table(
             "Built-in mechanisms of six axes (simulate alone knows them so far)",
             ["name", "masses [kg]", "pairs of shapes", "laws"], rows, texts=(0, 1, 3),
         ),
         *(f"{entry['name']}: {entry['source']}\n" for entry in six_axes),
     )  # fmt: skip
-    terminal.emit(f"The files are in {builtin_path(DEFAULT).parent}; `jaxhil init NAME` copies one.")
+    terminal.emit(
+        f"The files are in {builtin_path(DEFAULT_MECHANISM).parent}; `jaxhil init NAME` copies one."
+    )
     return 0
 
 
-def _row(entry: dict[str, Any]) -> list[Any]:
+def _mechanism_row(entry: dict[str, Any]) -> list[Any]:
     """Return the table row of a one-axis mechanism."""
     frequencies = " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-"
     return [entry["name"], entry["law"], entry["contacts"], entry["mass"], frequencies]
 
 
-def _entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
+def _mechanism_entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
     """Return the JSON entry of a one-axis mechanism."""
     return {
         "name": name,
         "law": mechanism.contact.law,
         "contacts": mechanism.approach.contacts,
         "mass": mechanism.bodies.mass,
-        "contact_frequencies": _frequencies(mechanism),
+        "contact_frequencies": _contact_frequencies(mechanism),
         "control_period": mechanism.rig.control_period,
         "source": mechanism.source,
         "path": str(builtin_path(name)),
     }
 
 
-COLUMNS = ("name", "masses", "pairs")
+SIX_AXIS_COLUMNS = ("name", "masses", "pairs")
 
 
 def _six_axis_entry(name: str) -> dict[str, Any]:
@@ -91,9 +96,9 @@ def _six_axis_entry(name: str) -> dict[str, Any]:
     }
 
 
-def _frequencies(mechanism: Mechanism) -> list[float]:
+def _contact_frequencies(mechanism: Mechanism) -> list[float]:
     """Return sqrt(k/M)/(2 pi) [Hz] for every distinct stiffness; an empty list for a power law."""
-    if contact_law(mechanism.contact.law).stiffness_unit != "N/m":
+    if find_contact_law(mechanism.contact.law).stiffness_unit != "N/m":
         return []
     stiffness: list[float] = []
     for entry in mechanism.contact.stiffness:

@@ -5,45 +5,45 @@ from typing import Any
 
 from jaxhil.mechanism.file import load
 from jaxhil.rig import digest
-from jaxhil.simulation.sources import versions
+from jaxhil.simulation.source_fingerprint import dependency_versions
 from tuning import terminal
 from tuning.cli.commands.identify import read_logs
-from tuning.cli.options_identify import Monitor
-from tuning.identification.monitor.figures import FIGURES
-from tuning.identification.monitor.monitor import Monitored, monitor
+from tuning.cli.options_identify import MonitorOptions
+from tuning.identification.monitor.metrics import METRICS
+from tuning.identification.monitor.monitor import MonitorResult, monitor_contacts
 
 SCHEMA = "jaxhil/monitor/1"
-UNSTATED = (
+NO_UNCERTAINTY_NOTE = (
     "the mechanism file has no [uncertainty]: what is off by more than a clock or a scale may be is bad"
 )
 
 
-def run(options: Monitor) -> int:
+def run(options: MonitorOptions) -> int:
     """Compare the contacts of the logs with the mechanism, and print the result.
 
     Return 1 if the rig changed by more than the file's uncertainty, else 0.
     """
     loaded = load(options.mechanism)
-    with terminal.stages(2) as stages:
+    with terminal.show_stages(2) as stages:
         stages.turn_to("reading the logs")
         campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
         stages.turn_to("setting the contacts against the mechanism")
-        result = monitor(campaign, loaded.mechanism)
+        result = monitor_contacts(campaign, loaded.mechanism)
     content = {
         "schema": SCHEMA,
         "mechanism": loaded.label,
         "mechanism_sha256": loaded.sha256,
         "state": result.state,
         "reason": result.verdict,
-        "alarm": _counted(result.alarm),
-        "since": _counted(result.since),
+        "alarm": _count_from_one(result.alarm),
+        "since": _count_from_one(result.since),
         "changes": [{"figure": item.name, "value": item.value, "std": item.std} for item in result.changes],
-        "contacts": [_contact(number, result) for number in range(len(result.contacts))],
-        "notes": [*campaign.notes, *([] if loaded.mechanism.uncertainty else [UNSTATED])],
+        "contacts": [_contact_entry(number, result) for number in range(len(result.contacts))],
+        "notes": [*campaign.notes, *([] if loaded.mechanism.uncertainty else [NO_UNCERTAINTY_NOTE])],
         "sources": campaign.sources,
-        "versions": versions(),
+        "versions": dependency_versions(),
     }
-    plain = terminal.finite(content)
+    plain = terminal.to_json_data(content)
     document = {**plain, "sha256": digest(plain)}
     terminal.warn(document["notes"])
     if options.json:
@@ -53,18 +53,18 @@ def run(options: Monitor) -> int:
     return 1 if result.state == "bad" else 0
 
 
-def _counted(number: int | None) -> int | None:
+def _count_from_one(number: int | None) -> int | None:
     """Return an index as a number that counts from 1; None stays None."""
     return None if number is None else number + 1
 
 
-def _contact(number: int, result: Monitored) -> dict[str, Any]:
+def _contact_entry(number: int, result: MonitorResult) -> dict[str, Any]:
     """Return the JSON entry of one contact."""
     contact = result.contacts[number]
     figures = {
         name: {"value": float(value), "predicted_std": float(std), "z": float(z)}
         for (name, _, _), value, std, z in zip(
-            FIGURES, contact.value, contact.predicted_std, contact.z, strict=True
+            METRICS, contact.value, contact.predicted_std, contact.z, strict=True
         )
     }
     return {"contact": number + 1, "log": contact.source, "state": contact.state, "figures": figures}
@@ -72,31 +72,31 @@ def _contact(number: int, result: Monitored) -> dict[str, Any]:
 
 def _print(document: dict[str, Any]) -> None:
     """Print the table of contacts and the verdict."""
-    headings = ["contact", *(_heading(name, unit) for name, unit, _ in FIGURES)]
+    headings = ["contact", *(_format_heading(name, unit) for name, unit, _ in METRICS)]
     rows = [
         [
             contact["contact"],
-            *(_shown(contact["figures"][name]["value"], scale) for name, _, scale in FIGURES),
+            *(_format_scaled(contact["figures"][name]["value"], scale) for name, _, scale in METRICS),
             contact["state"],
         ]
         for contact in document["contacts"]
     ]
     title = f"By {document['mechanism']}: 0 where the rig is that of the file"
-    table = terminal.table(title, [*headings, "state"], rows, texts=(len(headings),))
+    table = terminal.build_table(title, [*headings, "state"], rows, texts=(len(headings),))
     spread = ", ".join(
-        f"{name} {terminal.figure(scale * std, 2)}{'' if unit == '1' else f' {unit}'}"
-        for name, unit, scale in FIGURES
+        f"{name} {terminal.format_number(scale * std, 2)}{'' if unit == '1' else f' {unit}'}"
+        for name, unit, scale in METRICS
         if (std := document["contacts"][-1]["figures"][name]["predicted_std"]) is not None
     )
     terminal.emit(table, f"Predicted to scatter in the last contact by: {spread}.", f"{document['reason']}.")
 
 
-def _heading(name: str, unit: str) -> str:
+def _format_heading(name: str, unit: str) -> str:
     """Return a column's heading on three lines, so that all columns fit."""
     first, _, last = name.rpartition(" ")
     return "\n".join([first, last, "" if unit == "1" else f"[{unit}]"])
 
 
-def _shown(value: float | None, scale: float) -> str:
+def _format_scaled(value: float | None, scale: float) -> str:
     """Return a scaled value as text, or a dash for None."""
     return "-" if value is None else f"{scale * value:+.2g}"

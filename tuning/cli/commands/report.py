@@ -2,28 +2,28 @@
 
 from pathlib import Path
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import remove_stale, writing
-from jaxhil.simulation.environment import prepare
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import remove_stale, report_write_errors
+from jaxhil.simulation.jax_environment import prepare_jax
 from tuning import terminal
-from tuning.cli.options_report import Report
-from tuning.front_door.report import report
+from tuning.api.report import report
+from tuning.cli.options_report import ReportOptions
 
-ENDINGS = (".html", ".htm")
+PAGE_SUFFIXES = (".html", ".htm")
 
 
-def run(options: Report) -> int:
+def run(options: ReportOptions) -> int:
     """Write the page; return 1 if its verdict is bad, else 0."""
     if not options.results:
-        raise InputError("RESULT: found nothing, allowed what jaxhil identify, tune, sweep, ... wrote")
+        raise InputError("RESULT: found nothing, expected what jaxhil identify, tune, sweep, ... wrote")
     target = Path(options.output)
-    if target.suffix.lower() not in ENDINGS:
-        allowed = f"a name that ends in {', '.join(ENDINGS)}"
-        raise InputError(f"--output: found {shown(options.output)}, allowed {allowed}")
-    with writing(target):
+    if target.suffix.lower() not in PAGE_SUFFIXES:
+        allowed = f"a name that ends in {', '.join(PAGE_SUFFIXES)}"
+        raise InputError(f"--output: found {format_value(options.output)}, expected {allowed}")
+    with report_write_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_stale(target.parent)
-    prepare()
+    prepare_jax()
     page = report(options.results, progress=True)
     page.save(target)
     if options.json:
@@ -33,7 +33,7 @@ def run(options: Report) -> int:
     else:
         rows = [tuple(requirement.values()) for requirement in page.requirements]
         heads = ["judged", "required", "result", "margin", "verdict"]
-        tables = [terminal.table("Requirements", heads, rows, texts=range(5))] if rows else []
+        tables = [terminal.build_table("Requirements", heads, rows, texts=range(5))] if rows else []
         terminal.emit(*tables, f"Verdict: {page.verdict}.")
-        terminal.emit_line(f"Wrote {one_line(str(target))}, {len(page.html) / 1e6:.2g} MB")
+        terminal.emit_line(f"Wrote {to_one_line(str(target))}, {len(page.html) / 1e6:.2g} MB")
     return 1 if page.verdict == "bad" else 0

@@ -5,68 +5,68 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from jaxhil.errors import InputError, one_line
-from jaxhil.files import follow
+from jaxhil.errors import InputError, to_one_line
+from jaxhil.files import resolve_output_path
 from tuning import terminal
+from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
-from tuning.front_door import arguments
 
-LONGEST_EMPTY = 30.0  # s; longest duration of the empty loop
-EMPTY_SHARE = 0.2  # duration of the empty loop over the run's duration
-MOST_TICKS = 2_000_000
-MOST_ROWS = 12  # largest number of contacts in the printed table
+MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop
+EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop over the run's duration
+MAX_TICKS = 2_000_000
+MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
 def run(options: RigOptions) -> int:
     """Run an empty loop, then the controller; return 0 if all is good, 1 if not, 130 if interrupted."""
-    arguments.limit(options.limit)
-    arguments.integers(0, seed=options.seed)
+    arguments.check_limit(options.limit)
+    arguments.check_integers(0, seed=options.seed)
     _check_injection(options)
     if options.plot is not None:
         checks.check_plot(options.plot)
-    gains = arguments.readable_gain_file(options.path)
-    document, mechanism = load(gains)
+    gains = arguments.find_gain_file(options.path)
+    document, mechanism = load_checked_gains(gains)
     check_bundle_code(Path(options.path), document["compensator"])
     period = mechanism.rig.control_period
-    if not period <= options.duration <= MOST_TICKS * period:
-        allowed = f"{period:g} to {MOST_TICKS * period:g} s, {MOST_TICKS} control periods"
-        raise InputError(f"--duration: found {options.duration:g}, allowed {allowed}")
+    if not period <= options.duration <= MAX_TICKS * period:
+        allowed = f"{period:g} to {MAX_TICKS * period:g} s, {MAX_TICKS} control periods"
+        raise InputError(f"--duration: found {options.duration:g}, expected {allowed}")
 
     from tuning.rig.network import Injection
-    from tuning.rig.report import judge, reference_restitutions
-    from tuning.rig.session import Setup, real_time, run_session
+    from tuning.rig.session import SessionSettings, real_time_priority, run_session
+    from tuning.rig.session_report import evaluate_session, ideal_restitutions
 
     try:
-        with real_time(options.realtime):
+        with real_time_priority(options.realtime):
             pass
     except OSError as error:
-        reason = one_line(error.strerror or str(error), 100)
-        raise InputError(f"--realtime: found no such priority ({reason}), allowed without it") from None
+        reason = to_one_line(error.strerror or str(error), 100)
+        raise InputError(f"--realtime: found no such priority ({reason}), expected without it") from None
 
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
         scratch = Path(temporary)
-        setup = Setup(
-            folder=controller_folder(document["compensator"], scratch),
+        setup = SessionSettings(
+            folder=write_controller_files(document["compensator"], scratch),
             gains=gains,
             mechanism=mechanism,
-            stroke=stroke(document),
+            stroke=read_command_limits(document),
             duration=options.duration,
-            empty_duration=min(LONGEST_EMPTY, EMPTY_SHARE * options.duration),
+            empty_duration=min(MAX_EMPTY_LOOP_DURATION, EMPTY_LOOP_SHARE * options.duration),
             injection=Injection(options.drops, options.jitter, options.delay),
             seed=options.seed,
             priority=options.realtime,
         )
-        session = run_session(setup, scratch, terminal.note, _Progress(period).tell)
+        session = run_session(setup, scratch, terminal.note, _LoopProgress(period).tell)
     # jax is first imported here, so that it does not disturb the loop.
-    references = reference_restitutions(mechanism, session.contacts)
-    result = judge(setup, session, references, options.limit, document["compensator"])
+    references = ideal_restitutions(mechanism, session.contacts)
+    result = evaluate_session(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
-        from jaxhil.simulation.contact_plot import save
+        from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.latency import latency_plot
 
         title = f"{mechanism.name}, {document['compensator']}: latencies at {1 / period:g} Hz over UDP"
-        save(latency_plot(session, title, period), follow(options.plot))
+        save_figure(latency_plot(session, title, period), resolve_output_path(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
         terminal.emit_json(result)
@@ -79,15 +79,15 @@ def run(options: RigOptions) -> int:
 
 def check_bundle_code(folder: Path, compensator: str) -> None:
     """Raise `InputError` if the folder is a bundle that is damaged or has other code than this version."""
-    from tuning.bundle.checking import check_code
+    from tuning.bundle.checking import find_code_differences
     from tuning.bundle.manifest import is_bundle
 
-    reasons = check_code(folder, compensator) if is_bundle(folder) else []
+    reasons = find_code_differences(folder, compensator) if is_bundle(folder) else []
     if reasons:
-        raise InputError(f"{one_line(str(folder))}: {reasons[0]}; jaxhil verify says more")
+        raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}; jaxhil verify says more")
 
 
-def controller_folder(compensator: str, scratch: Path) -> Path:
+def write_controller_files(compensator: str, scratch: Path) -> Path:
     """Write the files of the controller's process, as in a bundle, to `scratch`, and return it."""
     from tuning.bundle.content import code_files
 
@@ -96,22 +96,22 @@ def controller_folder(compensator: str, scratch: Path) -> Path:
     return scratch
 
 
-def load(gains: Path) -> tuple[dict[str, Any], Any]:
+def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any]:
     """Return the gain file's document and mechanism, checked like on the rig. Raise `InputError`."""
-    from jaxhil.mechanism.file import from_builtins
+    from jaxhil.mechanism.file import from_plain_data
     from jaxhil.rig import GainFileError
     from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 
-    source = one_line(str(gains))
+    source = to_one_line(str(gains))
     try:
         document = read_gain_document(gains)
         check_gain_document(document, source)
     except GainFileError as error:
         raise InputError(str(error)) from None
-    return document, from_builtins(document["mechanism"], f"{source}: mechanism")
+    return document, from_plain_data(document["mechanism"], f"{source}: mechanism")
 
 
-def stroke(document: dict[str, Any]) -> tuple[float, float]:
+def read_command_limits(document: dict[str, Any]) -> tuple[float, float]:
     """Return the smallest and the largest position command [m] that a gain document allows."""
     from jaxhil.rig.gain_file import check_gain_document
 
@@ -119,7 +119,7 @@ def stroke(document: dict[str, Any]) -> tuple[float, float]:
     return limits["command_lowest"], limits["command_highest"]
 
 
-class _Progress:
+class _LoopProgress:
     """Progress of the loop on standard error; short texts, because the loop itself writes them."""
 
     def __init__(self, period: float) -> None:
@@ -139,59 +139,68 @@ class _Progress:
 def _check_injection(options: RigOptions) -> None:
     """Check the probabilities and delays of the injected faults. Raise `InputError`."""
     if not 0.0 <= options.drops < 1.0:
-        raise InputError(f"--drops: found {options.drops:g}, allowed a probability >= 0 and < 1")
+        raise InputError(f"--drops: found {options.drops:g}, expected a probability >= 0 and < 1")
     for name in ("jitter", "delay"):
         value = getattr(options, name)
         if not 0.0 <= value <= 1.0:
-            raise InputError(f"--{name}: found {value:g}, allowed 0 to 1 s")
+            raise InputError(f"--{name}: found {value:g}, expected 0 to 1 s")
 
 
 def _print(document: dict[str, Any]) -> None:
     """Print the tables and remarks."""
     loops = {"empty loop": document["empty_loop"], "controller": document["run"]}
     reached = {name: loop for name, loop in loops.items() if loop is not None}
-    terminal.emit(*_tables(document, reached), *_remarks(document, reached))
+    terminal.emit(*_build_tables(document, reached), *_session_remarks(document, reached))
 
 
-def _tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
+def _build_tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
     """Return the tables of ticks, times and contacts."""
     rate = f"{1 / document['control_period']:g} Hz over UDP"
-    ticks = terminal.table(
+    ticks = terminal.build_table(
         f"{document['mechanism']}, {document['compensator']}, {rate}: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
         [
-            (name, *(loop[key] for key in ("ticks", "missed", *(f"missed_by_{cause}" for cause in _CAUSES))))
+            (
+                name,
+                *(
+                    loop[key]
+                    for key in ("ticks", "missed", *(f"missed_by_{cause}" for cause in _MISS_CAUSES))
+                ),
+            )
             for name, loop in reached.items()
         ],
     )
-    times = terminal.table(
+    times = terminal.build_table(
         "Times [µs]: median, 99.9th percentile, maximum",
         ["", "loop", "median", "99.9 %", "maximum"],
         [
             (words, name, *(f"{1e6 * value:.1f}" for value in loop[key].values()))
-            for key, words in _TIMES.items()
+            for key, words in _TIME_LABELS.items()
             for name, loop in reached.items()
         ],
         texts=(0, 1),
     )
     rows = [
         (
-            *(number, contact["number"] + 1, terminal.figure(contact["restitution"], 5)),
-            *(terminal.figure(contact["reference_restitution"], 5), terminal.signed(contact["error"])),
+            *(number, contact["number"] + 1, terminal.format_number(contact["restitution"], 5)),
+            *(
+                terminal.format_number(contact["reference_restitution"], 5),
+                terminal.format_error(contact["error"]),
+            ),
             *(contact["peak_force"], 1e3 * contact["duration"], contact["status"]),
         )
-        for number, contact in enumerate(document["contacts"][:MOST_ROWS], start=1)
+        for number, contact in enumerate(document["contacts"][:MAX_TABLE_ROWS], start=1)
     ]
     headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
-    contacts = terminal.table(f"Contacts: {len(document['contacts'])}", headings, rows, texts=(7,))
+    contacts = terminal.build_table(f"Contacts: {len(document['contacts'])}", headings, rows, texts=(7,))
     return [ticks, times, *([contacts] if rows else [])]
 
 
-def _remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[str]:
+def _session_remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[str]:
     """Return the sentences below the tables; the last ones are the verdict."""
     lines = []
-    if len(document["contacts"]) > MOST_ROWS:
-        lines.append(f"... and {len(document['contacts']) - MOST_ROWS} more contacts.")
+    if len(document["contacts"]) > MAX_TABLE_ROWS:
+        lines.append(f"... and {len(document['contacts']) - MAX_TABLE_ROWS} more contacts.")
     if document["largest_error"] is not None:
         lines.append(f"Largest error of {document['judged']} contacts: {document['largest_error']:+.5f}.")
     lines += [
@@ -223,8 +232,8 @@ def _remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[str]:
     return lines + ([f"Bad: {reason}" for reason in document["reasons"]] or [f"Good: {document['good']}"])
 
 
-_CAUSES = ("controller", "injection", "machine")
-_TIMES = {
+_MISS_CAUSES = ("controller", "injection", "machine")
+_TIME_LABELS = {
     "tick_time": "controller, per tick",
     "tick_cpu": "of it CPU",
     "round_trip": "round trip",

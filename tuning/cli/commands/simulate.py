@@ -3,52 +3,52 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.environment import prepare
+from jaxhil.simulation.jax_environment import prepare_jax
 from tuning import terminal
+from tuning.api import arguments, mechanism_summary
 from tuning.cli.commands import checks, simulate_six
-from tuning.cli.commands.choice import chosen, in_six_axes, named_any
-from tuning.cli.options import Simulate
-from tuning.front_door import arguments, meaning
+from tuning.cli.commands.choice import load_any_named_mechanism, load_six_axis_mechanism, select_compensator
+from tuning.cli.options import SimulateOptions
 
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
 # Estimates of a compensator: the column's heading and decimals; values are shown times 1000.
-ESTIMATES = {"force_delay": ("force delay [ms]", 2)}
+ESTIMATE_COLUMNS = {"force_delay": ("force delay [ms]", 2)}
 
 
-def run(options: Simulate) -> int:
+def run(options: SimulateOptions) -> int:
     """Run the contacts and report each; return 0 if `Run.reasons` is empty, else 1."""
-    arguments.limit(options.limit)
-    arguments.integers(0, seed=options.seed)
+    arguments.check_limit(options.limit)
+    arguments.check_integers(0, seed=options.seed)
     if options.plot is not None:
         checks.check_plot(options.plot)
     if options.log is not None:
-        checks.file(options.log)
-    mechanism = named_any(options)
+        checks.check_file_path(options.log)
+    mechanism = load_any_named_mechanism(options)
     if mechanism is None:
-        prepare()
-        mechanism = in_six_axes(options)
+        prepare_jax()
+        mechanism = load_six_axis_mechanism(options)
     if isinstance(mechanism, SixAxisMechanism):
-        simulate_six.check(options)
-        prepare()
+        simulate_six.check_six_axis_options(options)
+        prepare_jax()
         return simulate_six.run(options, mechanism)
     if options.animate is not None:
         allowed = "none: there is an animation of six axes only"
-        raise InputError(f"--animate: found {shown(options.animate)}, allowed {allowed}")
+        raise InputError(f"--animate: found {format_value(options.animate)}, expected {allowed}")
     if options.reference:
         allowed = "a mechanism of six axes: of one axis the table has e* beside e"
-        raise InputError(f"--reference: found one axis, allowed {allowed}")
-    prepare()
-    from jaxhil.simulation.contact_bounds import BOUNDS
+        raise InputError(f"--reference: found one axis, expected {allowed}")
+    prepare_jax()
+    from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS
     from jaxhil.simulation.run import simulate
 
-    mechanism, compensator, gains = chosen(options, mechanism)
-    _check(mechanism, compensator, gains)
-    meaning.say(mechanism, None if options.json else terminal.emit_line)
+    mechanism, compensator, gains = select_compensator(options, mechanism)
+    _check_simulation(mechanism, compensator, gains)
+    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
     result = simulate(mechanism, compensator, gains, seed=options.seed)
     reasons = result.reasons(options.limit)
     if options.plot is not None:
@@ -57,7 +57,7 @@ def run(options: Simulate) -> int:
     if options.log is not None:
         result.to_csv(options.log)
         terminal.note(f"wrote {options.log}")
-    contacts = [_entry(contact) for contact in result.contacts]
+    contacts = [_contact_entry(contact) for contact in result.contacts]
     if options.json:
         terminal.emit_json(
             {
@@ -66,10 +66,10 @@ def run(options: Simulate) -> int:
                 "gains": result.gains,
                 "contacts": contacts,
                 "status": result.status,
-                "reason": _reason(result.status),
+                "reason": _explain_status(result.status),
                 "meaning": result.meaning,
                 "limit": options.limit,
-                "bounds": BOUNDS,
+                "bounds": CONTACT_BOUNDS,
                 "reasons": reasons,
                 "verdict": "bad" if reasons else "good",
             }
@@ -79,7 +79,7 @@ def run(options: Simulate) -> int:
     return 1 if reasons else 0
 
 
-def _check(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> None:
+def _check_simulation(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> None:
     """Raise `InputError` if the mechanism cannot be simulated with these gains."""
     from jaxhil.simulation.gain_choice import choose_gains
     from jaxhil.simulation.plausibility import check_run
@@ -88,25 +88,27 @@ def _check(mechanism: Mechanism, compensator: str, gains: str | Path | None) -> 
     check_run(mechanism)
 
 
-def _reason(status: str) -> str | None:
+def _explain_status(status: str) -> str | None:
     """Return the explanation of a run's status, or None if the run ended well."""
-    from jaxhil.simulation.metrics import STATUS_REASONS
+    from jaxhil.simulation.metrics import CONTACT_STATUS_REASONS
 
-    return STATUS_REASONS.get(status)
+    return CONTACT_STATUS_REASONS.get(status)
 
 
-def _entry(contact: "ContactResult") -> dict[str, Any]:
+def _contact_entry(contact: "ContactResult") -> dict[str, Any]:
     """Return the JSON entry of a contact, without the estimates that its compensator does not make."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
 
 
-def _print(options: Simulate, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]) -> None:
+def _print(
+    options: SimulateOptions, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]
+) -> None:
     """Print the table of contacts and the verdict."""
-    from jaxhil.simulation.contact_bounds import STATED
+    from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
 
     # Contacts that were not reached are counted below the table.
     contacts = [contact for contact in contacts if contact["status"] != "not reached"]
-    estimates = [name for name in ESTIMATES if any(name in contact for contact in contacts)]
+    estimates = [name for name in ESTIMATE_COLUMNS if any(name in contact for contact in contacts)]
     rows = [
         [
             number,
@@ -114,18 +116,18 @@ def _print(options: Simulate, result: "Run", contacts: list[dict[str, Any]], rea
             contact["reference_restitution"],
             f"{contact['error']:+.4f}" if contact["status"] == "ok" else "-",
             contact["peak_force"],
-            terminal.ratio(contact["peak_force"], contact["reference_peak_force"]),
+            terminal.format_ratio(contact["peak_force"], contact["reference_peak_force"]),
             1e3 * contact["duration"],
-            terminal.ratio(contact["duration"], contact["reference_duration"]),
+            terminal.format_ratio(contact["duration"], contact["reference_duration"]),
             1e3 * contact["approach_velocity"],
-            *(f"{1e3 * contact[name]:.{ESTIMATES[name][1]}f}" for name in estimates),
+            *(f"{1e3 * contact[name]:.{ESTIMATE_COLUMNS[name][1]}f}" for name in estimates),
             contact["status"],
         ]
         for number, contact in enumerate(contacts, start=1)
     ]
     headings = ["contact", "e", "e*", "error", "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
     headings += ["speed [mm/s]"]
-    headings += [*(ESTIMATES[name][0] for name in estimates), "status"]
+    headings += [*(ESTIMATE_COLUMNS[name][0] for name in estimates), "status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     title += f", {rule}" if result.compensator != "none" else ""
@@ -136,5 +138,5 @@ def _print(options: Simulate, result: "Run", contacts: list[dict[str, Any]], rea
     if reasons:
         lines += [f"Bad: {reason}." for reason in reasons]
     else:
-        lines.append(f"Good: every error is within {options.limit:g}, {STATED}.")
-    terminal.emit(terminal.table(title, headings, rows, texts=(len(headings) - 1,)), *lines)
+        lines.append(f"Good: every error is within {options.limit:g}, {CONTACT_BOUNDS_TEXT}.")
+    terminal.emit(terminal.build_table(title, headings, rows, texts=(len(headings) - 1,)), *lines)

@@ -4,66 +4,73 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.errors import InputError, shown
+from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from tuning import terminal
 from tuning.cli.commands import checks
-from tuning.cli.options import Simulate
+from tuning.cli.options import SimulateOptions
 
 if TYPE_CHECKING:
     from jaxhil.sixdof.run import Episode, SixAxisRun
 
-FILMS = (".gif", ".mp4")
-GOOD = ("rebounded", "captured")  # statuses of a run that ended well
+ANIMATION_SUFFIXES = (".gif", ".mp4")
+GOOD_STATUSES = ("rebounded", "captured")  # statuses of a run that ended well
 
 
-def check(options: Simulate) -> None:
+def check_six_axis_options(options: SimulateOptions) -> None:
     """Raise `InputError` for options that six axes do not support."""
     if options.setting is not None:
-        found = f"--setting: found {shown(options.setting)}"
-        raise InputError(f"{found}, allowed none: in six axes there is none so far")
+        found = f"--setting: found {format_value(options.setting)}"
+        raise InputError(f"{found}, expected none: in six axes there is none so far")
     if options.reference:
         for key in ("compensator", "gains", "plot", "animate", "log"):
             value = getattr(options, key)
             if value is not None:
-                raise InputError(f"--{key}: found {shown(str(value))}, allowed none beside --reference")
+                raise InputError(
+                    f"--{key}: found {format_value(str(value))}, expected none beside --reference"
+                )
     if options.animate is not None:
-        _check_film(options.animate)
+        _check_animation_path(options.animate)
 
 
-def _check_film(path: str) -> None:
+def _check_animation_path(path: str) -> None:
     """Check that an animation can be written to `path`. Raise `InputError`."""
     suffix = Path(path).suffix.lower()
-    if suffix not in FILMS:
-        raise InputError(f"--animate: found {shown(path)}, allowed a name that ends in {', '.join(FILMS)}")
+    if suffix not in ANIMATION_SUFFIXES:
+        raise InputError(
+            f"--animate: found {format_value(path)}, expected a name that ends in "
+            f"{', '.join(ANIMATION_SUFFIXES)}"
+        )
     if suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise InputError(
-            f"--animate: found {shown(path)}, allowed .gif: there is no ffmpeg, which makes .mp4"
+            f"--animate: found {format_value(path)}, expected .gif: there is no ffmpeg, which makes .mp4"
         )
-    checks.file(path)
+    checks.check_file_path(path)
 
 
-def run(options: Simulate, mechanism: SixAxisMechanism) -> int:
+def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     """Run the episodes and report each; return 0 if both errors are within the limit, else 1."""
     if options.reference:
-        return _run_in_space(options, mechanism)
+        return _run_ideal_contact(options, mechanism)
     from jaxhil.sixdof.run import simulate_six_axes
 
     gains = None if options.gains is None else Path(options.gains)
     result = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
-    good = result.status in GOOD and all(_worst(episode) <= options.limit for episode in result.episodes)
-    good = good and not any(_unlike(result))
+    good = result.status in GOOD_STATUSES and all(
+        _worst_error(episode) <= options.limit for episode in result.episodes
+    )
+    good = good and not any(_is_unlike_ideal(result))
     terminal.warn(f"{mechanism.name}: {warning}" for warning in result.meaning.warnings)
     _write(options, result)
     if options.json:
-        terminal.emit_json(_document(options, result, good))
+        terminal.emit_json(_build_document(options, result, good))
     else:
         terminal.emit_line(result.meaning.line(mechanism.name))
         _print(options, result, good)
     return 0 if good else 1
 
 
-def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
+def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     """Simulate and report the ideal contact without a rig; return 0 if anything touches, else 1."""
     from jaxhil.sixdof.alone import simulate_in_space
 
@@ -85,25 +92,25 @@ def _run_in_space(options: Simulate, mechanism: SixAxisMechanism) -> int:
             episode.reference_touches,
             result.status,
         ]
-        table = terminal.table(f"{mechanism.name}, in space", [*headings, "status"], [row], texts=(7,))
+        table = terminal.build_table(f"{mechanism.name}, in space", [*headings, "status"], [row], texts=(7,))
         speed, turning = ([f"{part:.4g}" for part in result.final.twist[at : at + 3]] for at in (0, 3))
         after = f"After {result.final.time:.4g} s: velocity ({', '.join(speed)}) m/s, "
         terminal.emit(table, after + f"angular velocity ({', '.join(turning)}) rad/s of C against T.")
     return 0 if episode.reference_touches else 1
 
 
-def _worst(episode: "Episode") -> float:
+def _worst_error(episode: "Episode") -> float:
     """Return the larger of an episode's energy and twist errors."""
     return max(abs(episode.energy_error), episode.twist_error)
 
 
-def _unlike(result: "SixAxisRun") -> list[bool]:
+def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
     """Return for every episode whether the real contact is unlike the ideal one."""
-    from jaxhil.simulation.contact_bounds import unlike_ideal
+    from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 
     period = result.mechanism.rig.control_period
     return [
-        unlike_ideal(
+        is_contact_out_of_bounds(
             episode.peak_force,
             episode.reference_peak_force,
             episode.duration,
@@ -114,30 +121,30 @@ def _unlike(result: "SixAxisRun") -> list[bool]:
     ]
 
 
-def _write(options: Simulate, result: "SixAxisRun") -> None:
+def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
     """Write the plot, the animation and the log that the options request."""
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     if options.plot is not None:
-        from jaxhil.files import follow, writing
-        from jaxhil.simulation.contact_plot import save
+        from jaxhil.files import report_write_errors, resolve_output_path
+        from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.six_axes import six_axes_plot
 
-        with writing(options.plot):
-            save(six_axes_plot(result.ticks, title), follow(options.plot))
+        with report_write_errors(options.plot):
+            save_figure(six_axes_plot(result.ticks, title), resolve_output_path(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.animate is not None:
-        from jaxhil.files import follow, writing
+        from jaxhil.files import report_write_errors, resolve_output_path
         from tuning.plots.animation import animate
 
-        with writing(options.animate):
-            animate(result.ticks, title, follow(options.animate))
+        with report_write_errors(options.animate):
+            animate(result.ticks, title, resolve_output_path(options.animate))
         terminal.note(f"wrote {options.animate}")
     if options.log is not None:
         result.to_csv(options.log)
         terminal.note(f"wrote {options.log}")
 
 
-def _document(options: Simulate, result: "SixAxisRun", good: bool) -> dict[str, Any]:
+def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) -> dict[str, Any]:
     """Return the JSON document of the run."""
     return {
         "mechanism": result.mechanism.name,
@@ -154,7 +161,7 @@ def _document(options: Simulate, result: "SixAxisRun", good: bool) -> dict[str, 
     }
 
 
-def _print(options: Simulate, result: "SixAxisRun", good: bool) -> None:
+def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
     """Print the table of episodes and the verdict."""
     rows = [
         [
@@ -178,13 +185,13 @@ def _print(options: Simulate, result: "SixAxisRun", good: bool) -> None:
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title += f", {rule}" if result.compensator != "none" else ""
     terminal.emit(
-        terminal.table(title, headings, rows, texts=(len(headings) - 1,)),
-        *(_more(number, episode) for number, episode in enumerate(result.episodes, start=1)),
+        terminal.build_table(title, headings, rows, texts=(len(headings) - 1,)),
+        *(_describe_twist_error(number, episode) for number, episode in enumerate(result.episodes, start=1)),
         _verdict(options, result, good),
     )
 
 
-def _more(number: int, episode: "Episode") -> str:
+def _describe_twist_error(number: int, episode: "Episode") -> str:
     """Return a sentence with the parts of an episode's twist error and the ideal contact's values."""
     parts = f"normal {episode.normal_part:+.3f}, lateral {episode.lateral_part:.3f}"
     parts += f", rotational {episode.rotational_part:.3f}"
@@ -194,25 +201,25 @@ def _more(number: int, episode: "Episode") -> str:
     return f"Episode {number}: twist error {parts}; in space {space}; {touches}."
 
 
-def _verdict(options: Simulate, result: "SixAxisRun", good: bool) -> str:
+def _verdict(options: SimulateOptions, result: "SixAxisRun", good: bool) -> str:
     """Return the verdict and its reason."""
-    from jaxhil.simulation.contact_bounds import BRIEFLY, STATED
+    from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT, CONTACT_BOUNDS_TEXT
 
     if result.status == "miss":
         return "Bad: nothing touched."
-    if result.status not in GOOD:
+    if result.status not in GOOD_STATUSES:
         return f"Bad: the run ended with status '{result.status}'."
     if good:
-        return f"Good: every energy and twist error is within {options.limit:g}, {STATED}."
-    if all(_worst(episode) <= options.limit for episode in result.episodes):
-        number = _unlike(result).index(True)
+        return f"Good: every energy and twist error is within {options.limit:g}, {CONTACT_BOUNDS_TEXT}."
+    if all(_worst_error(episode) <= options.limit for episode in result.episodes):
+        number = _is_unlike_ideal(result).index(True)
         episode = result.episodes[number]
         force, time = (
             episode.peak_force / episode.reference_peak_force,
             episode.duration / episode.reference_duration,
         )
         reason = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
-        return f"Bad: episode {number + 1}: {reason}, allowed {BRIEFLY}."
-    worst = max(result.episodes, key=_worst)
+        return f"Bad: episode {number + 1}: {reason}, expected {CONTACT_BOUNDS_SHORT_TEXT}."
+    worst = max(result.episodes, key=_worst_error)
     errors = f"{worst.energy_error:+.4f} and {worst.twist_error:.4f}"
-    return f"Bad: the largest energy and twist errors are {errors}, allowed {options.limit:g}."
+    return f"Bad: the largest energy and twist errors are {errors}, limit {options.limit:g}."

@@ -2,25 +2,25 @@
 
 from pathlib import Path
 
-from jaxhil.simulation.environment import prepare
+from jaxhil.simulation.jax_environment import prepare_jax
 from tuning import terminal
+from tuning.api.arguments import find_gain_file
+from tuning.api.sweep import run_study
 from tuning.cli.commands import sweep_tables
 from tuning.cli.options import Sweep
-from tuning.front_door.arguments import readable_gain_file
-from tuning.front_door.sweep import run_study
 
 
 def run(options: Sweep) -> int:
     """Run the scenarios that the store lacks, and report all; return 0 if the verdict is good, else 1."""
     options.check()
-    path = readable_gain_file(options.gains)
-    prepare()
+    path = find_gain_file(options.gains)
+    prepare_jax()
     folder = path.with_name(f"{path.stem}-sweep") if options.output is None else Path(options.output)
     study = run_study(path, options, folder, progress=True)
     if options.json:
         terminal.emit_json(study.document)
     else:
-        sweep_tables.emit(study.document)
+        sweep_tables.print_sweep(study.document)
     if study.unwritten:
         raise study.unwritten[0]
     return 0 if study.verdict == "good" else 1

@@ -5,27 +5,27 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.files import make_folder, remove_stale, writing
-from jaxhil.mechanism.file import AnyMechanism, LoadedAny, load_any, to_builtins
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import make_folder, remove_stale, report_write_errors
+from jaxhil.mechanism.file import AnyMechanism, LoadedAnyMechanism, load_any, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.environment import prepare, program_folder
+from jaxhil.simulation.jax_environment import prepare_jax, program_folder
 from tuning import terminal
+from tuning.api import mechanism_summary
+from tuning.api.tune import tune_each
+from tuning.api.tuned_gains import TunedGains
 from tuning.cli.commands import checks, tune_pareto
-from tuning.cli.commands.checks import folder_name
-from tuning.cli.commands.resuming import pieces_in, say_of_pieces
-from tuning.cli.commands.tune_tables import print_one, print_overview
+from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
+from tuning.cli.commands.checks import make_folder_name
+from tuning.cli.commands.tune_tables import print_overview, print_result
 from tuning.cli.options import Tune
-from tuning.front_door import meaning
-from tuning.front_door.tune import tune_each
-from tuning.front_door.tuned_gains import TunedGains
 
 if TYPE_CHECKING:
-    from tuning.caches.pieces import Pieces
+    from tuning.caches.checkpoints import Checkpoints
 
 PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
-OVERVIEW = "overview.png"
-MOST_DRAWN = 4  # largest number of mechanisms with plots each; more mechanisms share one plot
+OVERVIEW_FILE = "overview.png"
+MAX_PLOTTED_MECHANISMS = 4  # largest number of mechanisms with plots each; more mechanisms share one plot
 
 
 def run(options: Tune) -> int:
@@ -35,11 +35,11 @@ def run(options: Tune) -> int:
     repeated.
     """
     if options.pareto:
-        prepare()
+        prepare_jax()
     options.check()
     if options.start or options.setting is not None:
         # Errors in these options are reported before errors in the files.
-        prepare()
+        prepare_jax()
         options.settings()
         options.known()
     loaded, problems = _load(options)
@@ -47,14 +47,14 @@ def run(options: Tune) -> int:
     if loaded:
         # This is checked before jax starts, so that no tuning is lost if the folder cannot be written.
         _check_output(Path(options.output), [entry.mechanism for entry in loaded])
-        loaded = _understood(options, loaded, problems)
+        loaded = _check_mechanisms(options, loaded, problems)
     if loaded:
-        pieces = pieces_in(options.output, options.resume)
+        pieces = open_checkpoints(options.output, options.resume)
         try:
             entries = _tune_all(options, loaded, problems, pieces)
-        except _Interrupted as stop:
+        except _TuningInterrupted as stop:
             entries, interrupted = stop.entries, True
-        say_of_pieces(pieces)
+        warn_about_checkpoints(pieces)
     if options.json:
         terminal.emit_json(
             {
@@ -85,36 +85,39 @@ def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
 
     Warn if only the name of a mechanism is the same.
     """
-    checks.output(output)
+    checks.prepare_output_folder(output)
     for mechanism in mechanisms:
-        path = output / folder_name(mechanism.name) / "gains.json"
-        earlier = checks.own_results(path, "compensator", PLOTS, [mechanism.name])
-        if earlier and earlier.get("mechanism") != to_builtins(mechanism):
-            name = shown(mechanism.name)
-            terminal.warn([f"{one_line(str(path))}: replaced: it is of another mechanism of the name {name}"])
-    if len(mechanisms) > MOST_DRAWN and not any(output.glob("*/gains.json")):
-        checks.own_results(output / "gains.json", "compensator", [OVERVIEW])
+        path = output / make_folder_name(mechanism.name) / "gains.json"
+        earlier = checks.check_earlier_results(path, "compensator", PLOTS, [mechanism.name])
+        if earlier and earlier.get("mechanism") != to_plain_data(mechanism):
+            name = format_value(mechanism.name)
+            terminal.warn(
+                [f"{to_one_line(str(path))}: replaced: it is of another mechanism of the name {name}"]
+            )
+    if len(mechanisms) > MAX_PLOTTED_MECHANISMS and not any(output.glob("*/gains.json")):
+        checks.check_earlier_results(output / "gains.json", "compensator", [OVERVIEW_FILE])
 
 
-class _Interrupted(Exception):
+class _TuningInterrupted(Exception):
     """Error that carries the entries of the mechanisms that were finished before an interruption."""
 
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
 
 
-def _load(options: Tune) -> tuple[list[LoadedAny], list[str]]:
+def _load(options: Tune) -> tuple[list[LoadedAnyMechanism], list[str]]:
     """Load the mechanism files, and return the usable ones and the problems with the others."""
     loaded, problems, folders = [], [], {}
-    for file in _expand(options.files, problems):
+    for file in _expand_folders(options.files, problems):
         try:
             entry = load_any(file, options.overrides, options.unset)
             options.fits(entry.mechanism)
-            folder = folder_name(entry.mechanism.name)
+            folder = make_folder_name(entry.mechanism.name)
             if (first_label := folders.get(folder.casefold())) is not None:
                 raise InputError(
-                    f"{entry.label}: name: found {shown(entry.mechanism.name)}, allowed a name whose folder, "
-                    f"{one_line(folder)}, differs by more than capitals from that of {first_label}"
+                    f"{entry.label}: name: found {format_value(entry.mechanism.name)}, expected a name "
+                    "whose folder, "
+                    f"{to_one_line(folder)}, differs by more than capitals from that of {first_label}"
                 )
             folders[folder.casefold()] = entry.label
             loaded.append(entry)
@@ -125,24 +128,26 @@ def _load(options: Tune) -> tuple[list[LoadedAny], list[str]]:
     return loaded, problems
 
 
-def _understood(options: Tune, loaded: list[LoadedAny], problems: list[str]) -> list[LoadedAny]:
+def _check_mechanisms(
+    options: Tune, loaded: list[LoadedAnyMechanism], problems: list[str]
+) -> list[LoadedAnyMechanism]:
     """Return the mechanisms that can be simulated, and print a summary of each; report the others."""
-    prepare()
+    prepare_jax()
     options.settings()
     usable = []
     for entry in loaded:
         try:
-            meaning.check(entry.mechanism, entry.label)
+            mechanism_summary.check_can_be_simulated(entry.mechanism, entry.label)
         except InputError as error:
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
         else:
-            meaning.say(entry.mechanism, None if options.json else terminal.emit_line)
+            mechanism_summary.report_summary(entry.mechanism, None if options.json else terminal.emit_line)
             usable.append(entry)
     return usable
 
 
-def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
+def _expand_folders(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
     """Return every file, a folder replaced by its .toml files; [None] for the default mechanism."""
     expanded: list[str | None] = []
     for file in files:
@@ -151,7 +156,9 @@ def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
             continue
         inside = sorted(str(path) for path in Path(file).glob("*.toml"))
         if not inside:
-            problems.append(f"{one_line(file)}: found no mechanism file, allowed a folder with .toml files")
+            problems.append(
+                f"{to_one_line(file)}: found no mechanism file, expected a folder with .toml files"
+            )
             terminal.note(f"jaxhil: {problems[-1]}")
         expanded.extend(inside)
     return expanded if files else [None]
@@ -159,23 +166,23 @@ def _expand(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
 
 def _tune_all(
     options: Tune,
-    loaded: list[LoadedAny],
+    loaded: list[LoadedAnyMechanism],
     problems: list[str],
-    pieces: "Pieces",
+    pieces: "Checkpoints",
 ) -> list[dict[str, Any]]:
     """Tune all mechanisms, write and print the results, and return their entries in order."""
-    prepare()
+    prepare_jax()
     entries, done, fronts = {}, {}, {}
-    drawn = len(loaded) <= MOST_DRAWN
+    drawn = len(loaded) <= MAX_PLOTTED_MECHANISMS
     try:
-        with terminal.progress(len(loaded), "mechanisms") as bar, ThreadPoolExecutor(1) as meanwhile:
+        with terminal.show_progress(len(loaded), "mechanisms") as bar, ThreadPoolExecutor(1) as meanwhile:
             if drawn and program_folder() is not None:
                 first = loaded[0].mechanism
                 if isinstance(first, Mechanism):
                     meanwhile.submit(_prepare_drawing, first, options.compensator)
             for index, result in tune_each(loaded, options, bar, pieces):
                 try:
-                    entries[index] = _finish(options, loaded[index], result, drawn, bar.say)
+                    entries[index] = _write_result(options, loaded[index], result, drawn, bar.say)
                 except InputError as error:
                     problems.append(str(error))
                     terminal.note(f"jaxhil: {error}")
@@ -183,14 +190,16 @@ def _tune_all(
                 done[index] = result
                 terminal.warn(f"{result.mechanism.name}: {text}" for text in result.warnings)
                 if not options.json and drawn:
-                    print_one(options, result.found, entries[index])
+                    print_result(options, result.found, entries[index])
         if options.pareto and done:
-            with terminal.progress(len(done), "fronts") as bar:
-                fronts = tune_pareto.trade(options, done, entries, problems, bar, pieces)
+            with terminal.show_progress(len(done), "fronts") as bar:
+                fronts = tune_pareto.compute_fronts(options, done, entries, problems, bar, pieces)
     except KeyboardInterrupt:
-        raise _Interrupted(_in_order(entries)) from None
+        raise _TuningInterrupted(_sort_by_index(entries)) from None
     if len(loaded) > 1 and done:
-        _overview(options, [gains.found for gains in _in_order(done)], _in_order(entries), drawn)
+        _show_overview(
+            options, [gains.found for gains in _sort_by_index(done)], _sort_by_index(entries), drawn
+        )
     if not options.json and drawn:
         for index in sorted(fronts):
             tune_pareto.print_front(options, done[index].found, fronts[index], entries[index]["pareto"])
@@ -198,33 +207,33 @@ def _tune_all(
         terminal.emit(
             f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
         )
-    return _in_order(entries)
+    return _sort_by_index(entries)
 
 
-def _overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
+def _show_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
     """Print the table of all mechanisms, and draw one common plot if they have no plots each."""
     if not drawn:
-        from jaxhil.simulation.contact_plot import save
+        from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.tuning_results import overview_plot
 
-        save(overview_plot(results, options.limit), Path(options.output) / OVERVIEW)
+        save_figure(overview_plot(results, options.limit), Path(options.output) / OVERVIEW_FILE)
     if not options.json:
         print_overview(options, results, entries, drawn)
 
 
-def _in_order(by_index: dict[int, Any]) -> list[Any]:
+def _sort_by_index(by_index: dict[int, Any]) -> list[Any]:
     """Return the values of a dictionary, sorted by index."""
     return [by_index[index] for index in sorted(by_index)]
 
 
-def _finish(
-    options: Tune, loaded: LoadedAny, result: TunedGains, drawn: bool, say: Callable[[str], None]
+def _write_result(
+    options: Tune, loaded: LoadedAnyMechanism, result: TunedGains, drawn: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Write the gain file and the plots of one mechanism, and return its entry."""
     from tuning.gains.tasks import has_sensor_noise
 
-    folder = Path(options.output) / folder_name(loaded.mechanism.name)
-    with writing(folder):
+    folder = Path(options.output) / make_folder_name(loaded.mechanism.name)
+    with report_write_errors(folder):
         make_folder(folder)
         remove_stale(folder)
     result.save(folder / "gains.json")
@@ -250,8 +259,8 @@ def _finish(
         "warnings": result.warnings,
         "tuned_intervals": tuned.intervals.plain() if tuned.intervals else None,
         "honesty": tuned.transparency,
-        "starts": [_start(start) for start in tuned.starts],
-        "carried_over": _carried_over(tuned),
+        "starts": [_start_entry(start) for start in tuned.starts],
+        "carried_over": _starts_from_earlier_gains(tuned),
         "freedom": {name: tolerance._asdict() for name, tolerance in tuned.freedom.items()},
         "certified": tuned.global_comparison._asdict() if tuned.global_comparison else None,
         "timings": tuned.timings,
@@ -261,23 +270,23 @@ def _finish(
     }
 
 
-def _start(start) -> dict[str, Any]:
+def _start_entry(start) -> dict[str, Any]:
     """Return the JSON entry of a start of the solver."""
     return {
         name: value for name, value in start._asdict().items() if name not in ("coordinates", "curvature")
     }
 
 
-def _carried_over(result) -> list[dict[str, Any]]:
+def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
     """Return the starts that began at earlier tuned gains, with their mechanisms and distances."""
-    from tuning.gains.transfer import distance
+    from tuning.gains.transfer import compute_mechanism_distance
 
     return [
         {
             "start": result.usual_starts + number,
             "source": earlier.source,
             "mechanism": earlier.mechanism.name,
-            "distance": distance(result.mechanism, earlier.mechanism),
+            "distance": compute_mechanism_distance(result.mechanism, earlier.mechanism),
         }
         for number, earlier in enumerate(result.first, start=1)
     ]
@@ -286,12 +295,14 @@ def _carried_over(result) -> list[dict[str, Any]]:
 def _prepare_drawing(mechanism, compensator: str) -> None:
     """Import and compile the code for the plots while the solver compiles on another core."""
     from jaxhil.laws.compensators import literature_gains
-    from jaxhil.simulation.motion import prepare_motion
-    from tuning.gains.tune import uncompensated
+    from jaxhil.simulation.motion_curves import prepare_motion
+    from tuning.gains.tune import remove_compensation
     from tuning.plots import tuning_results  # noqa: F401
 
     gains = literature_gains(mechanism, compensator)
-    prepare_motion(mechanism, {"before": uncompensated(compensator, gains), "tuned": (compensator, gains)})
+    prepare_motion(
+        mechanism, {"before": remove_compensation(compensator, gains), "tuned": (compensator, gains)}
+    )
 
 
 def is_better(figures, other) -> bool:
@@ -301,25 +312,25 @@ def is_better(figures, other) -> bool:
 
 def _draw(result, options: Tune, folder: Path) -> list[str]:
     """Draw the plots of one mechanism, and return their paths."""
-    from jaxhil.simulation.contact_plot import contact_plot, save
-    from jaxhil.simulation.motion import nominal_motion
-    from tuning.gains.tune import uncompensated
-    from tuning.plots.tuning_results import errors_plot, loss_plot, two_errors_plot
+    from jaxhil.simulation.contact_plot import plot_contacts, save_figure
+    from jaxhil.simulation.motion_curves import compute_nominal_motion
+    from tuning.gains.tune import remove_compensation
+    from tuning.plots.tuning_results import errors_plot, loss_plot, six_axis_errors_plot
 
     name, compensator = result.mechanism.name, options.compensator
     if isinstance(result.mechanism, Mechanism):
-        before, tuned = uncompensated(compensator, result.literature), (compensator, result.gains)
-        motion = nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
+        before, tuned = remove_compensation(compensator, result.literature), (compensator, result.gains)
+        motion = compute_nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
         figures = {
             "errors.png": errors_plot(result, options.limit),
-            "contact.png": contact_plot(motion, f"{name}: nominal run, {compensator}"),
+            "contact.png": plot_contacts(motion, f"{name}: nominal run, {compensator}"),
         }
     else:
-        figures = {"errors.png": two_errors_plot(result, options.limit)}
+        figures = {"errors.png": six_axis_errors_plot(result, options.limit)}
     if result.starts:
         figures["loss.png"] = loss_plot(result)
     for file, figure in figures.items():
-        save(figure, folder / file)
+        save_figure(figure, folder / file)
     return [str(folder / file) for file in figures]
 
 

@@ -5,31 +5,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.errors import InputError
-from jaxhil.files import make_folder, open_plain, remove_stale, writing
+from jaxhil.files import make_folder, open_regular, remove_stale, report_write_errors
 from tuning import terminal
+from tuning.api import tune_pareto
+from tuning.api.tuned_gains import TradedGains, TunedGains
 from tuning.cli.options import Tune
-from tuning.front_door import tune_pareto
-from tuning.front_door.tuned_gains import TradedGains, TunedGains
 
 if TYPE_CHECKING:
-    from tuning.caches.pieces import Pieces
+    from tuning.caches.checkpoints import Checkpoints
 
-FOLDER = "pareto"
+FRONT_FOLDER = "pareto"
 
 
-def trade(
+def compute_fronts(
     options: Tune,
     done: Mapping[int, TunedGains],
     entries: Mapping[int, dict[str, Any]],
     problems: list[str],
     bar: terminal.Progress,
-    pieces: "Pieces",
+    pieces: "Checkpoints",
 ) -> dict[int, Any]:
     """Compute and write the fronts of the tuned mechanisms, add them to `entries`, and return them."""
     order, fronts = sorted(done), {}
     results = [done[index] for index in order]
     arguments = options.pareto, options.pareto_against, bar, pieces, options.scheduler
-    for number, points in tune_pareto.trade(results, *arguments):
+    for number, points in tune_pareto.compute_fronts(results, *arguments):
         index = order[number]
         folder = Path(entries[index]["gain_file"]).parent
         try:
@@ -45,17 +45,17 @@ def trade(
 def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -> None:
     """Print every point, and the point of least cost whose error is within the limit."""
     rows: list[list[Any]] = [
-        ["literature's rule", None, *_numbers(result, front.literature), ""],
-        ["tuned", None, *_numbers(result, front.tuned), ""],
+        ["literature's rule", None, *_point_cells(result, front.literature), ""],
+        ["tuned", None, *_point_cells(result, front.tuned), ""],
     ]
     for number, point in enumerate(front.points, start=1):
         like = next(n for n, earlier in enumerate(front.points, start=1) if earlier.place == point.place)
         remark = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
-        rows.append([str(number), point.weight, *_numbers(result, point), remark])
+        rows.append([str(number), point.weight, *_point_cells(result, point), remark])
     axis = front.axis
     weight = axis.weight.replace("_", " ")
-    headings = ["point", weight, axis.name, *([] if _is_rms(result) else ["objective"])]
-    table = terminal.table(
+    headings = ["point", weight, axis.name, *([] if _is_rms_objective(result) else ["objective"])]
+    table = terminal.build_table(
         f"{result.mechanism.name}: restitution error against {axis.words}, "
         f"{options.validation} fresh scenarios",
         [*headings, "rms", "99th pct", "max", "not ended", ""],
@@ -84,22 +84,22 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
 
 def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
     """Write a gain file for each point and the plot of all, and return the entry for `--json`."""
-    from jaxhil.simulation.contact_plot import save
+    from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.tuning_results import front_plot
 
     front, result, entries = points[0].front, points[0].tuned.found, []
     for number, point in enumerate(points, start=1):
-        point_folder = folder / FOLDER / f"{number:02d}"
-        for target in (folder / FOLDER, point_folder):
-            with writing(target):
+        point_folder = folder / FRONT_FOLDER / f"{number:02d}"
+        for target in (folder / FRONT_FOLDER, point_folder):
+            with report_write_errors(target):
                 make_folder(target)
                 remove_stale(target)
         point.save(point_folder / "gains.json")
         gains = {"gain_file": str(point_folder / "gains.json"), "gains": point.document["gains"]}
         entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})
-    _remove_others(folder / FOLDER, len(entries))
+    _remove_stale_points(folder / FRONT_FOLDER, len(entries))
     plot = folder / "pareto.png"
-    save(front_plot(front, result, options.limit), plot)
+    save_figure(front_plot(front, result, options.limit), plot)
     axis = front.axis
     others = {
         name: {axis.cost: fixed.cost, "error": fixed.error, "figures": fixed.figures}
@@ -108,7 +108,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
     return {"against": axis.name, "points": entries, **others, "plot": str(plot)}
 
 
-def _remove_others(folder: Path, number: int) -> None:
+def _remove_stale_points(folder: Path, number: int) -> None:
     """Remove the gain files of an earlier, longer front from the folder."""
     for path in folder.iterdir():
         name = path.name
@@ -125,14 +125,14 @@ def _is_gain_file(path: Path) -> bool:
     from jaxhil.simulation.gain_file import load_gain_file
 
     try:
-        open_plain(path).close()
+        open_regular(path).close()
         load_gain_file(path)
     except (InputError, OSError):
         return False
     return True
 
 
-def _is_rms(result: Any) -> bool:
+def _is_rms_objective(result: Any) -> bool:
     """Return whether the objective without the traded term is the rms error itself."""
     objective = result.settings.objective
     weights = (
@@ -144,10 +144,10 @@ def _is_rms(result: Any) -> bool:
     return (objective.name, *weights) == ("rms", 1.0, 0.0, 0.0, 0.0)
 
 
-def _numbers(result: Any, point: Any) -> list[Any]:
+def _point_cells(result: Any, point: Any) -> list[Any]:
     """Return the cells of a point: cost, errors, and failed contacts."""
     figures = point.figures
-    errors = [figures.rms] if _is_rms(result) else [point.error, figures.rms]
+    errors = [figures.rms] if _is_rms_objective(result) else [point.error, figures.rms]
     # A small cost is an error, not a factor.
     cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
     return [cost, *errors, figures.p99, figures.max, figures.failed]

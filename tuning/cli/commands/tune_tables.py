@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 from tuning import terminal
+from tuning.api.tune_verdict import describe_verdict
 from tuning.cli.options import Tune
-from tuning.front_door.tune_verdict import verdict_line
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
@@ -30,7 +30,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         else "e - e*"
     )
     terminal.emit(
-        terminal.table(
+        terminal.build_table(
             f"rms of {error} on {options.validation} fresh scenarios each, {options.compensator}",
             [*headings, "best start", "verdict"],
             rows,
@@ -41,24 +41,26 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         terminal.emit(f"wrote {options.output}/NAME/gains.json and {options.output}/overview.png", "")
 
 
-def print_one(options: Tune, result: Any, entry: dict[str, Any]) -> None:
+def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     """Print errors, gains and starts of one mechanism, and the verdict."""
     if "energy_error" in entry:
-        tables = [_two_errors(options, result, entry)]
+        tables = [_six_axis_error_table(options, result, entry)]
     else:
-        tables = [_errors(options, result, entry["better_than_literature"])]
-    tables += [_transparency(result)] if result.transparency else []
-    tables += [*_gains(options, result), *([_starts(options, result)] if result.starts else [])]
-    closing = [*_aims(options, result)]
+        tables = [_error_table(options, result, entry["better_than_literature"])]
+    tables += [_transparency_table(result)] if result.transparency else []
+    tables += [*_gain_tables(options, result), *([_start_table(options, result)] if result.starts else [])]
+    closing = [*_describe_aim(options, result)]
     closing += [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
     if not entry["sensor_noise"]:
         noise = "'{force=0.5,torque=0.05}'" if "energy_error" in entry else "2.67"
         closing.append(f"No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std={noise}")
     closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
-    terminal.emit(*tables, *_how_sure(result), *closing, verdict_line(result, options.limit), "")
+    terminal.emit(
+        *tables, *_describe_confidence(result), *closing, describe_verdict(result, options.limit), ""
+    )
 
 
-def _errors(options: Tune, result: Any, better: bool) -> Any:
+def _error_table(options: Tune, result: Any, better: bool) -> Any:
     """Return the table of restitution errors before tuning, with the literature's gains and tuned."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     judged, rows = {**result.figures}, []
@@ -82,14 +84,14 @@ def _errors(options: Tune, result: Any, better: bool) -> Any:
             )
         )
     count = int(result.outcomes["tuned"].wanted.sum())
-    return terminal.table(
+    return terminal.build_table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
         ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
         rows,
     )
 
 
-def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
+def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
     """Return the table of energy and twist errors of a six-axis mechanism."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     if not entry["better_than_literature"]:
@@ -108,7 +110,7 @@ def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
             )
             rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
     count = int(result.outcomes["tuned"].wanted.sum()) // 2
-    return terminal.table(
+    return terminal.build_table(
         f"{result.mechanism.name}: errors of {count} episodes in {options.validation} fresh scenarios",
         ["gains", "error", "rms", "99th pct", "max", "mean", "peak ratio", "not ended"],
         rows,
@@ -116,9 +118,9 @@ def _two_errors(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
     )
 
 
-def _gains(options: Tune, result: Any) -> list[Any]:
+def _gain_tables(options: Tune, result: Any) -> list[Any]:
     """Return a list with the table of gains; an empty one if the compensator has no gains."""
-    from jaxhil.laws.compensators import compensator_of
+    from jaxhil.laws.compensators import get_compensator
 
     mechanism = result.mechanism
     rows = [
@@ -128,13 +130,17 @@ def _gains(options: Tune, result: Any) -> list[Any]:
             result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
             *([f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())] or ["", ""]),
         )
-        for gain in compensator_of(options.compensator).gains
+        for gain in get_compensator(options.compensator).gains
     ]
     headings = ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"]
-    return [terminal.table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))] if rows else []
+    return (
+        [terminal.build_table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))]
+        if rows
+        else []
+    )
 
 
-def _aims(options: Tune, result: Any) -> list[str]:
+def _describe_aim(options: Tune, result: Any) -> list[str]:
     """Return a sentence on the aim of tuning, least noise or least error, if results decided it."""
     if not result.settings.quiet or result.without_noise is None or not result.starts:
         return []
@@ -145,7 +151,7 @@ def _aims(options: Tune, result: Any) -> list[str]:
     ]
 
 
-def _how_sure(result: Any) -> list[str]:
+def _describe_confidence(result: Any) -> list[str]:
     """Return sentences on the tolerance of the gains, the starts and the global search."""
     lines = []
     if result.freedom:
@@ -169,35 +175,35 @@ def _how_sure(result: Any) -> list[str]:
     return lines
 
 
-def _transparency(result: Any) -> Any:
+def _transparency_table(result: Any) -> Any:
     """Return the table of transparency metrics with the literature's and the tuned gains."""
     labels = {"literature": "literature's rule", "tuned": "tuned"}
     rows = [
-        [label, *(_with_ends(metric) for metric in result.transparency[key].values())]
+        [label, *(_format_with_interval(metric) for metric in result.transparency[key].values())]
         for key, label in labels.items()
     ]
-    return terminal.table(
+    return terminal.build_table(
         "Honesty: transparency to an early and a late push, slope of e against e*, peak command (95 %)",
         ["gains", *result.transparency["tuned"]],
         rows,
     )
 
 
-def _with_ends(figure: Any) -> str:
+def _format_with_interval(figure: Any) -> str:
     """Return a metric with its confidence interval as text."""
-    value, low, high = (terminal.figure(float(number), 3) for number in figure)
+    value, low, high = (terminal.format_number(float(number), 3) for number in figure)
     return f"{value} ({low} to {high})"
 
 
-def _starts(options: Tune, result: Any) -> Any:
+def _start_table(options: Tune, result: Any) -> Any:
     """Return the table of all starts; it has a column for their origins if any was not the default."""
     objective_name = "objective" if result.settings.probed else options.objective
     headings = ["start", "status", "steps", f"{objective_name} on training scenarios"]
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]
     if not result.first:
-        return terminal.table("Starts", headings, rows, texts=(1,))
+        return terminal.build_table("Starts", headings, rows, texts=(1,))
     origins = ["literature", *["spread"] * (len(rows) - 1)]
     for number, earlier in enumerate(result.first, start=result.usual_starts):
         origins[number] = f"gains of {earlier.source}"
     rows = [[*row, origin] for row, origin in zip(rows, origins, strict=True)]
-    return terminal.table("Starts", [*headings, "begins at"], rows, texts=(1, 4))
+    return terminal.build_table("Starts", [*headings, "begins at"], rows, texts=(1, 4))

@@ -3,8 +3,8 @@
 from typing import Any
 
 from tuning import terminal
+from tuning.api.verify import verify
 from tuning.cli.options_rig import Verify
-from tuning.front_door.verify import verify
 
 
 def run(options: Verify) -> int:
@@ -24,7 +24,7 @@ def run(options: Verify) -> int:
     return 0 if result.good else 1
 
 
-def _exponential(value: float | None) -> str:
+def _format_exponential(value: float | None) -> str:
     """Return a number in exponential notation, or a dash for None."""
     # The document stores values that are not finite as None.
     return "-" if value is None else f"{value:.1e}"
@@ -32,34 +32,34 @@ def _exponential(value: float | None) -> str:
 
 def _print(document: dict[str, Any]) -> None:
     """Print the tables of the verification and the verdict."""
-    from jaxhil.simulation.contact_bounds import BRIEFLY
+    from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
     tables: list[Any] = list(document.get("self_test", ()))
     if "signature" in document:
         tables.append(f"Signature: {document['signature']}.")
     if "replay" in document:
         tables += [
-            terminal.table(
+            terminal.build_table(
                 f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
                 ["run", "ticks", "compared", "near a threshold", "command range [N]", "largest difference"],
                 [
                     (
                         *("nominal" if number == 0 else f"draw {number}", lane["ticks"], lane["compared"]),
-                        *(lane["near"], lane["command_range"], _exponential(lane["difference"])),
+                        *(lane["near"], lane["command_range"], _format_exponential(lane["difference"])),
                     )
                     for number, lane in enumerate(document["replay"])
                 ],
             ),
-            terminal.table(
+            terminal.build_table(
                 "Nominal contacts with the runtime in the loop",
                 ["contact", "e", "e simulated", "force / ideal", "duration / ideal", "status", "simulated"],
                 [
                     (
-                        *(number, terminal.figure(contact["restitution"], 9)),
-                        terminal.figure(contact["simulated_restitution"], 9),
+                        *(number, terminal.format_number(contact["restitution"], 9)),
+                        terminal.format_number(contact["simulated_restitution"], 9),
                         *(
-                            terminal.figure(contact["peak_force_ratio"]),
-                            terminal.figure(contact["duration_ratio"]),
+                            terminal.format_number(contact["peak_force_ratio"]),
+                            terminal.format_number(contact["duration_ratio"]),
                         ),
                         contact["status"],
                         contact["simulated_status"],
@@ -72,7 +72,7 @@ def _print(document: dict[str, Any]) -> None:
     if document["verdict"]:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, restitutions to "
-            f"{document['closed_loop_limit']:.0e}; real contact: {BRIEFLY}."
+            f"{document['closed_loop_limit']:.0e}; real contact: {CONTACT_BOUNDS_SHORT_TEXT}."
         ]
     else:
         lines = [f"Bad: {reason}" for reason in document["reasons"]]

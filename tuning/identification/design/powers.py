@@ -18,23 +18,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ROUNDS = 400
+POWER_ITERATIONS = 400
 
 
 @dataclass(frozen=True)
-class Group:
+class RunLines:
     """Lines of one run."""
 
     information: np.ndarray  # (lines, parameters, parameters), per unit power
     use: np.ndarray  # (limits, lines), share of each limit per unit power
 
 
-def best_powers(groups: Sequence[Group], weight: np.ndarray) -> list[np.ndarray]:
+def optimise_powers(groups: Sequence[RunLines], weight: np.ndarray) -> list[np.ndarray]:
     """Return the powers of each group that minimize trace(A I^-1) within its limits; A is `weight`."""
-    powers = [flat_powers(group) for group in groups]
+    powers = [make_flat_powers(group) for group in groups]
     prices = [np.ones(len(group.use)) for group in groups]
-    for _ in range(ROUNDS):
-        spread = inverse(information(groups, powers))
+    for _ in range(POWER_ITERATIONS):
+        spread = invert_scaled(sum_information(groups, powers))
         worth = spread @ weight @ spread
         for index, group in enumerate(groups):
             gain = np.einsum("ij,lji->l", worth, group.information)
@@ -46,19 +46,19 @@ def best_powers(groups: Sequence[Group], weight: np.ndarray) -> list[np.ndarray]
     return powers
 
 
-def flat_powers(group: Group) -> np.ndarray:
+def make_flat_powers(group: RunLines) -> np.ndarray:
     """Return equal powers at all lines, as large as the limits allow."""
     lines = group.use.shape[1]
     return np.full(lines, 1.0 / (group.use @ np.ones(lines)).max())
 
 
-def information(groups: Sequence[Group], powers: Sequence[np.ndarray]) -> np.ndarray:
+def sum_information(groups: Sequence[RunLines], powers: Sequence[np.ndarray]) -> np.ndarray:
     """Return the information matrix of all lines together."""
     parts = [np.einsum("l,lij->ij", p, group.information) for group, p in zip(groups, powers, strict=True)]
     return np.sum(parts, axis=0)
 
 
-def inverse(matrix: np.ndarray) -> np.ndarray:
+def invert_scaled(matrix: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric matrix whose parameters have very different units."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return np.linalg.pinv(matrix / np.outer(size, size), rcond=1e-14, hermitian=True) / np.outer(size, size)

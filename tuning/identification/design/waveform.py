@@ -12,16 +12,22 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-Limited = tuple[np.ndarray | complex, float]  # response of a signal to the wave, at its lines, and its limit
-PLAIN: Limited = (1.0 + 0.0j, 1.0)
+LimitedSignal = tuple[
+    np.ndarray | complex, float
+]  # response of a signal to the wave, at its lines, and its limit
+UNLIMITED_SIGNAL: LimitedSignal = (1.0 + 0.0j, 1.0)
 
-STARTS = 1  # number of random starts
-DOUBLINGS = 3, 5  # base-2 logarithms of the powers: the 8th, then the 32nd
-STEPS = 40  # solver iterations for each power
+RANDOM_STARTS = 1  # number of random starts
+NORM_POWER_LOG2 = 3, 5  # base-2 logarithms of the powers: the 8th, then the 32nd
+MAX_SOLVER_ITERATIONS = 40  # solver iterations for each power
 
 
-def phases(
-    amplitude: np.ndarray, lines: np.ndarray, rows: int, limited: Sequence[Limited] = (PLAIN,), seed: int = 0
+def optimise_phases(
+    amplitude: np.ndarray,
+    lines: np.ndarray,
+    rows: int,
+    limited: Sequence[LimitedSignal] = (UNLIMITED_SIGNAL,),
+    seed: int = 0,
 ) -> np.ndarray:
     """Return phases [rad] of the lines that keep peaks low.
 
@@ -38,22 +44,26 @@ def phases(
     # Schroeder: the group delay at a line is proportional to the power below it.
     schroeder = -2.0 * np.pi * np.cumsum(np.cumsum(power) - power) * np.gradient(lines.astype(float))
     rng = np.random.default_rng(seed)
-    starts = [schroeder, *rng.uniform(0.0, 2.0 * np.pi, (STARTS, len(lines)))]
-    tried = [_lowered(amplitude, lines, rows, limited, angles) for angles in starts]
+    starts = [schroeder, *rng.uniform(0.0, 2.0 * np.pi, (RANDOM_STARTS, len(lines)))]
+    tried = [_reduce_peak(amplitude, lines, rows, limited, angles) for angles in starts]
     return min(
         tried,
-        key=lambda candidate: max(np.abs(s).max() for s in made(amplitude, lines, rows, candidate, limited)),
+        key=lambda candidate: max(
+            np.abs(s).max() for s in make_limited_signals(amplitude, lines, rows, candidate, limited)
+        ),
     )
 
 
-def _lowered(amplitude, lines, rows, limited, angle) -> np.ndarray:
-    size = max(np.abs(signal).max() for signal in made(amplitude, lines, rows, angle, limited))
+def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
+    size = max(
+        np.abs(signal).max() for signal in make_limited_signals(amplitude, lines, rows, angle, limited)
+    )
 
     def mean(angle, doublings):
         """Return the logarithm of the mean of a power of all signals, and its derivative by the phases."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
-            limited, made(amplitude, lines, rows, angle, limited), strict=True
+            limited, make_limited_signals(amplitude, lines, rows, angle, limited), strict=True
         ):
             raised, one_less = signal / size, np.ones_like(signal)
             for _ in range(doublings):
@@ -64,20 +74,25 @@ def _lowered(amplitude, lines, rows, limited, angle) -> np.ndarray:
             slope += np.real(1j * amplitude * response / (limit * size) * np.exp(1j * angle) * pull)
         return np.log(total) / power, slope / total
 
-    for doublings in DOUBLINGS:
+    for doublings in NORM_POWER_LOG2:
         result: Any = optimize.minimize(
-            mean, angle, (doublings,), method="L-BFGS-B", jac=True, options={"maxiter": STEPS}
+            mean, angle, (doublings,), method="L-BFGS-B", jac=True, options={"maxiter": MAX_SOLVER_ITERATIONS}
         )
         angle = result.x
     return angle
 
 
-def made(amplitude, lines, rows, angle, limited: Sequence[Limited]) -> list[np.ndarray]:
+def make_limited_signals(amplitude, lines, rows, angle, limited: Sequence[LimitedSignal]) -> list[np.ndarray]:
     """Return one period of each limited signal over its limit."""
-    return [wave(amplitude * np.abs(r) / limit, lines, rows, angle + np.angle(r)) for r, limit in limited]
+    return [
+        synthesise_multisine(amplitude * np.abs(r) / limit, lines, rows, angle + np.angle(r))
+        for r, limit in limited
+    ]
 
 
-def wave(amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray) -> np.ndarray:
+def synthesise_multisine(
+    amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray
+) -> np.ndarray:
     """Return one period, the sum of amplitude_l cos(2 pi l n / rows + angle_l)."""
     spectrum = np.zeros(rows // 2 + 1, complex)
     spectrum[lines] = 0.5 * rows * amplitude * np.exp(1j * angle)
@@ -89,7 +104,7 @@ def crest_factor(values: np.ndarray) -> float:
     return float(np.abs(values).max() / np.sqrt(np.mean(values**2)))
 
 
-def repeated(period: np.ndarray, times: int, fade: int) -> np.ndarray:
+def repeat_with_fades(period: np.ndarray, times: int, fade: int) -> np.ndarray:
     """Return the period repeated `times`, with `fade` further rows at each end for a smooth start and end."""
     whole = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
     rise = np.sin(0.5 * np.pi * np.arange(fade) / fade) ** 2

@@ -15,28 +15,28 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line, shown
+from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.structs import Mechanism
-from tuning.identification.logs import checks, clock, segments
-from tuning.identification.logs.causality import check_rows_of, integrator_of_all
-from tuning.identification.logs.channels import NUMBERS, columns_of
-from tuning.identification.logs.joining import LATE
+from tuning.identification.logs import checks, clock, contact_detection
+from tuning.identification.logs.channels import NUMERIC_CHANNELS, read_channels
+from tuning.identification.logs.force_command_check import check_command
+from tuning.identification.logs.lost_rows import LogSegment, split_at_gaps
 from tuning.identification.logs.mapping import (
     KINDS,
     LogMapping,
     RunFiles,
-    masses_of,
-    own_mapping,
+    find_equivalent_mass,
+    make_simulation_mapping,
 )
-from tuning.identification.logs.model_motion import check_command
 from tuning.identification.logs.readers import open_log
-from tuning.identification.logs.rows import Stretch, stretches
-from tuning.identification.logs.scales import SMOOTH, check_velocity
-from tuning.identification.records import Campaign, Kind, Run, Timing
+from tuning.identification.logs.resampling import FORCE_LATE_CHANNEL
+from tuning.identification.logs.row_convention import check_row_convention, detect_common_integrator
+from tuning.identification.logs.scales import SPEED_SPAN_TICKS, check_velocity
+from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, RunKind
 
-TOUCHING = ("tap", "contact")
-SCRAP = 50  # rows, least length of a segment between gaps
-JUMP = 0.5  # jump of the velocity between runs of a log, over the 95 % quantile of the speed
+KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
+MIN_SEGMENT_ROWS = 50  # rows, least length of a segment between gaps
+MIN_VELOCITY_JUMP = 0.5  # jump of the velocity between runs of a log, over the 95 % quantile of the speed
 
 
 def read_campaign(
@@ -58,36 +58,38 @@ def read_campaign(
     Raises:
         InputError: If a log cannot be read or fails a check; the message names file, row or column.
     """
-    mapping = mapping or own_mapping()
+    mapping = mapping or make_simulation_mapping()
     if not logs:
-        raise InputError("logs: found none, allowed one or more files")
-    timing, mass = _timing(mapping, prior), masses_of(mapping, prior)
+        raise InputError("logs: found none, expected one or more files")
+    timing, mass = _make_timing(mapping, prior), find_equivalent_mass(mapping, prior)
     if mass is None:
-        raise InputError("bodies.equivalent_mass: found nothing, allowed a number > 0 kg, here or in a prior")
+        raise InputError(
+            "bodies.equivalent_mass: found nothing, expected a number > 0 kg, here or in a prior"
+        )
     for path in logs:
         if not any(entry.names(path) for entry in mapping.runs):
-            patterns = ", ".join(shown(pattern) for entry in mapping.runs for pattern in entry.files)
-            raise InputError(f"{one_line(str(path))}: found a log that no run names, allowed {patterns}")
-    runs: list[Run] = []
+            patterns = ", ".join(format_value(pattern) for entry in mapping.runs for pattern in entry.files)
+            raise InputError(f"{to_one_line(str(path))}: found a log that no run names, expected {patterns}")
+    runs: list[LoggedRun] = []
     notes: dict[str, list[str]] = {}  # labels of the logs of each note
     clocks = []
     for entry in mapping.runs:
         for path in logs:
             if entry.names(path):
-                reading = _Reading(path, entry, mapping, timing, mass, prior)
+                reading = _RunsOfFile(path, entry, mapping, timing, mass, prior)
                 runs += reading.runs
                 for note in reading.notes:
                     notes.setdefault(note.removeprefix(f"{reading.label}: "), []).append(reading.label)
                 clocks.append(reading.ticks.clock)
-    integrator = integrator_of_all(runs, timing.control_period) or (prior and prior.rig.integrator)
+    integrator = detect_common_integrator(runs, timing.control_period) or (prior and prior.rig.integrator)
     if not timing.two_clocks:
-        check_rows_of(runs, timing, integrator)
+        check_row_convention(runs, timing, integrator)
     timing = replace(timing, clock=max(clocks, key=lambda reading_clock: reading_clock.jitter))
-    sources = {path.name: _sha256(path) for path in logs}
-    return Campaign(tuple(runs), timing, mass, sources, _joined(notes), integrator)
+    sources = {path.name: _hash_log(path) for path in logs}
+    return Campaign(tuple(runs), timing, mass, sources, _merge_notes(notes), integrator)
 
 
-def _joined(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Return each note once, with the name of its first log and the number of further logs."""
     lines = []
     for note, labels in notes.items():
@@ -96,7 +98,7 @@ def _joined(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-class _Reading:
+class _RunsOfFile:
     """Runs of one file under one entry of the mapping."""
 
     def __init__(
@@ -104,12 +106,12 @@ class _Reading:
         path: Path,
         entry: RunFiles,
         mapping: LogMapping,
-        timing: Timing,
+        timing: CampaignTiming,
         mass: float,
         prior: Mechanism | None,
     ):
-        self.label, self.notes = one_line(str(path)) or "''", list[str]()
-        self.kind: Kind = entry.kind
+        self.label, self.notes = to_one_line(str(path)) or "''", list[str]()
+        self.kind: RunKind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
         # Contacts so far; last tick and resting force of a contact that a gap interrupts.
         self._met, self._open = 0, None
@@ -118,63 +120,63 @@ class _Reading:
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
-        columns, stamps, self._begin, notes = columns_of(log, mapping, timing.control_period)
+        columns, stamps, self._begin, notes = read_channels(log, mapping, timing.control_period)
         self.notes += notes
-        used = _kept(stamps, entry, timing.control_period)
+        used = _select_rows(stamps, entry, timing.control_period)
         if stamps is not None:
             self._begin += float(stamps[used][0]) if len(stamps[used]) else 0.0
         stamps, columns = None if stamps is None else stamps[used], {n: c[used] for n, c in columns.items()}
         rows = len(next(iter(columns.values())))
-        if rows < checks.FEWEST_ROWS:
-            allowed = f"at least {checks.FEWEST_ROWS}"
-            raise InputError(f"{self.label}: found {rows} row{'s' * (rows != 1)}, allowed {allowed}")
+        if rows < checks.MIN_LOG_ROWS:
+            allowed = f"at least {checks.MIN_LOG_ROWS}"
+            raise InputError(f"{self.label}: found {rows} row{'s' * (rows != 1)}, expected {allowed}")
         period = timing.control_period
         if stamps is None or mapping.timing.clock == "index":
-            self.ticks = clock.counted(rows, period)
+            self.ticks = clock.number_rows(rows, period)
         else:
-            self.ticks = clock.ticks_of(stamps, period, self.label)
-        modes = _modes(columns.pop("mode", None), mapping, entry.kind, self.label)
-        channels = {name: columns.get(name) for name in (*NUMBERS, LATE)}
+            self.ticks = clock.assign_ticks(stamps, period, self.label)
+        modes = _classify_rows(columns.pop("mode", None), mapping, entry.kind, self.label)
+        channels = {name: columns.get(name) for name in (*NUMERIC_CHANNELS, FORCE_LATE_CHANNEL)}
         for name, values in channels.items():
             if values is not None:
-                checks.check_rows(self.label, name, values)
+                checks.check_values(self.label, name, values)
         if (index := channels["contact_index"]) is not None:
             channels["contact_index"] = index.astype(np.int64)
         self.runs = self._cut(channels, modes)
 
-    def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[Run]:
+    def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[LoggedRun]:
         """Return the runs, divided at gaps, changes of mode, jumps between runs, and contacts."""
         tick, x = self.ticks.tick, channels["position_desired"]
         assert x is not None
-        cuts = _jumps(x, channels["contact_index"])
+        cuts = _find_restarts(x, channels["contact_index"])
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
-        runs: list[Run] = []
-        for stretch in stretches(tick, channels, cuts, self._timing.control_period, self._mass):
-            if len(stretch.tick) < SCRAP:
+        runs: list[LoggedRun] = []
+        for stretch in split_at_gaps(tick, channels, cuts, self._timing.control_period, self._mass):
+            if len(stretch.tick) < MIN_SEGMENT_ROWS:
                 self.notes.append(f"{self.label}: {len(stretch.tick)} rows between gaps are left out")
                 continue
-            kind: Kind = self.kind
+            kind: RunKind = self.kind
             if modes is not None:
                 kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[:1])][0])]
-            runs += self._stretch(stretch, kind)
+            runs += self._runs_of_segment(stretch, kind)
         if not runs:
             allowed = (
-                f"at least {SCRAP} without a gap of more than 3, with a contact where there is to be one"
+                f"at least {MIN_SEGMENT_ROWS} without a gap of more than 3, and a contact if the kind has one"
             )
-            raise InputError(f"{self.label}: found {len(tick)} rows, allowed {allowed}")
+            raise InputError(f"{self.label}: found {len(tick)} rows, expected {allowed}")
         return runs
 
-    def _stretch(self, stretch: Stretch, kind: Kind) -> list[Run]:
+    def _runs_of_segment(self, stretch: LogSegment, kind: RunKind) -> list[LoggedRun]:
         """Check a segment and return its runs: one for each contact, or a single one."""
         period, force = self._timing.control_period, stretch.channels["force_measured"]
         self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
         self._ignore(stretch, "velocity_desired", check_velocity(self.label, stretch, period))
-        if kind not in ("press", *TOUCHING):
+        if kind not in ("press", *KINDS_SPLIT_AT_CONTACTS):
             return [self._run(stretch, kind, slice(None), None, None)]
         if force is None:
             allowed = "one where there is contact"
-            raise InputError(f"{self.label}: force_measured: found no such channel, allowed {allowed}")
+            raise InputError(f"{self.label}: force_measured: found no such channel, expected {allowed}")
         touched = self._touched(stretch.tick, force)
         holds = kind == "contact" and self._command_holds(stretch, touched)
         self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass, holds)
@@ -190,7 +192,7 @@ class _Reading:
             for number, (part, contact) in enumerate(zip(parts, touched, strict=False))
         ]
 
-    def _command_holds(self, stretch: Stretch, touched: list[tuple[int, int]]) -> bool:
+    def _command_holds(self, stretch: LogSegment, touched: list[tuple[int, int]]) -> bool:
         """Return whether the force command moves the model; ignore the channel with a note if it cannot."""
         if stretch.channels["force_command"] is None:
             return False
@@ -204,7 +206,7 @@ class _Reading:
             self._ignore(stretch, "force_command", note)
         return holds
 
-    def _ignore(self, stretch: Stretch, channel: str, note: str | None) -> None:
+    def _ignore(self, stretch: LogSegment, channel: str, note: str | None) -> None:
         """Remove a channel of a segment if there is a note with the reason."""
         if note is not None:
             self.notes.append(note)
@@ -213,18 +215,27 @@ class _Reading:
     def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
         """Return the contacts of a segment, and count them; a contact may continue after a gap."""
         period, rest = self._timing.control_period, None
-        if self._open is not None and (tick[0] - self._open[0]) * period < segments.APART:
+        if self._open is not None and (tick[0] - self._open[0]) * period < contact_detection.MIN_CONTACT_GAP:
             rest = self._open[1]
-        touched = segments.contacts(force, period, rest)
+        touched = contact_detection.detect_contacts(force, period, rest)
         goes_on = rest is not None and bool(touched) and touched[0][0] == 0
         self._met += len(touched) - goes_on
-        ended = not touched or touched[-1][1] < len(force) - segments.TICKS
-        self._open = None if ended else (tick[-1], segments.resting(force) if rest is None else rest)
+        ended = not touched or touched[-1][1] < len(force) - contact_detection.MIN_CONTACT_TICKS
+        self._open = (
+            None
+            if ended
+            else (tick[-1], contact_detection.estimate_resting_force(force) if rest is None else rest)
+        )
         return touched
 
     def _run(
-        self, stretch: Stretch, kind: Kind, part: slice, touched: tuple[int, int] | None, number: int | None
-    ) -> Run:
+        self,
+        stretch: LogSegment,
+        kind: RunKind,
+        part: slice,
+        touched: tuple[int, int] | None,
+        number: int | None,
+    ) -> LoggedRun:
         """Return a part of a segment as a run, with the contact's number if no channel contains it."""
         channels = {
             name: None if values is None else values[part] for name, values in stretch.channels.items()
@@ -234,7 +245,7 @@ class _Reading:
             index = np.full(len(tick), number, np.int64)
         x, measured = stretch.channels["position_desired"], channels["position_measured"]
         assert x is not None and measured is not None
-        return Run(
+        return LoggedRun(
             kind=kind,
             source=self._path.name,
             tick=tick,
@@ -246,31 +257,33 @@ class _Reading:
             force_command=channels["force_command"],
             valid=stretch.valid[part],
             contact_index=index,
-            speed=None if touched is None else _speed(x, touched[0], self._timing.control_period),
+            speed=None
+            if touched is None
+            else _estimate_approach_speed(x, touched[0], self._timing.control_period),
             begin=self._begin,
-            force_late=channels[LATE],
+            force_late=channels[FORCE_LATE_CHANNEL],
         )
 
 
-def _timing(mapping: LogMapping, prior: Mechanism | None) -> Timing:
+def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming:
     spec, rig = mapping.timing, None if prior is None else prior.rig
     period = spec.control_period or (rig and rig.control_period)
     if period is None and mapping.channels.time.rate is not None:
         period = 1.0 / mapping.channels.time.rate
     if period is None:
-        raise InputError("timing.control_period: found nothing, allowed a number > 0 s, here or in a prior")
+        raise InputError("timing.control_period: found nothing, expected a number > 0 s, here or in a prior")
     rate = mapping.channels.time.rate
     if rate is not None and abs(rate * period - 1.0) > 1e-6:
         raise InputError(
-            f"channels.time.rate: found {rate:g} Hz, allowed 1 / control_period, {1 / period:g} Hz"
+            f"channels.time.rate: found {rate:g} Hz, expected 1 / control_period, {1 / period:g} Hz"
         )
     hold = spec.command_hold or (rig.command_hold if rig else "linear")
     latency = spec.command_latency if spec.command_latency is not None else rig.command_latency if rig else 0
     late, separate = spec.computing_delay, spec.clock == "separate"
-    return Timing(period, hold, latency, spec.row, None, late, separate)
+    return CampaignTiming(period, hold, latency, spec.row, None, late, separate)
 
 
-def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
+def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
     """Return the rows from the begin to the end of an entry."""
     if stamps is None:
         return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
@@ -278,7 +291,9 @@ def _kept(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
     return slice(first, None if entry.end is None else int(np.searchsorted(stamps, entry.end)))
 
 
-def _modes(values: np.ndarray | None, mapping: LogMapping, kind: Kind, label: str) -> np.ndarray | None:
+def _classify_rows(
+    values: np.ndarray | None, mapping: LogMapping, kind: RunKind, label: str
+) -> np.ndarray | None:
     """Return the kind of experiment at each row as an index into `KINDS`, or None without a mode channel."""
     channel = mapping.channels.mode
     if values is None or channel is None:
@@ -291,36 +306,36 @@ def _modes(values: np.ndarray | None, mapping: LogMapping, kind: Kind, label: st
         if kind_name not in KINDS:
             row = int(np.flatnonzero(inverse == len(kinds))[0]) + 1
             allowed = f"one of {', '.join([*channel.values, *KINDS])}"
-            raise InputError(f"{label}: row {row}: mode: found {shown(word)}, allowed {allowed}")
+            raise InputError(f"{label}: row {row}: mode: found {format_value(word)}, expected {allowed}")
         kinds.append(KINDS.index(kind_name))
     return np.array(kinds)[inverse]
 
 
-def _jumps(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
+def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     """Return the rows at which another contact begins at another position, as in simulations."""
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
     rows = rows[(rows >= 2) & (rows < len(x) - 1)]
     step = np.diff(x)
-    return rows[np.abs(step[rows] - step[rows - 2]) > JUMP * np.percentile(np.abs(step), 95)]
+    return rows[np.abs(step[rows] - step[rows - 2]) > MIN_VELOCITY_JUMP * np.percentile(np.abs(step), 95)]
 
 
-def _speed(x: np.ndarray, begin: int, period: float) -> float | None:
+def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float | None:
     """Return the approach speed of a contact [m/s], or None."""
     # The contact begins some ticks before its force exceeds the noise.
-    before = begin - SMOOTH
-    if before < SMOOTH:
+    before = begin - SPEED_SPAN_TICKS
+    if before < SPEED_SPAN_TICKS:
         return None
-    return float(x[before] - x[before - SMOOTH]) / (SMOOTH * period)
+    return float(x[before] - x[before - SPEED_SPAN_TICKS]) / (SPEED_SPAN_TICKS * period)
 
 
-def _sha256(path: Path) -> str:
+def _hash_log(path: Path) -> str:
     """Return the hash of a file, or of the names and contents of a folder's files."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     digest = hashlib.sha256()
     for part in sorted(entry for entry in path.rglob("*") if entry.is_file()):
-        digest.update(f"{_sha256(part)} {part.relative_to(path).as_posix()}\n".encode())
+        digest.update(f"{_hash_log(part)} {part.relative_to(path).as_posix()}\n".encode())
     return digest.hexdigest()

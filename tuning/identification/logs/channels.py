@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxhil.errors import InputError, one_line, shown
-from tuning.identification.logs import checks, clock, joining
-from tuning.identification.logs.mapping import Channel, LogMapping, si
-from tuning.identification.logs.readers import Columns, Log
+from jaxhil.errors import InputError, format_value, to_one_line
+from tuning.identification.logs import checks, clock, resampling
+from tuning.identification.logs.mapping import Channel, LogMapping, get_si_conversion
+from tuning.identification.logs.readers import ColumnsByName, OpenLog
 
-NUMBERS = (
+NUMERIC_CHANNELS = (
     "position_desired",
     "position_measured",
     "force_measured",
@@ -21,70 +21,71 @@ NUMBERS = (
     "contact_index",
 )
 
-STAMPS = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # column names of stamps in a group
+STAMP_COLUMN_PATTERN = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # column names of stamps in a group
 
 
-def columns_of(
-    log: Log, mapping: LogMapping, period: float
-) -> tuple[Columns, np.ndarray | None, float, list[str]]:
+def read_channels(
+    log: OpenLog, mapping: LogMapping, period: float
+) -> tuple[ColumnsByName, np.ndarray | None, float, list[str]]:
     """Return the available channels in SI units, the stamps from the first one [s], that one, and notes."""
     channels = mapping.channels
     wanted: dict[str, str] = {}
-    for name in (*NUMBERS, "mode"):
+    for name in (*NUMERIC_CHANNELS, "mode"):
         channel = getattr(channels, name)
         required = name in ("position_desired", "position_measured")
         if channel is not None and (required or channel.column in log.names):
             wanted[name] = channel.column
     stamps = [channels.time.column, *(getattr(channels, name).time for name in wanted if name != "mode")]
     read = log.read(list(dict.fromkeys([*wanted.values(), *(name for name in stamps if name is not None)])))
-    columns: Columns = {}
+    columns: ColumnsByName = {}
     for name, column in wanted.items():
         values = read[column]
         if name != "mode":
             channel: Channel = getattr(channels, name)
             if values.dtype == object:
                 raise InputError(
-                    f"{log.label}: column {shown(column)}: found {shown(values[0])}, allowed numbers"
+                    f"{log.label}: column {format_value(column)}: found {format_value(values[0])}, "
+                    "expected numbers"
                 )
-            factor, offset = si(channel, name)
+            factor, offset = get_si_conversion(channel, name)
             values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
         columns[name] = values
-    clocks = _clocks(log, mapping, wanted, read)
+    clocks = _read_channel_stamps(log, mapping, wanted, read)
     if clocks is None:
         time = channels.time.column
-        joining.check_lengths(log.label, columns | ({"time": read[time]} if time else {}), wanted)
-        return columns, *_stamps(log.label, read, mapping), []
-    columns, stamps, notes = joining.join(log.label, columns, clocks, wanted, period)
-    first = clocks[joining.MASTER]
+        resampling.check_lengths(log.label, columns | ({"time": read[time]} if time else {}), wanted)
+        return columns, *_read_row_stamps(log.label, read, mapping), []
+    columns, stamps, notes = resampling.resample_to_rows(log.label, columns, clocks, wanted, period)
+    first = clocks[resampling.MASTER_CHANNEL]
     begin = 0.0 if first is None else float(first[0])
     return columns, stamps - begin, begin, notes
 
 
-def _clocks(
-    log: Log, mapping: LogMapping, wanted: Mapping[str, str], read: Columns
+def _read_channel_stamps(
+    log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str], read: ColumnsByName
 ) -> dict[str, np.ndarray | None] | None:
     """Return the stamps of each channel if they differ; None if all channels share the rows of the log."""
     named = {name: getattr(getattr(mapping.channels, name), "time", None) for name in wanted}
     if any(named.values()):
-        return _named_clocks(log.label, mapping, named, read)
-    _check_stamps_beside(log, mapping, wanted)
+        return _read_mapped_stamps(log.label, mapping, named, read)
+    _check_stamps_in_groups(log, mapping, wanted)
     stamps_by_column = log.clocks(list(wanted.values()))
     clocks = {name: stamps_by_column.get(column) for name, column in wanted.items()}
-    master = clocks[joining.MASTER]
-    different = [wanted[name] for name, t in clocks.items() if not joining.same_clock(t, master)]
+    master = clocks[resampling.MASTER_CHANNEL]
+    different = [wanted[name] for name, t in clocks.items() if not resampling.has_same_stamps(t, master)]
     if not different:
         return None
-    time, since = mapping.channels.time, f"{shown(different[0])} has a clock of its own"
+    time, since = mapping.channels.time, f"{format_value(different[0])} has a clock of its own"
     if mapping.timing.clock == "index":
-        raise InputError(f'{log.label}: timing.clock: found "index", allowed "stamps", since {since}')
+        raise InputError(f'{log.label}: timing.clock: found "index", expected "stamps", since {since}')
     if time.column is not None and time.column not in log.stamps:
-        allowed = ", ".join(sorted(one_line(column, 40) for column in log.stamps)[:4])
-        found_text = f"column {shown(time.column)}"
-        raise InputError(f"{log.label}: time: found {found_text}, allowed one of {allowed}, since {since}")
+        allowed = ", ".join(sorted(to_one_line(column, 40) for column in log.stamps)[:4])
+        found_text = f"column {format_value(time.column)}"
+        raise InputError(f"{log.label}: time: found {found_text}, expected one of {allowed}, since {since}")
     return clocks
 
 
-def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
+def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
     """Raise `InputError` if a group of columns has stamps that differ from those of the rows.
 
     The names of columns define the groups of HDF5, MAT and TDMS files.
@@ -93,7 +94,7 @@ def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str
     if time.column is None or log.stamps:
         return
     for name, column in wanted.items():
-        for stamps in _stamps_beside(column, time.column, log.names):
+        for stamps in _find_other_stamps(column, time.column, log.names):
             read = log.read([time.column, stamps])
             rows, times = read[time.column], read[stamps]
             if rows.dtype == object or times.dtype == object or min(len(rows), len(times)) < 2:
@@ -104,61 +105,73 @@ def _check_stamps_beside(log: Log, mapping: LogMapping, wanted: Mapping[str, str
             # The stamps may have another unit of time.
             power = round(float(np.log10(group_step / step)) / 3.0)
             times = times * 1000.0**-power
-            if abs(group_step * 1000.0**-power / step - 1.0) > clock.RATE:
+            if abs(group_step * 1000.0**-power / step - 1.0) > clock.MAX_RATE_ERROR:
                 continue  # not a time, for example a count
-            if len(rows) == len(times) and np.max(np.abs(times - rows)) <= joining.AT_A_ROW * step:
+            if (
+                len(rows) == len(times)
+                and np.max(np.abs(times - rows)) <= resampling.SIMULTANEITY_TOLERANCE * step
+            ):
                 continue
             raise InputError(
-                f"{log.label}: column {shown(column)}: found stamps of its own in {shown(stamps)} that are "
-                f"not those in {shown(time.column)}, expected channels.{name}.time = {shown(stamps)}"
+                f"{log.label}: column {format_value(column)}: found stamps of its own in "
+                f"{format_value(stamps)} that are "
+                f"not those in {format_value(time.column)}, expected channels.{name}.time = "
+                f"{format_value(stamps)}"
             )
 
 
-def _stamps_beside(column: str, time: str, names: Sequence[str]) -> list[str]:
+def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str]:
     """Return stamp columns in the groups of a column that do not contain the stamps of the rows."""
     result = []
     for candidate in names:
         name = re.split(r"[/.]", candidate)[-1]
         parent = candidate[: len(candidate) - len(name)]
-        if parent and column.startswith(parent) and not time.startswith(parent) and STAMPS.search(name):
+        if (
+            parent
+            and column.startswith(parent)
+            and not time.startswith(parent)
+            and STAMP_COLUMN_PATTERN.search(name)
+        ):
             result.append(candidate)
     return [name for name in result if name != column]
 
 
-def _named_clocks(
-    label: str, mapping: LogMapping, named: Mapping[str, str | None], read: Columns
+def _read_mapped_stamps(
+    label: str, mapping: LogMapping, named: Mapping[str, str | None], read: ColumnsByName
 ) -> dict[str, np.ndarray | None]:
     """Return the stamps [s] of each channel from the columns in the mapping, relative to the first of all."""
     time = mapping.channels.time
     if mapping.timing.clock == "index":
         name = next(name for name, column in named.items() if column)
         raise InputError(
-            f'{label}: timing.clock: found "index", allowed "stamps", since channels.{name}.time is named'
+            f'{label}: timing.clock: found "index", expected "stamps", since channels.{name}.time is named'
         )
     columns = {name: column or time.column for name, column in named.items()}
     for column in dict.fromkeys(columns.values()):
         if column is not None and read[column].dtype == object:
             raise InputError(
-                f"{label}: column {shown(column)}: found {shown(read[column][0])}, allowed numbers"
+                f"{label}: column {format_value(column)}: found {format_value(read[column][0])}, expected "
+                "numbers"
             )
-    factor = si(Channel(column=time.column or "", unit=time.unit), "time")[0]
+    factor = get_si_conversion(Channel(column=time.column or "", unit=time.unit), "time")[0]
     zero = min(float(read[column][0]) for column in columns.values() if column and len(read[column]))
     scaled = {column: factor * (read[column] - zero) for column in columns.values() if column}
     return {name: scaled[column] if column else None for name, column in columns.items()}
 
 
-def _stamps(label: str, read: Columns, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
+def _read_row_stamps(label: str, read: ColumnsByName, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
     """Return the stamps [s] from the first one, and that one; None without a column of stamps."""
     time = mapping.channels.time
     if time.column is None:
         return None, 0.0
     stamps = read[time.column]
     if time.time_format is not None:
-        return clock.parsed(stamps, time.time_format, label)
+        return clock.parse_stamps(stamps, time.time_format, label)
     if stamps.dtype == object:
         allowed = "numbers, or a time_format beside the column"
-        raise InputError(f"{label}: column {shown(time.column)}: found {shown(stamps[0])}, allowed {allowed}")
-    checks.check_rows(label, "time", stamps)
+        where = f"{label}: column {format_value(time.column)}"
+        raise InputError(f"{where}: found {format_value(stamps[0])}, expected {allowed}")
+    checks.check_values(label, "time", stamps)
     # The first stamp may count from an epoch; subtracting it before the conversion saves digits.
-    factor = si(Channel(column=time.column, unit=time.unit), "time")[0]
+    factor = get_si_conversion(Channel(column=time.column, unit=time.unit), "time")[0]
     return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0

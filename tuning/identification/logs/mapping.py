@@ -20,48 +20,50 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.conversion import KeyProblem, close_match, to_struct
-from jaxhil.mechanism.structs import Bodies, CommandHold, Mechanism, says
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_struct
+from jaxhil.mechanism.structs import Bodies, CommandHold, Mechanism, key_metadata
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
-from tuning.identification.logs.units import COUNTS, OF_CHANNEL
-from tuning.identification.records import Kind, Row
+from tuning.identification.logs.units import COUNTS_UNIT, UNITS_OF_CHANNEL
+from tuning.identification.records import RowConvention, RunKind
 
 SCHEMA = "jaxhil/log/1"
-KINDS: tuple[Kind, ...] = ("free", "press", "tap", "contact", "rest")
+KINDS: tuple[RunKind, ...] = ("free", "press", "tap", "contact", "rest")
 
-Name = Annotated[str, Meta(min_length=1, max_length=200)]
-Pattern = Annotated[str, Meta(min_length=1, max_length=1000)]
+ColumnName = Annotated[str, Meta(min_length=1, max_length=200)]
+FilePattern = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Numeric column and its conversion to SI units."""
 
-    column: Name  # name of the column
+    column: ColumnName  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI unit if not specified
-    scale: Annotated[float, says("of the column's number", "")] = 1.0  # in the unit; for counts in SI units
-    sign: Annotated[int, says("of the whole", "", ge=-1, le=1)] = 1
-    offset: Annotated[float, says("added to the scaled number", "")] = 0.0  # in the unit
-    time: Name | None = None  # column of separate stamps, in the unit of the rows' stamps
+    scale: Annotated[float, key_metadata("of the column's number", "")] = (
+        1.0  # in the unit; for counts in SI units
+    )
+    sign: Annotated[int, key_metadata("of the whole", "", ge=-1, le=1)] = 1
+    offset: Annotated[float, key_metadata("added to the scaled number", "")] = 0.0  # in the unit
+    time: ColumnName | None = None  # column of separate stamps, in the unit of the rows' stamps
 
 
 class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Time stamps of the rows, or their rate if there are no stamps."""
 
-    column: Name | None = None  # name of the column
+    column: ColumnName | None = None  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s if not specified
-    rate: Annotated[float, says("of rows without stamps", "Hz", gt=0.0)] | None = None
+    rate: Annotated[float, key_metadata("of rows without stamps", "Hz", gt=0.0)] | None = None
     time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None  # format of `strptime`
 
 
 class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Column with the kind of experiment in each row."""
 
-    column: Name  # name of the column
-    values: dict[str, Kind] = field(default_factory=dict)  # kind of each entry with another word
+    column: ColumnName  # name of the column
+    values: dict[str, RunKind] = field(default_factory=dict)  # kind of each entry with another word
 
 
-class Channels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ChannelTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Columns of all channels."""
 
     time: TimeChannel
@@ -74,25 +76,27 @@ class Channels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     contact_index: Channel | None = None
 
 
-class LogTiming(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Timing of commands and readings in the logs."""
 
-    control_period: Annotated[float, says("time from tick to tick", "s", gt=0.0, le=0.1)] | None = None
-    command_hold: CommandHold | None = None
-    command_latency: Annotated[int, says("periods until a command reaches the drives", ge=0, le=1)] | None = (
+    control_period: Annotated[float, key_metadata("time from tick to tick", "s", gt=0.0, le=0.1)] | None = (
         None
     )
-    row: Row = "tick"
+    command_hold: CommandHold | None = None
+    command_latency: (
+        Annotated[int, key_metadata("periods until a command reaches the drives", ge=0, le=1)] | None
+    ) = None
+    row: RowConvention = "tick"
     computing_delay: Annotated[
-        int, says("periods from a reading to the command that answers it", ge=0, le=4)
+        int, key_metadata("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
     clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": those of the drives alone
 
 
-class Text(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class TextFormat(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Format of text files."""
 
-    skip_rows: Annotated[int, says("lines above that of the columns' names", ge=0, le=10_000)] = 0
+    skip_rows: Annotated[int, key_metadata("lines above that of the columns' names", ge=0, le=10_000)] = 0
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = (
         None  # found in the line of names if not specified
     )
@@ -102,10 +106,10 @@ class Text(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Files of one kind of experiment."""
 
-    files: Annotated[list[Pattern], Meta(min_length=1, max_length=1000)]  # patterns of the files' names
-    kind: Kind
-    begin: Annotated[float, says("of the run, from the first row", "s", ge=0.0)] = 0.0
-    end: Annotated[float, says("of the run, from the first row", "s", gt=0.0)] | None = None
+    files: Annotated[list[FilePattern], Meta(min_length=1, max_length=1000)]  # patterns of the files' names
+    kind: RunKind
+    begin: Annotated[float, key_metadata("of the run, from the first row", "s", ge=0.0)] = 0.0
+    end: Annotated[float, key_metadata("of the run, from the first row", "s", gt=0.0)] | None = None
 
     def names(self, path: Path) -> bool:
         """Return whether a pattern matches the file."""
@@ -116,10 +120,10 @@ class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Mapping of logs: channels, timing, masses, text format and runs."""
 
     schema: Literal["jaxhil/log/1"]
-    channels: Channels
-    timing: LogTiming = LogTiming()
+    channels: ChannelTable
+    timing: TimingSection = TimingSection()
     bodies: Bodies | None = None
-    text: Text = Text()
+    text: TextFormat = TextFormat()
     runs: Annotated[list[RunFiles], Meta(min_length=1, max_length=1000)]
 
 
@@ -129,48 +133,48 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
     Raises:
         InputError: If the file is missing or invalid.
     """
-    label = one_line(os.fspath(path)) or "''"
+    label = to_one_line(os.fspath(path)) or "''"
     try:
         data = read_bytes(Path(path), label, "a mapping")
     except FileNotFoundError:
-        raise InputError(f"{label}: found no such file, allowed a mapping file ({SCHEMA})") from None
-    return mapping_of(parse_toml(data, label, "a mapping"), label)
+        raise InputError(f"{label}: found no such file, expected a mapping file ({SCHEMA})") from None
+    return parse_mapping(parse_toml(data, label, "a mapping"), label)
 
 
-def mapping_of(raw: Mapping[str, Any], label: str) -> LogMapping:
+def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
     """Return the mapping of a parsed table; `label` names it in messages.
 
     Raises:
         InputError: If the table is invalid.
     """
     try:
-        mapping = to_struct(LogMapping, _spelled_out(raw))
-        _check(mapping)
+        mapping = to_struct(LogMapping, _expand_shorthand(raw))
+        _check_mapping(mapping)
     except KeyProblem as problem:
         raise InputError(f"{label}: {problem}") from None
     return mapping
 
 
-def own_mapping(kind: Kind = "contact") -> LogMapping:
+def make_simulation_mapping(kind: RunKind = "contact") -> LogMapping:
     """Return the mapping of logs with the column names of `jaxhil simulate --log`."""
     names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
-    return mapping_of(
+    return parse_mapping(
         {"schema": SCHEMA, "channels": channels, "runs": [{"files": "*", "kind": kind}]}, "own logs"
     )
 
 
-def si(channel: Channel, name: str) -> tuple[float, float]:
+def get_si_conversion(channel: Channel, name: str) -> tuple[float, float]:
     """Return the factor and the offset that convert the column's values to SI units."""
-    if channel.unit == COUNTS or name not in OF_CHANNEL:
+    if channel.unit == COUNTS_UNIT or name not in UNITS_OF_CHANNEL:
         unit = 1.0
     else:
-        units = OF_CHANNEL[name]
+        units = UNITS_OF_CHANNEL[name]
         unit = units[channel.unit or next(iter(units))]
     return channel.sign * unit * channel.scale, channel.sign * unit * channel.offset
 
 
-def _spelled_out(raw: Mapping[str, Any]) -> dict[str, Any]:
+def _expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return the table with bare names replaced by tables and single patterns by lists."""
     tables = dict(raw)
     if isinstance(channels := tables.get("channels"), Mapping):
@@ -189,17 +193,17 @@ def _spelled_out(raw: Mapping[str, Any]) -> dict[str, Any]:
     return tables
 
 
-def _check(mapping: LogMapping) -> None:
+def _check_mapping(mapping: LogMapping) -> None:
     channels = mapping.channels
-    for name, units in OF_CHANNEL.items():
+    for name, units in UNITS_OF_CHANNEL.items():
         channel = getattr(channels, name)
         if channel is None or channel.unit is None:
             continue
-        allowed = [*units, *([COUNTS] if name != "time" else [])]
+        allowed = [*units, *([COUNTS_UNIT] if name != "time" else [])]
         if channel.unit not in allowed:
-            expected = f"one of {', '.join(allowed)}{close_match(channel.unit, allowed)}"
-            raise KeyProblem(("channels", name, "unit"), shown(channel.unit), expected)
-        if channel.unit == COUNTS and channel.scale == 1.0:
+            expected = f"one of {', '.join(allowed)}{suggest_names(channel.unit, allowed)}"
+            raise KeyProblem(("channels", name, "unit"), format_value(channel.unit), expected)
+        if channel.unit == COUNTS_UNIT and channel.scale == 1.0:
             raise KeyProblem(("channels", name, "scale"), "none", "how much a count is, in SI units")
     for name in channels.__struct_fields__:
         channel = getattr(channels, name)
@@ -216,14 +220,16 @@ def _check(mapping: LogMapping) -> None:
             stamps_column = getattr(getattr(channels, name), "time", None)
             if stamps_column is not None:
                 expected = "none, since channels.time is no column of numbers"
-                raise KeyProblem(("channels", name, "time"), shown(stamps_column), expected)
+                raise KeyProblem(("channels", name, "time"), format_value(stamps_column), expected)
     _check_rest(mapping)
 
 
 def _check_rest(mapping: LogMapping) -> None:
     for index, run in enumerate(mapping.runs):
         if run.end is not None and run.end <= run.begin:
-            raise KeyProblem(("runs", index, "end"), shown(run.end), f"a number > begin, {run.begin:g} s")
+            raise KeyProblem(
+                ("runs", index, "end"), format_value(run.end), f"a number > begin, {run.begin:g} s"
+            )
     bodies = mapping.bodies
     if bodies is not None:
         specified = {key for key in bodies.__struct_fields__ if getattr(bodies, key) is not None}
@@ -232,7 +238,7 @@ def _check_rest(mapping: LogMapping) -> None:
             raise KeyProblem(("bodies",), " and ".join(sorted(specified)) or "neither", either)
 
 
-def masses_of(mapping: LogMapping, prior: Mechanism | None) -> float | None:
+def find_equivalent_mass(mapping: LogMapping, prior: Mechanism | None) -> float | None:
     """Return the equivalent mass [kg] of the numerical model, from the mapping or else from the prior."""
     if mapping.bodies is not None:
         return mapping.bodies.mass

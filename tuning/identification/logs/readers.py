@@ -20,24 +20,24 @@ import pyarrow as pa
 from pyarrow import csv as arrow_csv
 from pyarrow import parquet
 
-from jaxhil.errors import InputError, one_line, shown
-from jaxhil.mechanism.conversion import close_match
-from tuning.identification.logs.mapping import Text
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.mechanism.conversion import suggest_names
+from tuning.identification.logs.mapping import TextFormat
 
-Columns = dict[str, np.ndarray]  # float64 numbers, text objects, or stamps in s from the first one
+ColumnsByName = dict[str, np.ndarray]  # float64 numbers, text objects, or stamps in s from the first one
 
-Clocks = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
+StampsOfColumns = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
 
-PLAIN = Text()
+DEFAULT_TEXT_FORMAT = TextFormat()
 DELIMITERS = "\t;,"  # candidates in the line of names, in this order
-BLOCK = 1 << 22  # bytes that are parsed together
-MORE_ROWS = 1 << 19  # rows by which columns grow
-LONGEST_LINE = 1 << 20  # bytes
-SHOWN = 12  # column names in a message
+PARSE_BLOCK_BYTES = 1 << 22  # bytes that are parsed together
+GROWTH_ROWS = 1 << 19  # rows by which columns grow
+MAX_LINE_BYTES = 1 << 20  # bytes
+MAX_NAMES_IN_MESSAGE = 12  # column names in a message
 
-_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
-_PARQUET = (".parquet", ".pq")
-_FOREIGN = {
+_TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
+_PARQUET_SUFFIXES = (".parquet", ".pq")
+_THIRD_PARTY_FORMATS = {
     ".mat": ("mat", ("pymatreader", "h5py")),
     ".h5": ("hdf5", ("h5py",)),
     ".hdf5": ("hdf5", ("h5py",)),
@@ -49,53 +49,55 @@ _FOREIGN = {
 }
 
 
-class Log(NamedTuple):
+class OpenLog(NamedTuple):
     """Log file: the names of its columns, and functions that read them."""
 
     label: str  # its name in messages
     names: list[str]
-    read: Callable[[Sequence[str]], Columns]
+    read: Callable[[Sequence[str]], ColumnsByName]
     # Stamps [s] of columns that were read, with a common zero; None for a column without separate stamps.
-    clocks: Clocks = dict.fromkeys
+    clocks: StampsOfColumns = dict.fromkeys
     stamps: Collection[str] = ()  # columns that contain such stamps
 
 
-def open_log(path: Path, text: Text = PLAIN) -> Log:
+def open_log(path: Path, text: TextFormat = DEFAULT_TEXT_FORMAT) -> OpenLog:
     """Return the log of a file, or of a folder with a ROS 2 bag.
 
     Raises:
         InputError: If the log does not exist, has an unknown format or cannot be read.
     """
-    label = one_line(os.fspath(path)) or "''"
+    label = to_one_line(os.fspath(path)) or "''"
     if not path.exists():
-        raise InputError(f"{label}: found no such file, allowed a log")
+        raise InputError(f"{label}: found no such file, expected a log")
     suffix = ".db3" if (path / "metadata.yaml").is_file() else path.suffix.lower()
-    suffixes = (*_TEXT, *_PARQUET, *_FOREIGN)
+    suffixes = (*_TEXT_SUFFIXES, *_PARQUET_SUFFIXES, *_THIRD_PARTY_FORMATS)
     if suffix not in suffixes:
-        raise InputError(f"{label}: found a name that ends in {shown(suffix)}, allowed {', '.join(suffixes)}")
+        raise InputError(
+            f"{label}: found a name that ends in {format_value(suffix)}, expected {', '.join(suffixes)}"
+        )
     if path.is_dir() and suffix != ".db3":
-        raise InputError(f"{label}: found a directory, allowed a log")
+        raise InputError(f"{label}: found a directory, expected a log")
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{label}: found a pipe or a device, expected a log")
-    with reading(label):
-        if suffix in _TEXT:
-            return _text_log(path, label, text)
-        if suffix in _PARQUET:
-            return _parquet_log(path, label)
-        format, packages = _FOREIGN[suffix]
+    with convert_reader_errors(label):
+        if suffix in _TEXT_SUFFIXES:
+            return _open_text_log(path, label, text)
+        if suffix in _PARQUET_SUFFIXES:
+            return _open_parquet_log(path, label)
+        format, packages = _THIRD_PARTY_FORMATS[suffix]
         for package in packages:
             try:
                 importlib.import_module(package)
             except ImportError:
                 needs = f"{package}, which is not installed: python3 -m pip install 'jaxhil[logs]'"
                 raise InputError(f"{label}: a {suffix} file is read with {needs}") from None
-        opened = getattr(importlib.import_module("tuning.identification.logs.foreign"), format)(path)
-        read = _checked(label, opened.names, opened.read)
-        return Log(label, opened.names, read, _clocks(label, opened.clocks), opened.stamps)
+        opened = getattr(importlib.import_module("tuning.identification.logs.third_party"), format)(path)
+        read = _wrap_reader(label, opened.names, opened.read)
+        return OpenLog(label, opened.names, read, _wrap_stamp_reader(label, opened.clocks), opened.stamps)
 
 
 @contextmanager
-def reading(label: str) -> Iterator[None]:
+def convert_reader_errors(label: str) -> Iterator[None]:
     """Convert every exception of a reader to an `InputError` with one line."""
     try:
         yield
@@ -103,53 +105,58 @@ def reading(label: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise InputError(f"{label}: cannot be read: {one_line(reason.splitlines()[0], 200)}") from None
+        raise InputError(f"{label}: cannot be read: {to_one_line(reason.splitlines()[0], 200)}") from None
 
 
-def _clocks(label: str, clocks: Clocks | None) -> Clocks:
+def _wrap_stamp_reader(label: str, clocks: StampsOfColumns | None) -> StampsOfColumns:
     if clocks is None:
         return dict.fromkeys
 
     def checked(wanted: Sequence[str]) -> Mapping[str, np.ndarray | None]:
-        with reading(label):
+        with convert_reader_errors(label):
             return clocks(wanted)
 
     return checked
 
 
-def _checked(label: str, names: Sequence[str], read: Callable[[Sequence[str]], Columns]):
+def _wrap_reader(label: str, names: Sequence[str], read: Callable[[Sequence[str]], ColumnsByName]):
     """Return a reading function that raises `InputError` for missing or ambiguous columns."""
 
-    def checked(wanted: Sequence[str]) -> Columns:
+    def checked(wanted: Sequence[str]) -> ColumnsByName:
         for name in wanted:
             if name not in names:
-                examples = ", ".join(one_line(column, 40) for column in names[:SHOWN]) + ", ..." * (
-                    len(names) > SHOWN
-                )
-                hint = one_line(close_match(name, names))
+                examples = ", ".join(
+                    to_one_line(column, 40) for column in names[:MAX_NAMES_IN_MESSAGE]
+                ) + ", ..." * (len(names) > MAX_NAMES_IN_MESSAGE)
+                hint = to_one_line(suggest_names(name, names))
                 raise InputError(
-                    f"{label}: column {shown(name)}: found none of this name, allowed {examples}{hint}"
+                    f"{label}: column {format_value(name)}: found none of this name, expected "
+                    f"{examples}{hint}"
                 )
             if names.count(name) > 1:
-                raise InputError(f"{label}: column {shown(name)}: found {names.count(name)}, allowed one")
-        with reading(label):
+                raise InputError(
+                    f"{label}: column {format_value(name)}: found {names.count(name)}, expected one"
+                )
+        with convert_reader_errors(label):
             columns = read(wanted)
         return columns
 
     return checked
 
 
-def _text_log(path: Path, label: str, text: Text) -> Log:
+def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
     with path.open("rb") as file:
         for _ in range(text.skip_rows):
-            file.readline(LONGEST_LINE)
-        raw = file.readline(LONGEST_LINE)
-        second = file.readline(LONGEST_LINE)
+            file.readline(MAX_LINE_BYTES)
+        raw = file.readline(MAX_LINE_BYTES)
+        second = file.readline(MAX_LINE_BYTES)
     if not raw.strip():
         raise InputError(
-            f"{label}: found no line of columns' names, allowed one after {text.skip_rows} lines"
+            f"{label}: found no line of columns' names, expected one after {text.skip_rows} lines"
         )
-    line, following = (_decoded(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second))
+    line, following = (
+        _decode_line(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second)
+    )
     delimiter = text.delimiter or next((character for character in DELIMITERS if character in line), ",")
     names = [name.strip() for name in next(csv.reader(io.StringIO(line), delimiter=delimiter))]
     headless = all(_is_number(name, text.decimal) for name in names)
@@ -157,16 +164,18 @@ def _text_log(path: Path, label: str, text: Text) -> Log:
         names = [str(index + 1) for index in range(len(names))]
     skipped = text.skip_rows + (not headless)
 
-    def read(wanted: Sequence[str]) -> Columns:
+    def read(wanted: Sequence[str]) -> ColumnsByName:
         texts = [
-            n for n in wanted if not _numeric(following if not headless else line, names, n, delimiter, text)
+            n
+            for n in wanted
+            if not _is_numeric_column(following if not headless else line, names, n, delimiter, text)
         ]
         return _read_text(path, names, wanted, texts, skipped, delimiter, text.decimal)
 
-    return Log(label, names, _checked(label, names, read))
+    return OpenLog(label, names, _wrap_reader(label, names, read))
 
 
-def _numeric(line: str, names: Sequence[str], name: str, delimiter: str, text: Text) -> bool:
+def _is_numeric_column(line: str, names: Sequence[str], name: str, delimiter: str, text: TextFormat) -> bool:
     """Return whether the column contains a number in this line."""
     cells = next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
     index = list(names).index(name)
@@ -176,14 +185,16 @@ def _numeric(line: str, names: Sequence[str], name: str, delimiter: str, text: T
 def _read_text(
     path: Path, names: list[str], wanted: Sequence[str], texts: Sequence[str], skipped: int, delimiter: str,
     decimal: str,
-) -> Columns:  # fmt: skip
+) -> ColumnsByName:  # fmt: skip
     unique = [f"{index} {name}" for index, name in enumerate(names)]
     chosen = {name: unique[names.index(name)] for name in wanted}
     kinds = {chosen[name]: pa.string() if name in texts else pa.float64() for name in wanted}
 
     batches = arrow_csv.open_csv(
         path,
-        arrow_csv.ReadOptions(column_names=unique, skip_rows=skipped, block_size=BLOCK, use_threads=False),
+        arrow_csv.ReadOptions(
+            column_names=unique, skip_rows=skipped, block_size=PARSE_BLOCK_BYTES, use_threads=False
+        ),
         arrow_csv.ParseOptions(delimiter=delimiter),
         arrow_csv.ConvertOptions(
             column_types=kinds,
@@ -194,31 +205,31 @@ def _read_text(
     )
     # Growing columns save memory: a whole table takes three times the memory of its numbers. A single
     # thread counts the rows, so that messages name the bad one.
-    columns: Columns = {name: np.empty(0, object if name in texts else float) for name in chosen}
+    columns: ColumnsByName = {name: np.empty(0, object if name in texts else float) for name in chosen}
     rows = 0
     for batch in batches:
         until = rows + batch.num_rows
         for name, unique_name in chosen.items():
             column = columns[name]
             if len(column) < until:
-                column.resize(until + MORE_ROWS, refcheck=False)
-            column[rows:until] = _array(pa.chunked_array([batch.column(unique_name)]), name)
+                column.resize(until + GROWTH_ROWS, refcheck=False)
+            column[rows:until] = _column_to_array(pa.chunked_array([batch.column(unique_name)]), name)
         rows = until
     return {name: column[:rows] for name, column in columns.items()}
 
 
-def _parquet_log(path: Path, label: str) -> Log:
+def _open_parquet_log(path: Path, label: str) -> OpenLog:
     names = list(parquet.read_schema(path).names)
 
-    def read(wanted: Sequence[str]) -> Columns:
+    def read(wanted: Sequence[str]) -> ColumnsByName:
         # Read column by column: a whole table next to its numbers takes twice the memory.
         columns = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
-        return {name: _array(column, name) for name, column in zip(wanted, columns, strict=True)}
+        return {name: _column_to_array(column, name) for name, column in zip(wanted, columns, strict=True)}
 
-    return Log(label, names, _checked(label, names, read))
+    return OpenLog(label, names, _wrap_reader(label, names, read))
 
 
-def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
+def _column_to_array(column: pa.ChunkedArray, name: str) -> np.ndarray:
     kind = column.type
     if pa.types.is_dictionary(kind):
         column, kind = column.cast(kind.value_type), kind.value_type
@@ -226,7 +237,9 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
         return np.array(column.to_pylist(), dtype=object)
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
         if column.null_count:
-            raise ValueError(f"column {shown(name)}: found {column.null_count} empty cells, allowed none")
+            raise ValueError(
+                f"column {format_value(name)}: found {column.null_count} empty cells, expected none"
+            )
         unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
         integers = column.cast(pa.int64() if kind.bit_width == 64 else pa.int32()).to_numpy().astype(np.int64)
         return unit * (integers - integers[:1]).astype(float)
@@ -235,7 +248,7 @@ def _array(column: pa.ChunkedArray, name: str) -> np.ndarray:
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy())
 
 
-def _decoded(line: bytes, first: bool) -> str:
+def _decode_line(line: bytes, first: bool) -> str:
     try:
         return line.decode("utf-8-sig" if first else "utf-8")
     except UnicodeDecodeError:

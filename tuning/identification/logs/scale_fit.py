@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-FAR = 6.0  # times the median error, above which a row is excluded
-KEPT = 0.7  # share of rows that a fit must include
-ROUNDS = 4  # iterations of excluding rows
+OUTLIER_RATIO = 6.0  # times the median error, above which a row is excluded
+MIN_USED_SHARE = 0.7  # share of rows that a fit must include
+OUTLIER_ITERATIONS = 4  # iterations of excluding rows
 
 
-class Scale:
+class ScaleFit:
     """Fit of one signal as a multiple of another one."""
 
     def __init__(self, slope: float, left: float, rms: float, error: float, rows: float):
@@ -20,31 +20,31 @@ class Scale:
         self.rows = rows  # effective number of rows: fewer if the errors are correlated
 
 
-def scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> Scale | None:
+def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit | None:
     """Fit signal = slope * unit without outliers; return None if one of both is 0 throughout.
 
     Errors of rows up to twice `width` apart may be correlated.
     """
     used = np.ones(len(signal), bool)
     slope = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(OUTLIER_ITERATIONS):
         power = float(unit[used] @ unit[used])
         if power == 0.0 or not np.any(signal[used]):
             return None
         slope = float(signal[used] @ unit[used]) / power
         error = np.abs(signal - slope * unit)
-        again = error <= FAR * max(float(np.median(error)), 1e-300)
-        if np.mean(again) < KEPT or np.array_equal(again, used):
+        again = error <= OUTLIER_RATIO * max(float(np.median(error)), 1e-300)
+        if np.mean(again) < MIN_USED_SHARE or np.array_equal(again, used):
             break
         used = again
     left = signal[used] - slope * unit[used]
     rms, signal_rms = (float(np.sqrt(np.mean(values**2))) for values in (left, signal[used]))
-    power, alike = float(unit[used] @ unit[used]), _correlated(left, 2 * width)
+    power, alike = float(unit[used] @ unit[used]), _count_correlated(left, 2 * width)
     error = rms * np.sqrt(alike / power) if power else np.inf
-    return Scale(slope, rms / signal_rms if signal_rms else np.inf, rms, error, len(left) / alike)
+    return ScaleFit(slope, rms / signal_rms if signal_rms else np.inf, rms, error, len(left) / alike)
 
 
-def _correlated(values: np.ndarray, longest: int) -> float:
+def _count_correlated(values: np.ndarray, longest: int) -> float:
     """Return the number of correlated values that are equivalent to one independent value."""
     power = float(values @ values)
     if power == 0.0:

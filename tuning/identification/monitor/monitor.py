@@ -10,32 +10,43 @@ import numpy as np
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
-from tuning.identification.monitor.charts import LIMIT, changes
-from tuning.identification.monitor.figures import FIGURES, NAMES, Colour, Sensors, figures, weights
-from tuning.identification.monitor.prediction import Prediction
-from tuning.identification.monitor.readings import Readings, motion_of, readings
-from tuning.identification.monitor.uncertain import Uncertain, uncertain
-from tuning.identification.records import Campaign, Run, Timing
-from tuning.identification.two_clocks import refuse
+from tuning.identification.clock_drift import reject_separate_clocks
+from tuning.identification.monitor.change_detection import ALARM_THRESHOLD, detect_changes
+from tuning.identification.monitor.metric_filter import MetricFilter
+from tuning.identification.monitor.metrics import (
+    METRIC_NAMES,
+    METRICS,
+    ForceSensorSpec,
+    NoiseColour,
+    compute_metrics,
+    compute_weights,
+)
+from tuning.identification.monitor.predicted_readings import (
+    PredictedReadings,
+    predict_readings,
+    simulate_motion,
+)
+from tuning.identification.monitor.uncertain_parameters import UncertainParameter, list_uncertain_parameters
+from tuning.identification.records import Campaign, CampaignTiming, LoggedRun
 
-BLOCK = 64  # runs that are computed together
-SENSOR_DELAYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
-State = Literal["good", "watch", "bad"]
+RUNS_PER_BATCH = 64  # runs that are computed together
+SENSOR_DELAY_KEYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
+ContactState = Literal["good", "watch", "bad"]
 
 
 @dataclass(frozen=True)
-class Contact:
-    """Metrics of one contact relative to the file, in SI units and the order of `NAMES`."""
+class ContactDeviation:
+    """Metrics of one contact relative to the file, in SI units and the order of `METRIC_NAMES`."""
 
     source: str  # name of its log
     value: np.ndarray  # 0 if the file is correct, NaN if the log does not determine it
     predicted_std: np.ndarray  # standard deviation of the prediction
     z: np.ndarray  # (value - prediction) over predicted_std
-    state: State
+    state: ContactState
 
 
 @dataclass(frozen=True)
-class Change:
+class MetricChange:
     """Change of one metric, averaged over the contacts since the change."""
 
     name: str
@@ -44,16 +55,16 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Monitored:
+class MonitorResult:
     """Result of monitoring a log."""
 
-    contacts: tuple[Contact, ...]
+    contacts: tuple[ContactDeviation, ...]
     alarm: int | None  # index of the contact that raised the alarm
     since: int | None  # index of the contact with which the change probably began
-    changes: tuple[Change, ...]  # metrics that raised an alarm, the most significant first
+    changes: tuple[MetricChange, ...]  # metrics that raised an alarm, the most significant first
 
     @property
-    def state(self) -> State:
+    def state(self) -> ContactState:
         return self.contacts[-1].state
 
     @property
@@ -61,99 +72,106 @@ class Monitored:
         number = len(self.contacts)
         if self.alarm is None or self.since is None:
             return f"Good: the rig is that of the file in all of {number} contacts"
-        causes = ", ".join(_said(change) for change in self.changes)
+        causes = ", ".join(_describe_change(change) for change in self.changes)
         where = f"since contact {self.since + 1} of {number} ({self.contacts[self.since].source}): {causes}"
         if self.state == "watch":
             return f"Watch: {where}; the file's uncertainty covers it: identify again when convenient"
         return f"Bad: {where}; beyond the file's uncertainty: gains tuned on it are no longer vouched for"
 
 
-def _said(change: Change) -> str:
-    _, unit, scale = FIGURES[NAMES.index(change.name)]
+def _describe_change(change: MetricChange) -> str:
+    _, unit, scale = METRICS[METRIC_NAMES.index(change.name)]
     shown = "" if unit == "1" else f" {unit}"
     return f"{change.name} {scale * change.value:+.3g}{shown} (+- {scale * change.std:.2g})"
 
 
-def monitor(campaign: Campaign, mechanism: Mechanism) -> Monitored:
+def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
     """Compare the contacts of a campaign, in order, with a mechanism.
 
     Raises:
         InputError: If there is no contact, or the mechanism cannot be compared with a log.
     """
-    refuse(campaign.timing)
+    reject_separate_clocks(campaign.timing)
     runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
     if not runs:
-        raise InputError("logs: found no contact, allowed a run of kind contact or tap")
-    numbers, correlation = uncertain(mechanism)
+        raise InputError("logs: found no contact, expected a run of kind contact or tap")
+    numbers, correlation = list_uncertain_parameters(mechanism)
     sensor = mechanism.rig.force_sensor
-    prediction = Prediction(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
-    watch = _Watch(prediction)
-    for run, features in zip(runs, _told(runs, mechanism, campaign, numbers), strict=True):
+    prediction = MetricFilter(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
+    watch = _MonitorState(prediction)
+    for run, features in zip(runs, _compute_run_metrics(runs, mechanism, campaign, numbers), strict=True):
         watch.add(run.source, *features)
     if not any(np.isfinite(contact.value[0]) for contact in watch.contacts):
         text = f"found {mechanism.rig.contact_plane:g} m, which none of the contacts in the logs goes beyond"
-        raise InputError(f"rig.contact_plane: {text}, allowed where the hardware touches")
+        raise InputError(f"rig.contact_plane: {text}, expected where the hardware touches")
     return watch.outcome()
 
 
-def _told(
-    runs: Sequence[Run], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[Uncertain]
+def _compute_run_metrics(
+    runs: Sequence[LoggedRun], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[UncertainParameter]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield the metrics of each run, their derivatives by the parameters, and their covariance."""
     rig, timing = mechanism.rig, campaign.timing
     sensor = rig.force_sensor
-    sensors = Sensors(sensor.noise_std, sensor.quantum, sensor.dead_zone, sensor.range, sensor.time_constant)
+    sensors = ForceSensorSpec(
+        sensor.noise_std, sensor.quantum, sensor.dead_zone, sensor.range, sensor.time_constant
+    )
     stds = {number.path: number.std for number in numbers}
     delay = np.hypot(stds["rig.simulator.delay"], stds["rig.force_sensor.delay"])
     slack = float(delay), stds.get("rig.contact_plane", 0.0)
-    colours = Colour(np.empty(0)), Colour(np.empty(0))
-    for begin in range(0, len(runs), BLOCK):
-        block = runs[begin : begin + BLOCK]
-        expected, stepped = _expected(mechanism, block, timing, numbers)
+    colours = NoiseColour(np.empty(0)), NoiseColour(np.empty(0))
+    for begin in range(0, len(runs), RUNS_PER_BATCH):
+        block = runs[begin : begin + RUNS_PER_BATCH]
+        expected, stepped = _predict_with_sensitivities(mechanism, block, timing, numbers)
         for lane, run in enumerate(block):
             rows = len(run.tick)
-            run_weights = weights(
+            run_weights = compute_weights(
                 run, expected, lane, sensors, slack, campaign.equivalent_mass, timing.control_period
             )
             slopes = [run_weights.shift(f[:rows, lane], x[:rows, lane]) for f, x in stepped]
-            value, noise = figures(run, expected, lane, run_weights, sensors, colours)
+            value, noise = compute_metrics(run, expected, lane, run_weights, sensors, colours)
             yield value, np.array(slopes).T, noise
 
 
-def _expected(
-    mechanism: Mechanism, runs: Sequence[Run], timing: Timing, numbers: Sequence[Uncertain]
-) -> tuple[Readings, list[tuple[np.ndarray, np.ndarray]]]:
+def _predict_with_sensitivities(
+    mechanism: Mechanism,
+    runs: Sequence[LoggedRun],
+    timing: CampaignTiming,
+    numbers: Sequence[UncertainParameter],
+) -> tuple[PredictedReadings, list[tuple[np.ndarray, np.ndarray]]]:
     """Return predicted readings, and their changes for one standard deviation of each parameter."""
-    slack = max(number.std for number in numbers if number.path in SENSOR_DELAYS)
-    motion, differences = motion_of(mechanism, runs, timing, slack), []
-    expected = readings(mechanism, runs, motion)
+    slack = max(number.std for number in numbers if number.path in SENSOR_DELAY_KEYS)
+    motion, differences = simulate_motion(mechanism, runs, timing, slack), []
+    expected = predict_readings(mechanism, runs, motion)
     for parameter in numbers:
-        stepped = parameter.stepped(mechanism)
+        stepped = parameter.step_parameter(mechanism)
         moved = (
-            motion_of(stepped, runs, timing, slack) if parameter.path.startswith("rig.simulator.") else motion
+            simulate_motion(stepped, runs, timing, slack)
+            if parameter.path.startswith("rig.simulator.")
+            else motion
         )
-        read = readings(stepped, runs, moved)
+        read = predict_readings(stepped, runs, moved)
         differences.append((read.force - expected.force, read.position - expected.position))
     return expected, differences
 
 
-class _Watch:
+class _MonitorState:
     """State of the monitor after the contacts so far; the prediction is not updated after an alarm."""
 
-    def __init__(self, prediction: Prediction):
+    def __init__(self, prediction: MetricFilter):
         self.prediction = prediction
         self.seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        self.contacts: list[Contact] = []
+        self.contacts: list[ContactDeviation] = []
         self.alarm: int | None = None
         self.since = 0
-        self.beyond = np.zeros(len(NAMES), bool)  # metrics that raised an alarm
+        self.beyond = np.zeros(len(METRIC_NAMES), bool)  # metrics that raised an alarm
 
     def add(self, source: str, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> None:
         deviation, std = self.prediction.deviation(value, slopes, noise)
         self.seen.append((value, slopes, noise))
-        self.contacts.append(Contact(source, value, std, deviation / std, "good"))
-        likelier, began = changes(np.array([contact.z for contact in self.contacts]))
-        self.beyond |= likelier > LIMIT
+        self.contacts.append(ContactDeviation(source, value, std, deviation / std, "good"))
+        likelier, began = detect_changes(np.array([contact.z for contact in self.contacts]))
+        self.beyond |= likelier > ALARM_THRESHOLD
         if not self.beyond.any():
             self.prediction.learn(value, slopes, noise)
             return
@@ -163,14 +181,14 @@ class _Watch:
         covered = self.prediction.covers(*self._mean())
         self.contacts[-1] = replace(self.contacts[-1], state="watch" if covered else "bad")
 
-    def outcome(self) -> Monitored:
+    def outcome(self) -> MonitorResult:
         if self.alarm is None:
-            return Monitored(tuple(self.contacts), None, None, ())
+            return MonitorResult(tuple(self.contacts), None, None, ())
         value, _, noise = self._mean()
         std = np.sqrt(np.diag(noise))
         order = sorted(np.flatnonzero(self.beyond), key=lambda i: -abs(value[i] / std[i]))
-        result = tuple(Change(NAMES[i], float(value[i]), float(std[i])) for i in order)
-        return Monitored(tuple(self.contacts), self.alarm, self.since, result)
+        result = tuple(MetricChange(METRIC_NAMES[i], float(value[i]), float(std[i])) for i in order)
+        return MonitorResult(tuple(self.contacts), self.alarm, self.since, result)
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return metrics, slopes and covariance, averaged over the contacts since the change."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-class Identified(NamedTuple):
+class ContactEstimate(NamedTuple):
     """Estimate of theta = (k, b), and its covariance P = U D U^T."""
 
     stiffness: Float[Array, "*batch"]  # k [N/m]
@@ -23,15 +23,15 @@ class Identified(NamedTuple):
     damping_variance: Float[Array, "*batch"]  # d_2
 
 
-def update(
-    old: Identified,
+def update_estimate(
+    old: ContactEstimate,
     forgetting: Array,
     initial_variances: tuple[Array, Array],
     deflection: Array,
     rate: Array,
     force: Array,
     weight: Array,
-) -> Identified:
+) -> ContactEstimate:
     """Return the estimate after one reading: deflection [m], rate [m/s], force [N] and weight [1].
 
     With weight w, phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda) the recursion is
@@ -50,7 +50,7 @@ def update(
     step = (force - (old.stiffness * deflection + old.damping * rate)) * inverse_2
     variances = (old.stiffness_variance * inverse_1, old.damping_variance * alpha_1 * inverse_2 / factor)
     bounded = [jnp.where(d < most, d, most) for d, most in zip(variances, initial_variances, strict=True)]
-    return Identified(
+    return ContactEstimate(
         stiffness=old.stiffness + (g_1 + g_2 * old.coupling) * step,
         damping=old.damping + g_2 * step,
         coupling=old.coupling - g_1 * f_2 * inverse_1,

@@ -7,19 +7,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxhil.laws.shared.estimates import FORCE_DELAY, SIMULATOR_LAG, simulator_lag
 from jaxhil.laws.shared.lead_filter import (
     LEAD_FILTER,
     PHASE_LEAD,
     LeadFilter,
     LeadState,
-    lead,
-    lead_filter,
+    apply_lead_filter,
+    build_lead_filter,
 )
-from jaxhil.laws.simulation_base import Compensator, Constants, Gain, Gains, rig_gain
+from jaxhil.laws.shared.nominal_values import FORCE_DELAY, SIMULATOR_LAG, simulator_lag
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, rig_gain
 
 # An ideal simulator with a zero-order hold is half a period ahead; such a negative lag is not predicted.
-LAG = rig_gain(
+SIMULATOR_LAG_GAIN = rig_gain(
     "simulator_lag",
     lower=lambda mechanism: 0.0,
     upper=lambda mechanism: 2 * max(0.0, simulator_lag(mechanism)) + 0.02,
@@ -40,7 +40,7 @@ class Smith(Compensator):
 
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
     reads_position: ClassVar[bool] = False
-    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, LAG)
+    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, SIMULATOR_LAG_GAIN)
     # A/(T_s/2) of the whole transfer function behind the lead, (1 + A s)/(1 + T_s s/2).
     excess: eqx.AbstractClassVar[float]
 
@@ -52,7 +52,7 @@ class Smith(Compensator):
         period, lag = constants.control_period, gains["simulator_lag"]
         scale = 1 / (lag + period)
         predictor = LeadFilter((lag - period) * scale, (3 * lag + period) * scale, (period - 3 * lag) * scale)
-        return Cascade(lead_filter(gains, constants), predictor)
+        return Cascade(build_lead_filter(gains, constants), predictor)
 
     def noise_amplification(self, gains, constants):
         return cascade_amplification(gains, constants, self.excess)
@@ -62,12 +62,12 @@ class Smith(Compensator):
         return Cascade(LeadState(zeros, zeros), LeadState(zeros, zeros))
 
     def step(self, prepared, state, signals, tick):
-        led, lead_state = lead(prepared.lead, state.lead, signals.force_measured)
-        predicted, predictor = lead(prepared.predictor, state.predictor, led)
+        led, lead_state = apply_lead_filter(prepared.lead, state.lead, signals.force_measured)
+        predicted, predictor = apply_lead_filter(prepared.predictor, state.predictor, led)
         return self.combined(led, predicted), Cascade(lead_state, predictor)
 
 
-def cascade_amplification(gains: Gains, constants: Constants, excess: float) -> Float[Array, "*batch"]:
+def cascade_amplification(gains: Gains, constants: KnownConstants, excess: float) -> Float[Array, "*batch"]:
     """Return the noise amplification of the lead and (1 + A s)/(1 + C s), C = T_s/2, A = excess C [1].
 
     Tustin's rule maps the unit circle to the imaginary axis: the variance of white noise behind the filter is

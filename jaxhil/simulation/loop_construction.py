@@ -1,0 +1,120 @@
+"""Construction of the static `Loop` of a mechanism and a compensator for a batch of scenarios.
+
+A `Loop` contains only what determines the compiled program. Delay lines have lengths that are powers of two,
+so that mechanisms with similar delays share one program.
+"""
+
+import jax
+import numpy as np
+
+from jaxhil.contact.laws import find_contact_law
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.cells import MAX_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
+from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.scenario import Scenario
+
+MIN_RING_LENGTH = 16  # samples; least length of a delay line
+# Greatest pole and contact frequency [rad per control period] for which samples suffice.
+# SLOW: the peak force is accurate to 2e-3.
+# SLOW_BETWEEN, for force sensors with a lag and laws with memory: the restitution is accurate to 1e-5.
+MAX_SAMPLED_RATES, MAX_SAMPLED_RATES_WITH_MEMORY = (1.0, 0.1), (0.15, 0.05)
+DAMPER_WEIGHT = 2.0  # weight of a damper's rate b/M against a frequency, as its force jumps at the touch
+
+
+def build_loop(
+    mechanism: Mechanism,
+    compensator: str,
+    scenarios: Scenario,
+    energies: bool = False,
+    chatter: bool = False,
+    exact: bool = False,
+) -> Loop:
+    """Return the loop of `mechanism` with the compensator named `compensator`, for all `scenarios`.
+
+    `energies` records the mechanical work of the real force, `chatter` the command's excess variation.
+    `exact` computes restitution, peak force, duration and work to 1e-6 from the motion between samples.
+    Without it, the samples alone are used where they are accurate enough, which is several times faster.
+    """
+    rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
+    simulator = scenarios.simulator
+    law = COMPENSATORS[compensator]
+    sensed = np.maximum(force.delay, position.delay) + simulator.delay
+    aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
+
+    def samples(delay) -> int:
+        """Return the length of a delay line that reaches `delay` [s] back, current interval included."""
+        periods = float(np.max(delay / scenarios.control_period))
+        return max(MIN_RING_LENGTH, 1 << int(np.ceil(np.log2(periods + 4))))
+
+    is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
+    return Loop(
+        law=find_contact_law(mechanism.contact.law).simulated,
+        compensator=law,
+        integrator=rig.integrator,
+        hold=rig.command_hold,
+        latency=rig.command_latency,
+        has_lag=bool(np.any(force.time_constant > 0)),
+        has_force_bias=bool(np.any(force.bias != 0)),
+        has_force_noise=bool(np.any(force.noise_std > 0)),
+        has_position_noise=bool(np.any(position.noise_std > 0)),
+        has_sample_effects=bool(
+            np.any(force.quantum > 0)
+            or np.any(force.dead_zone > 0)
+            or np.any(np.isfinite(force.range))
+            or np.any(position.quantum > 0)
+        ),
+        has_limits=bool(
+            np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
+        ),
+        discontinuity_order=_find_discontinuity_order(simulator.numerator, rig.command_hold),
+        cells=_choose_cell_counts(mechanism, scenarios, exact),
+        is_two_sided=is_two_sided,
+        ring=samples(sensed),
+        controller_ring=samples(max(aligned, default=0.0)),
+        energies=energies,
+        probed=scenarios.probe is not None,
+        chatter=chatter,
+    )
+
+
+def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts:
+    """Return the number of cells, or `NO_CELLS` if samples are accurate enough and `exact` is not set.
+
+    Cells are counted for the fastest pole and the shortest lag of any lane, at the longest control period.
+    """
+    period = float(np.max(scenarios.control_period))
+    fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
+    lags = np.asarray(scenarios.force_sensor.time_constant) / period
+    law, lagging = find_contact_law(mechanism.contact.law), bool(np.any(lags > 0))
+    pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if law.remembers or lagging else MAX_SAMPLED_RATES
+    slow = fastest <= pole and _max_contact_frequency(mechanism, scenarios) * period <= contact
+    if slow and (law.arcs or not lagging) and not exact:
+        return NO_CELLS
+    return count_cells(min(fastest, MAX_POLE), lags)
+
+
+def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
+    """Return the largest contact frequency [rad/s] of any lane, entered at the first approach's velocity.
+
+    This is sqrt(F'/M) at the greatest penetration, or 2 F_d/M if larger, where F_d is the slope of the force
+    against the penetration rate at the onset.
+    """
+    # NumPy broadcasts slots and lanes; JAX, of which the scenarios may be, would refuse it.
+    law, contact = find_contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)
+    mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
+    if contact.stiffness.ndim > contact.damping.ndim:  # (slots, segments, lanes): the stiffest segment
+        contact = contact._replace(stiffness=np.max(contact.stiffness, axis=1))
+    with np.errstate(all="ignore"):
+        slope, damping = law.tangent_stiffness(contact, mass, velocity), law.onset_damping(contact)
+        frequency = np.max(np.sqrt(slope / mass), initial=0.0)
+        return float(max(frequency, DAMPER_WEIGHT * np.max(damping / mass)))
+
+
+def _find_discontinuity_order(numerator, hold: str) -> int:
+    """Return the order of the lowest derivative of the position that jumps at the ticks, at most 3.
+
+    It is the relative degree of the motion simulator, plus 1 if the command itself does not jump.
+    """
+    proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
+    return min((proper[0] if proper else 0) + (hold == "linear"), 3)

@@ -1,0 +1,233 @@
+"""Checks of the arguments of public functions; each raises an error with a message of one line.
+
+The same message serves the function and the command: an `ArgumentError` also has a text with the option's
+name.
+"""
+
+import functools
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.files import open_input
+from jaxhil.laws import built_in_compensators
+from jaxhil.mechanism.file import AnyMechanism, LoadedAnyMechanism, LoadedMechanism, source_sha256
+from jaxhil.mechanism.loading import as_any_mechanism, as_mechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import Mechanism
+
+if TYPE_CHECKING:
+    from jaxhil.simulation.gain_file import LoadedGains
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+SIX_AXIS_COMPENSATOR_NAMES = built_in_compensators(6)
+
+
+class ArgumentError(InputError):
+    """Error for an unusable argument: "name: found X, expected Y".
+
+    `option` is the text for the command's option. `which` names the entry of an argument with several values.
+    """
+
+    def __init__(self, name: str, found: str, allowed: str, which: str = ""):
+        """Create the error from the argument's name, the value found and the allowed values, in words."""
+        text = f"{f': {which}' if which else ''}: found {found}, expected {allowed}"
+        super().__init__(name + text)
+        self.option = f"--{name.replace('_', '-')}{text}"
+
+
+def convert_os_errors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a public function, so that an `OSError` in it becomes an `InputError`."""
+
+    @functools.wraps(function)
+    def called(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        try:
+            return function(*arguments, **named)
+        except OSError as error:
+            where = f"{to_one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
+            raise InputError(f"{where}{to_one_line(error.strerror or str(error), 200)}") from None
+
+    return called
+
+
+def check_integers(least: int, most: int | None = None, **values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is an integer from `least` to `most`."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ArgumentError(name, format_value(value), f"an integer >= {least}")
+        if value < least:
+            raise ArgumentError(name, str(value), f"an integer >= {least}")
+        if most is not None and value > most:
+            raise ArgumentError(name, str(value), f"at most {most}")
+
+
+def check_choice(allowed: Sequence[str], **values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is one of the `allowed` names."""
+    for name, value in values.items():
+        if value not in allowed:
+            raise ArgumentError(name, format_value(value), ", ".join(allowed))
+
+
+def check_limit(value: Any) -> None:
+    """Raise `ArgumentError` unless a limit of the restitution error is a number >= 0; it may be infinite."""
+    if not is_number(value) or math.isnan(value) or value < 0:
+        raise ArgumentError("limit", str(value) if is_number(value) else format_value(value), "a number >= 0")
+
+
+def check_booleans(**values: Any) -> None:
+    """Raise `ArgumentError` unless every argument is true or false."""
+    for name, value in values.items():
+        if not isinstance(value, bool):
+            raise ArgumentError(name, format_value(value), "true or false")
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is an `int` or `float` (also NumPy's `float64`), and not a `bool`."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def check_compensators(names: Iterable[Any], argument: str = "compensator") -> None:
+    """Raise `ArgumentError` unless every name is a compensator, built in or registered."""
+    allowed = compensator_names()
+    for name in names:
+        check_choice(allowed, **{argument: name})
+
+
+def check_supports_mechanism(
+    compensator: Any, mechanism: AnyMechanism | None, argument: str = "compensator"
+) -> None:
+    """Raise `ArgumentError` unless the compensator supports the mechanism's axes, or any if it is None."""
+    if mechanism is None:
+        check_choice(
+            tuple(dict.fromkeys([*compensator_names(), *SIX_AXIS_COMPENSATOR_NAMES])),
+            **{argument: compensator},
+        )
+    elif not isinstance(mechanism, SixAxisMechanism):
+        check_compensators([compensator], argument)
+    elif compensator not in SIX_AXIS_COMPENSATOR_NAMES:
+        allowed = f"{', '.join(SIX_AXIS_COMPENSATOR_NAMES)}: in six axes there are no others so far"
+        raise ArgumentError(argument, format_value(compensator), allowed)
+
+
+def check_one_axis_arguments(mechanism: AnyMechanism, **values: Any) -> None:
+    """Raise `ArgumentError` if the mechanism has six axes and any of the arguments is set."""
+    for name, value in values.items():
+        if isinstance(mechanism, SixAxisMechanism) and value:
+            found = "a function" if callable(value) else format_value(value)
+            raise ArgumentError(name, found, "nothing: in six axes there is none so far")
+
+
+def compensator_names() -> tuple[str, ...]:
+    """Return the names of all compensators, the registered ones last.
+
+    This does not import jax: registered compensators exist only if jax is already imported.
+    """
+    loaded = sys.modules.get("jaxhil.laws.compensators")
+    return tuple(dict.fromkeys([*built_in_compensators(), *(loaded.COMPENSATORS if loaded else ())]))
+
+
+def check_setting_name(compensator: str, value: Any) -> None:
+    """Raise `ArgumentError` unless a given setting is one of the compensator's. This may import jax."""
+    if value is None:
+        return
+    from jaxhil.laws.compensators import get_compensator
+
+    names = get_compensator(compensator).settings
+    if value not in names:
+        allowed = ", ".join(names) or f"none, {compensator} has no settings"
+        raise ArgumentError("setting", format_value(value), allowed)
+
+
+def as_list(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
+    """Return a value as a list, and whether it was a list.
+
+    A value of one of the `kinds`, a mapping, or a value that is not iterable becomes a list of one entry.
+    """
+    if isinstance(value, kinds) or not isinstance(value, Iterable) or isinstance(value, Mapping):
+        return [value], False
+    return list(value), True
+
+
+def check_path(name: str, value: Any) -> Path:
+    """Return a path, which need not exist. Raise `ArgumentError` if the value is not a path."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise ArgumentError(name, format_value(value), "a path")
+    return Path(value)
+
+
+def load_mechanisms(value: Any) -> tuple[list[LoadedMechanism], bool]:
+    """Return one-axis mechanisms as a list, and whether several were given.
+
+    Each is given as the result of `jaxhil.load`, or as a name or path that it accepts. Raise `InputError`.
+    """
+    listed, is_list = _as_mechanism_list(value)
+    checked = [as_mechanism(entry) for entry in listed]
+    return [
+        LoadedMechanism(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked
+    ], is_list
+
+
+def load_any_mechanisms(value: Any) -> tuple[list[LoadedAnyMechanism], bool]:
+    """Return mechanisms with one axis or six as a list, like `load_mechanisms`."""
+    listed, is_list = _as_mechanism_list(value)
+    checked = [as_any_mechanism(entry) for entry in listed]
+    return [
+        LoadedAnyMechanism(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked
+    ], is_list
+
+
+def _as_mechanism_list(value: Any) -> tuple[list[Any], bool]:
+    """Return mechanisms as a list, and whether it was a list. Raise `ArgumentError` for an empty one."""
+    listed, is_list = as_list(value, (Mechanism, SixAxisMechanism, str, os.PathLike))
+    if not listed:
+        raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
+    return listed, is_list
+
+
+def load_gains(value: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
+    """Return the loaded gains of a path, a folder, or an object with a gain file's `document`.
+
+    Six axes are accepted only with `any_axes`.
+    """
+    from jaxhil.simulation.gain_file import check_document, load_gain_file
+
+    document = getattr(value, "document", None)
+    if isinstance(document, Mapping):
+        return check_document(dict(document), any_axes=any_axes)
+    path = check_path(argument, value)
+    return load_gain_file(path / "gains.json" if path.is_dir() else path, any_axes)
+
+
+def find_gain_file(value: Any, argument: str = "gains") -> Path:
+    """Return the path of a gain file, given itself or its folder. Raise `InputError` if it is unreadable."""
+    try:
+        path = check_path(argument, value)
+        if path.is_dir():
+            path = path / "gains.json"
+        with open_input(path) as file:
+            file.read(1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        where = to_one_line(os.fspath(value)) or repr(value)
+        raise InputError(f"{where}: cannot be read: {to_one_line(reason)}") from None
+    return path
+
+
+def check_has_runtime(compensator: str) -> None:
+    """Raise `InputError` if the compensator was registered without a runtime for the rig."""
+    from jaxhil.rig import COMPENSATORS
+
+    if compensator not in COMPENSATORS:
+        raise InputError(
+            f"{compensator}: found no runtime class for the rig, "
+            f"expected a law registered with one: jaxhil.register(law, runtime=...)"
+        )

@@ -1,0 +1,270 @@
+"""Function `tuning.export`: writes gains as a bundle that a rig computer can check and run."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+from msgspec import to_builtins
+from tyro.conf import arg
+
+from jaxhil.errors import format_value
+from jaxhil.rig.limits import LIMITS
+from jaxhil.simulation.jax_environment import jax_context
+from tuning import terminal
+from tuning.api import arguments
+from tuning.api.arguments import ArgumentError
+from tuning.api.options import (
+    AllowedValues,
+    SeedRange,
+    add_options,
+    check_options,
+    number_option,
+    text_option,
+)
+from tuning.bundle.selftest import SIGNATURE_FILE
+
+if TYPE_CHECKING:
+    from tuning.sweeps.store import SweepStore
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """Result of `export`.
+
+    Attributes:
+        document: all results, as `jaxhil export --json` prints them.
+        sizes: size of each of the bundle's files [bytes].
+    """
+
+    document: dict[str, Any]
+    sizes: dict[str, int]
+
+    @property
+    def verdict(self) -> str:
+        """Return the verdict: "good", "bad" or "unknown".
+
+        It is "bad" if the rig's controller differs from the simulated one, or gives wrong alarms more often
+        than allowed, and "unknown" if nothing is bad, but too few runs determine the alarm rates.
+        """
+        return self.document["verdict"]
+
+    @property
+    def good(self) -> bool:
+        """Return whether nothing is bad, that is, whether `jaxhil export` ends with exit code 0."""
+        return self.verdict != "bad"
+
+    @property
+    def reasons(self) -> list[str]:
+        """Return the reasons for a bad verdict; an empty list for any other verdict."""
+        return list(self.document["reasons"])
+
+    @property
+    def unknown(self) -> list[str]:
+        """Return what is not known, with the sweep that would show it; empty for a good verdict."""
+        return list(self.document["unknown"])
+
+
+ProbabilityRange = AllowedValues(0.0, 1.0, words="0 to 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of `export`."""
+
+    false_alarms: Annotated[
+        float,
+        arg(
+            metavar="PROBABILITY",
+            help="Acceptable share of good runs (error at most half the limit) that are stopped.",
+        ),
+        ProbabilityRange,
+    ] = 0.01
+    missed: Annotated[
+        float,
+        arg(metavar="PROBABILITY", help="Acceptable share of bad runs that the watchdog misses."),
+        ProbabilityRange,
+    ] = 0.02
+    seed: Annotated[int, number_option("SeedRange of the test vectors."), SeedRange] = 0
+    sign: Annotated[
+        str | None,
+        text_option("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
+    ] = None
+
+
+@arguments.convert_os_errors
+@add_options(ExportOptions)
+def export(
+    gains: Any,
+    folder: str | os.PathLike[str],
+    *,
+    sweep: Any = None,
+    formats: Sequence[str] | None = None,
+    limits: Mapping[str, float | None] | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> ExportResult:
+    """Write a bundle for the rig: gains, controller, test vectors and self-test, without dependencies.
+
+    Args:
+        gains: result of `tuning.tune`, or the path of a gain file or of its folder.
+        folder: folder of the bundle: a new or empty one, or a bundle, which is replaced.
+        sweep: result of `tuning.sweep` for these gains, or the folder of its store, from which limits and
+            alarm rates are computed.
+        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99"; None for all.
+        limits: limits of this rig by name [SI units], None for no limit; they replace the computed ones.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The verdict with its reasons, all results, and the sizes of the files.
+
+    Raises:
+        InputError: If an argument is unusable, the compensator has no runtime, or the folder cannot be
+            written; the message has one line.
+
+    Example:
+        >>> import tempfile
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     exported = tuning.export(tuned, folder, formats=["c99"])
+        >>> "gains.json" in exported.sizes
+        True
+    """
+    settings = ExportOptions(**options)
+    check_options(settings)
+    arguments.check_booleans(progress=progress)
+    from tuning.bundle.bundle import build_bundle, check_bundle_folder, check_same_mechanism, write_bundle
+    from tuning.bundle.signing import load_signer
+
+    target = arguments.check_path("folder", folder)
+    user_limits = _parse_limits({} if limits is None else limits)
+    path = gains if hasattr(gains, "document") else arguments.find_gain_file(gains)
+    _check_formats(formats)
+    check_bundle_folder(target)
+    key = None if settings.sign is None else load_signer(arguments.check_path("sign", settings.sign))
+    with jax_context():
+        loaded = arguments.load_gains(path)
+        arguments.check_has_runtime(loaded.compensator)
+        check_same_mechanism(target, loaded.mechanism.name)
+        format_names = _select_formats(formats)
+        calibration = _calibrate_limits(
+            loaded, sweep, user_limits, (settings.false_alarms, settings.missed), progress
+        )
+        with terminal.show_stages(2, progress) as stages:
+            bundle = build_bundle(
+                loaded.document,
+                format_names,
+                calibration.limits,
+                calibration.rates,
+                settings.seed,
+                stages.begin,
+                key,
+            )
+            if not bundle.reasons:
+                write_bundle(target, bundle.files)
+    document = _build_document(loaded, bundle, format_names, calibration.rates)
+    document["bundle"] = None if bundle.reasons else str(target)
+    return ExportResult(document, {name: len(content) for name, content in bundle.files.items()})
+
+
+def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
+    """Return the document of the export, without the path of the bundle."""
+    from tuning.verification.stops import describe_limit_changes
+
+    stops = []
+    if bundle.stop is not None:
+        # A nominal run that the limits stop here is also stopped on the rig.
+        stops = [f"the nominal run is {bundle.stop.text}; {describe_limit_changes(bundle.passing)}"]
+    elif bundle.ended and bundle.ended[0]:
+        stops = [f"the nominal run, {bundle.ended[0]}"]
+    reasons = [*bundle.reasons, *stops, *rates["reasons"]]
+    return {
+        "bundle": None,
+        "mechanism": loaded.mechanism.name,
+        "compensator": loaded.compensator,
+        "gains_sha256": bundle.document["sha256"],
+        "formats": format_names,
+        "files": sorted(bundle.files),
+        "signed": SIGNATURE_FILE in bundle.files,
+        "limits": bundle.document.get("limits"),
+        "rates": rates,
+        "ticks": bundle.ticks,
+        "runs": bundle.runs,
+        "ended": bundle.ended,
+        "stop": None if bundle.stop is None else {**to_builtins(bundle.stop), "passing": bundle.passing},
+        "reasons": reasons,
+        "unknown": rates["unknown"],
+        "verdict": "bad" if reasons else rates["verdict"],
+    }
+
+
+def _calibrate_limits(
+    loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
+):
+    """Return the calibrated limits, and the rates of false and missed alarms."""
+    from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
+    from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios
+    from tuning.watchdog.verdict import AllowedAlarmRates
+
+    faulty = count_fault_scenarios(allowed[1])
+    with _open_sweep(sweep) as store:
+        runs = DEFAULT_DRAWS if store is None else count_stored_scenarios(store)
+        with terminal.show_progress(runs + len(INJECTED_FAULTS) * faulty, "runs", progress) as bar:
+            bar.reach(0, "working out the limits")
+            return calibrate(
+                loaded,
+                store,
+                replaced=replaced,
+                allowed=AllowedAlarmRates(*allowed),
+                progress=bar.advance,
+                faulty=faulty,
+            )
+
+
+@contextmanager
+def _open_sweep(sweep: Any) -> "Iterator[SweepStore | None]":
+    """Open the store of a sweep; None without a sweep."""
+    from tuning.api.sweep import SweepStudy
+    from tuning.sweeps.store import read_store
+
+    if isinstance(sweep, SweepStudy):
+        with sweep.store() as store:
+            yield store
+    else:
+        yield None if sweep is None else read_store(arguments.check_path("sweep", sweep))
+
+
+def _parse_limits(limits: Any) -> dict[str, float | None]:
+    """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
+    if not isinstance(limits, Mapping):
+        raise ArgumentError("limits", format_value(limits), "limits by name")
+    for name, value in limits.items():
+        if name not in LIMITS:
+            raise ArgumentError("limits", format_value(name), f"one of {', '.join(LIMITS)}")
+        if value is not None and not (arguments.is_number(value) and LIMITS[name].admits(value)):
+            raise ArgumentError("limits", format_value(value), allowed_values(name), name)
+    return {name: None if value is None else float(value) for name, value in limits.items()}
+
+
+def allowed_values(name: str) -> str:
+    """Return the allowed values of a limit, in words."""
+    limit = LIMITS[name]
+    return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
+
+
+def _check_formats(formats: Any) -> None:
+    """Raise `InputError` for a format that does not exist."""
+    from tuning.bundle.writers import WRITERS
+
+    for name in formats or ():
+        arguments.check_choice(tuple(WRITERS), format=name)
+
+
+def _select_formats(formats: Sequence[str] | None) -> list[str]:
+    """Return the requested formats, by default all, in the order of `WRITERS`."""
+    from tuning.bundle.writers import WRITERS
+
+    return [name for name in WRITERS if not formats or name in formats]

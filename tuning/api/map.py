@@ -1,0 +1,246 @@
+"""Function `tuning.map`: computes where the loop diverges over two keys, and the nominal point's margins."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tyro.conf import arg
+
+from jaxhil.errors import InputError
+from jaxhil.files import report_write_errors, write_atomically
+from jaxhil.mechanism.loading import as_mechanism
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.rig import digest
+from jaxhil.simulation.jax_environment import jax_context
+from tuning import terminal
+from tuning.api import arguments, mechanism_summary
+from tuning.api.options import (
+    AllowedValues,
+    LimitRange,
+    Resume,
+    Scheduler,
+    SeedRange,
+    add_options,
+    check_options,
+    number_option,
+)
+
+if TYPE_CHECKING:
+    from tuning.stability_map.grid import MapResults
+
+SCHEMA = "jaxhil/map/1"
+DOCUMENT_FILE, PLOT = "map.json", "map.png"
+MAX_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class StabilityMap:
+    """Result of `map`; arrays are NumPy's, with rows along y and columns along x."""
+
+    document: dict[str, Any]  # all results, as `jaxhil map --json` prints them
+    x: np.ndarray  # values along x, (columns,), in the unit of its key
+    y: np.ndarray  # values along y, (rows,)
+    error: np.ndarray  # e - e* of largest magnitude of any contact, (rows, columns) [1]; NaN: no end
+    restitution: np.ndarray  # e of that contact, (rows, columns) [1]
+    found: "MapResults" = field(repr=False)
+
+    def plot(self, path: str | os.PathLike[str]) -> None:
+        """Draw the map to a .png, .pdf or .svg file. Raise `InputError` if it cannot be written."""
+        from jaxhil.simulation.contact_plot import save_figure
+        from tuning.plots.stability_map import map_plot
+
+        title = f"{self.document['mechanism']}, compensation: {self.document['compensator']}"
+        target = arguments.check_path("path", path)
+        with report_write_errors(target):
+            save_figure(map_plot(self.found, title, self.document["limit"]), target)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """Options of `map`."""
+
+    points: Annotated[
+        int, number_option("Number of points along each axis."), AllowedValues(2, MAX_POINTS)
+    ] = 100
+    limit: Annotated[
+        float, arg(metavar="NUMBER", help="Restitution error up to which margins are computed."), LimitRange
+    ] = 0.01
+    resume: Resume = False
+    scheduler: Scheduler = None
+    seed: Annotated[
+        int, number_option("SeedRange of the sensor noise, the same at every point."), SeedRange
+    ] = 0
+
+
+@arguments.convert_os_errors
+@add_options(MapOptions)
+def map(
+    mechanism: Mechanism | str | os.PathLike[str],
+    x: str,
+    y: str,
+    compensator: str = "none",
+    gains: Mapping[str, float] | str | os.PathLike[str] | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> StabilityMap:
+    """Compute the restitution error over two keys of a mechanism, and closed-form theory.
+
+    The gains are the same at every point, those of the nominal mechanism: the map shows the effect of changes
+    that the controller does not know. If compensator and contact law are linear, the map also has the
+    spectral radius of the sampled loop in contact and, at the nominal point, its derivative by every gain.
+
+    Args:
+        mechanism: a `Mechanism`, the name of a built-in one, or a file's path.
+        x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is that of
+            the file's [uncertainty], else 0.3 to 3 times the nominal value; for a gain its bounds. A list is
+            scaled as a whole, and the values are those of its first entry; "contact.stiffness[1]" is a single
+            entry.
+        y: key along y, like `x`.
+        compensator: name of a compensator.
+        gains: gains, as for `jaxhil.simulate`.
+        folder: folder for map.json and map.png; None writes nothing.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The values along both axes, the errors, and all results.
+
+    Raises:
+        InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> result = tuning.map("rig-300kg", "rig.force_sensor.delay", "contact.stiffness", points=3)
+        >>> result.error.shape
+        (3, 3)
+    """
+    settings = MapOptions(**options)
+    check_options(settings)
+    arguments.check_booleans(progress=progress)
+    if settings.resume and folder is None:
+        raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
+    checked, target = (
+        as_mechanism(mechanism),
+        None if folder is None else arguments.check_path("folder", folder),
+    )
+    with jax_context():
+        from jaxhil.laws.compensators import COMPENSATORS
+        from jaxhil.simulation.gain_choice import choose_gains
+        from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
+        from tuning.stability_map.axes import check_axes, parse_axis
+        from tuning.stability_map.grid import compute_map, count_runs
+
+        name, values = choose_gains(checked, compensator, gains)
+        law = COMPENSATORS[name]
+        try:
+            axes = parse_axis("x", x, checked, law, values), parse_axis("y", y, checked, law, values)
+            check_axes(checked, axes)
+        except InputError as error:
+            error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
+            raise
+        mechanism_summary.check_can_be_simulated(checked)
+        with terminal.show_progress(count_runs(settings.points), "runs", progress) as bar:
+            checkpoints = Checkpoints(None if target is None else target / CHECKPOINT_FOLDER, settings.resume)
+            computed = compute_map(
+                checked,
+                name,
+                values,
+                axes,
+                settings.points,
+                settings.limit,
+                settings.seed,
+                bar.tell,
+                settings.scheduler,
+                checkpoints,
+            )
+        document = _build_document(checked, name, values, computed, settings.limit, settings.seed)
+        stability_map = StabilityMap(
+            document, computed.x, computed.y, computed.error, computed.restitution, computed
+        )
+        if target is not None:
+            _write(stability_map, target)
+            checkpoints.remove()
+    return stability_map
+
+
+def _write(stability_map: StabilityMap, folder: Path) -> None:
+    """Write map.json and map.png."""
+    with report_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / DOCUMENT_FILE, terminal.format_json(stability_map.document).encode("ascii"))
+    stability_map.plot(folder / PLOT)
+
+
+def _build_document(
+    mechanism: Mechanism,
+    compensator: str,
+    gains: Mapping[str, float],
+    computed: "MapResults",
+    limit: float,
+    seed: int,
+) -> dict[str, Any]:
+    """Return the JSON document of a map."""
+    from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS
+    from jaxhil.simulation.source_fingerprint import dependency_versions
+    from tuning.gain_file import VERSIONED_PACKAGES, to_json_data
+
+    closed, radii, nominal = computed.closed, computed.radii, computed.nominal
+    keys = ("low", "high")
+    document = {
+        "schema": SCHEMA,
+        "mechanism": mechanism.name,
+        "compensator": compensator,
+        "gains": dict(gains),
+        **{
+            name: {"key": axis.key, "unit": axis.unit, "nominal": axis.nominal, "values": values}
+            for name, axis, values in zip("xy", computed.axes, (computed.x, computed.y), strict=True)
+        },
+        "limit": limit,
+        "seed": seed,
+        "error": computed.error,
+        "restitution": computed.restitution,
+        "peak_force_ratio": computed.peak_force_ratio,
+        "duration_ratio": computed.duration_ratio,
+        "bounds": CONTACT_BOUNDS,
+        "theory": {
+            "series": closed.series,
+            "characteristic_root": closed.characteristic_root,
+            "delay_over_critical": closed.delay_over_critical,
+            "none_because": closed.reason,
+        },
+        "spectral_radius": {
+            **({} if radii is None else {"x": radii.x, "y": radii.y, "values": radii.values}),
+            "none_because": computed.no_growth,
+        },
+        "nominal": {
+            "restitution": nominal.restitution,
+            "error": nominal.error,
+            "peak_force_ratio": nominal.peak_force_ratio,
+            "duration_ratio": nominal.duration_ratio,
+            "growth": nominal.growth,
+            "margins": {
+                name: None
+                if margins is None
+                else {
+                    axis: dict(zip(keys, margin, strict=True))
+                    for axis, margin in zip("xy", margins, strict=True)
+                }
+                for name, margins in (
+                    ("error", nominal.error_margins),
+                    ("contact", nominal.contact_margins),
+                    ("spectral_radius", nominal.radius_margins),
+                )
+            },
+        },
+        "versions": dependency_versions(VERSIONED_PACKAGES),
+    }
+    document = to_json_data(document)
+    return {**document, "sha256": digest(document)}
+
+
+__all__ = ["MapOptions", "StabilityMap", "map"]

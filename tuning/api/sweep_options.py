@@ -1,0 +1,109 @@
+"""Options of `tuning.sweep` and `jaxhil sweep`."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from tyro.conf import arg
+
+from jaxhil.errors import format_value
+from tuning.api import arguments
+from tuning.api.arguments import ArgumentError
+from tuning.api.options import (
+    AllowedValues,
+    Limit,
+    Resume,
+    Scheduler,
+    check_options,
+    number_option,
+    text_option,
+)
+from tuning.sweeps import MAX_CHUNK_SIZE, MAX_SCENARIOS, MAX_SEED, PRECISIONS, SAMPLINGS
+
+MAX_SOBOL_SCENARIOS = 2**20  # largest number of scenarios for each input
+DEFAULT_SOBOL_SCENARIOS = 1024
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Options of `sweep`."""
+
+    scenarios: Annotated[
+        int, number_option("Scenarios to draw and run."), AllowedValues(1, MAX_SCENARIOS)
+    ] = 100_000
+    seed: Annotated[
+        int, number_option("Seed; scenario i depends only on the seed and on i."), AllowedValues(0, MAX_SEED)
+    ] = 0
+    sampling: Annotated[
+        str,
+        arg(metavar="NAME", help="random, or sobol (scrambled, several replicates)."),
+        AllowedValues(names=SAMPLINGS),
+    ] = "random"
+    precision: Annotated[
+        str,
+        arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset."),
+        AllowedValues(names=PRECISIONS),
+    ] = "float64"
+    works: Annotated[
+        bool,
+        arg(
+            name="works",
+            metavar="",
+            help="Also compute the mechanical work of the real force, to 1e-6; tens of times slower.",
+        ),
+    ] = False
+    limit: Limit = 0.01
+    until_width: Annotated[
+        float | None,
+        text_option("WIDTH", "Stop once the probability's interval is this narrow, or after --scenarios."),
+        AllowedValues(math.ulp(0.0), 1.0, words="a width above 0, at most 1"),
+    ] = None
+    drivers: Annotated[
+        int | None,
+        text_option(
+            "[NUMBER]",
+            "Also Sobol indices of the error, from a power of two of scenarios; bare: "
+            f"{DEFAULT_SOBOL_SCENARIOS}.",
+        ),
+        AllowedValues(2, MAX_SOBOL_SCENARIOS, words=f"a power of two, 2 to {MAX_SOBOL_SCENARIOS}"),
+    ] = None
+    rare: Annotated[
+        float | None,
+        text_option(
+            "[LIMIT]", "Also subset simulation of rare errors beyond this limit; bare, or 0: --limit."
+        ),
+    ] = None
+    acceptable: Annotated[
+        float | None,
+        text_option(
+            "PROBABILITY",
+            "Failure probability that the interval may reach; by default no run may fail.",
+        ),
+        AllowedValues(0.0, 1.0, words="a probability, 0 to 1"),
+    ] = None
+    resume: Resume = False
+    chunk: Annotated[
+        int,
+        number_option("Scenarios computed at a time, and rows of each chunk of the store."),
+        AllowedValues(1, MAX_CHUNK_SIZE),
+    ] = 16384
+    scheduler: Scheduler = None
+
+    def check(self) -> None:
+        """Check all options. Raise `InputError`."""
+        check_options(self)
+        if self.until_width is not None and self.sampling != "random":
+            raise ArgumentError("until_width", f"with --sampling {self.sampling}", "with random")
+        if self.drivers is not None and self.drivers & (self.drivers - 1):
+            raise ArgumentError("drivers", str(self.drivers), f"a power of two, 2 to {MAX_SOBOL_SCENARIOS}")
+        if (rare := self.rare) is not None:
+            is_number = arguments.is_number(rare)
+            if not (is_number and (rare == 0 or (math.isfinite(rare) and rare >= self.limit))):
+                raise ArgumentError("rare", _format_value(rare), "a finite error, at least --limit")
+            if rare == 0 and not math.isfinite(self.limit):
+                raise ArgumentError("rare", "without a limit", "with a finite --limit")
+
+
+def _format_value(value: Any) -> str:
+    """Return a value as text for a message."""
+    return str(value) if arguments.is_number(value) else format_value(value)

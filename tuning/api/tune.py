@@ -1,0 +1,110 @@
+"""Function `tuning.tune`: tunes one compensator's gains for one or several mechanisms."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from jaxhil.mechanism.file import LoadedAnyMechanism, LoadedMechanism
+from jaxhil.simulation.jax_environment import jax_context
+from tuning import terminal
+from tuning.api import arguments, mechanism_summary, tune_pareto
+from tuning.api.options import add_options
+from tuning.api.tune_options import TuneOptions
+from tuning.api.tuned_gains import TunedGains
+
+if TYPE_CHECKING:
+    from tuning.caches.checkpoints import Checkpoints
+
+
+@arguments.convert_os_errors
+@add_options(TuneOptions)
+def tune(
+    mechanism: Any,
+    compensator: str = TuneOptions.compensator,
+    *,
+    progress: bool = False,
+    **options: Any,
+) -> Any:
+    """Tune a compensator's gains for a mechanism, and evaluate them on fresh scenarios.
+
+    Equal arguments give equal gains to the last bit, also with the command `jaxhil tune`.
+
+    Args:
+        mechanism: result of `jaxhil.load`, or a name or path that it accepts; or a list of these, which are
+            tuned together.
+        compensator: name of a compensator, built in or registered; in six axes "none", "phase_lead" or
+            "phase_lead_per_axis".
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    `start` also accepts results of `tune`, and `objective` a function of the metrics of all scenarios, which
+    returns a number >= 0 to be minimised.
+
+    Returns:
+        A `TunedGains`, or a list of them for a list of mechanisms.
+
+    Raises:
+        InputError: If an argument is unusable; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> sorted(tuned.gains)
+        ['lead_filter', 'phase_lead']
+        >>> tuned.verdict
+        'bad'
+    """
+    settings = TuneOptions(compensator=compensator, **options)
+    arguments.check_booleans(progress=progress)
+    loaded, is_list = arguments.load_any_mechanisms(mechanism)
+    settings.check()
+    for entry in loaded:
+        settings.fits(entry.mechanism)
+    with jax_context():
+        for entry in loaded:
+            mechanism_summary.check_can_be_simulated(entry.mechanism, entry.label)
+        for entry in loaded if progress else ():
+            mechanism_summary.report_summary(entry.mechanism, terminal.note)
+    with jax_context(), terminal.show_progress(len(loaded), "mechanisms", progress) as bar:
+        by_index = dict(tune_each(loaded, settings, bar))
+        results = [by_index[index] for index in range(len(loaded))]
+    if settings.pareto:
+        with jax_context(), terminal.show_progress(len(loaded), "fronts", progress) as bar:
+            for index, front in tune_pareto.compute_fronts(
+                results, settings.pareto, settings.pareto_against, bar, None, settings.scheduler
+            ):
+                results[index] = dataclasses.replace(results[index], pareto=tuple(front))
+    return results if is_list else results[0]
+
+
+def tune_each(
+    loaded: Sequence[LoadedMechanism | LoadedAnyMechanism],
+    options: TuneOptions,
+    bar: terminal.Progress,
+    pieces: "Checkpoints | None" = None,
+) -> Iterator[tuple[int, TunedGains]]:
+    """Yield the index and the result of every mechanism, as they are finished.
+
+    The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
+    stored there.
+    """
+    from tuning.caches.checkpoints import NO_CHECKPOINTS
+    from tuning.gains.search_progress import SearchProgress
+    from tuning.gains.tune_all import tune_all
+
+    settings, earlier = options.settings(), options.known()
+    mechanisms = [entry.mechanism for entry in loaded]
+    number = len(loaded)
+    work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
+    checkpoints = pieces or NO_CHECKPOINTS
+    results = tune_all(
+        mechanisms,
+        options.compensator,
+        settings,
+        work,
+        earlier,
+        pieces=checkpoints,
+        scheduler=options.scheduler,
+    )
+    for index, result in results:
+        yield index, TunedGains(result, loaded[index].sha256, options.limit)

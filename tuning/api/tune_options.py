@@ -1,0 +1,211 @@
+"""Options of `tuning.tune` and `jaxhil tune`."""
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+
+from jaxhil.errors import to_one_line
+from jaxhil.mechanism.file import AnyMechanism
+from tuning.api import arguments, tune_pareto
+from tuning.api.arguments import ArgumentError
+from tuning.api.options import (
+    AllowedValues,
+    Limit,
+    Scheduler,
+    SeedRange,
+    Setting,
+    check_options,
+    number_option,
+    text_option,
+)
+
+if TYPE_CHECKING:
+    from tuning.gains.objective import Objective
+    from tuning.gains.settings import TuneSettings
+    from tuning.gains.transfer import EarlierGains
+
+    # The command line accepts names; the function also accepts results and functions.
+    Start = Any
+    ObjectiveOption = str | Callable[[Any], Any]
+else:
+    Start = tuple[str, ...]
+    ObjectiveOption = str
+
+CountRange = AllowedValues(1)
+OptionalWeight = float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneOptions:
+    """Options of `tune`."""
+
+    compensator: Annotated[str, arg(metavar="NAME", help="Compensator to tune.")] = "response_error"
+    setting: Setting = None
+    scenarios: Annotated[
+        int | None,
+        text_option("NUMBER", "Scenarios to tune on; by default 32, or 128 where sensors are noisy."),
+        CountRange,
+    ] = None
+    starts: Annotated[
+        int,
+        number_option("Starts of the solver, and number_option of each further group if they disagree."),
+        CountRange,
+    ] = 4
+    start: Annotated[
+        Start,
+        text_option(
+            "GAINS [GAINS ...]",
+            "Gain files of the same compensator: each mechanism is also tuned from the gains of the most "
+            "similar of their mechanisms.",
+        ),
+    ] = ()
+    steps: Annotated[
+        int, number_option("Largest number_option of solver steps from each start."), CountRange
+    ] = 25
+    validation: Annotated[int, number_option("Fresh scenarios for the evaluation."), CountRange] = 511
+    objective: Annotated[
+        ObjectiveOption,
+        arg(
+            metavar="NAME",
+            help="Statistic of the errors e - e*: rms, cvar (mean of the worst 5 percent) or worst.",
+        ),
+    ] = "rms"
+    divergence_weight: Annotated[
+        float,
+        number_option("OptionalWeight of a squared divergence (e > e*) relative to a squared convergence."),
+    ] = 1.0
+    command_weight: Annotated[
+        OptionalWeight,
+        text_option(
+            "NUMBER",
+            "Penalty, in multiples of the limit, of a command peak one ideal peak too high; by default 0.3 "
+            "for impulse_ledger, 0 for others.",
+        ),
+    ] = None
+    noise_weight: Annotated[
+        OptionalWeight,
+        text_option(
+            "NUMBER",
+            "Penalty, in multiples of the limit, of one more amplification of the sensor noise. Default with "
+            "noisy sensors: the quietest gains within the limit; 0: the least error.",
+        ),
+    ] = None
+    chatter_weight: Annotated[
+        OptionalWeight,
+        text_option(
+            "NUMBER",
+            "Penalty, in multiples of the limit, of one extra swing of the command by the ideal peak force.",
+        ),
+    ] = None
+    transparency_weight: Annotated[
+        OptionalWeight,
+        text_option(
+            "NUMBER",
+            "OptionalWeight of the errors of the same scenarios with a push on the hardware, and with "
+            "more damping; "
+            "by default 1 for impulse_ledger, 0 for others.",
+            aliases=("--honesty-weight",),
+        ),
+    ] = None
+    pareto: Annotated[
+        int, number_option("Number of points of a trade-off against the restitution error, each a gain file.")
+    ] = 0
+    pareto_against: Annotated[
+        str | None,
+        text_option(
+            "NAME",
+            "What --pareto trades the error against: noise, peak (of the command) or honesty; by "
+            "default noise, or peak for impulse_ledger.",
+        ),
+    ] = None
+    global_search: Annotated[
+        bool,
+        arg(
+            name="global-search",
+            aliases=("--certify",),
+            metavar="",
+            help="Also search the full range of all gains, with 50 times the evaluations, for better ones.",
+        ),
+    ] = False
+    seed: Annotated[int, number_option("SeedRange of scenarios and starts."), SeedRange] = 0
+    limit: Limit = 0.01
+    scheduler: Scheduler = None
+
+    def check(self) -> None:
+        """Check all options that can be checked without jax. Raise `InputError`."""
+        check_options(self)
+        arguments.check_supports_mechanism(self.compensator, None)
+        if callable(self.objective) and self.pareto:
+            raise ArgumentError("objective", "a function beside pareto", "one of rms, cvar, worst")
+        tune_pareto.check_pareto_options(self.pareto, self.pareto_against, self.compensator)
+
+    def fits(self, mechanism: AnyMechanism) -> None:
+        """Raise `InputError` if the mechanism has six axes and an option does not support them."""
+        arguments.check_supports_mechanism(self.compensator, mechanism)
+        options = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
+        arguments.check_one_axis_arguments(mechanism, **{name: getattr(self, name) for name in options})
+        if callable(self.objective):
+            arguments.check_one_axis_arguments(mechanism, objective=self.objective)
+
+    def settings(self) -> "TuneSettings":
+        """Return the settings of the tuning. Raise `InputError`. This imports jax."""
+        from tuning.gains.settings import TuneSettings
+
+        arguments.check_setting_name(self.compensator, self.setting)
+        return TuneSettings(
+            self.scenarios,
+            self.starts,
+            self.steps,
+            self.validation,
+            self.seed,
+            self._objective(),
+            global_search=self.global_search,
+            setting=self.setting,
+            quiet=self.wants_quiet,
+            evaluate_transparency=self.pareto_against == "honesty",
+        )
+
+    @property
+    def wants_quiet(self) -> bool:
+        """Return whether the limit is finite and no option of the objective was changed."""
+        weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
+        is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
+        return is_default and 0 < self.limit < math.inf
+
+    def _objective(self) -> "Objective":
+        """Return the objective, with the compensator's default weights where none are given."""
+        from tuning.gains.objective import WEIGHT_FIELDS, Objective
+        from tuning.transparency.probes import choose_default_weights
+
+        # If the limit is 0 or infinite, the default limit is the unit of the weights.
+        limit = float(self.limit) if 0 < self.limit < math.inf else TuneOptions.limit
+        options = {name: getattr(self, name) for name in WEIGHT_FIELDS}
+        user_weights = {name: weight for name, weight in options.items() if weight is not None}
+        if not callable(self.objective):
+            weights = {**choose_default_weights(self.compensator), **user_weights}
+            return Objective(self.objective, **weights, limit=limit)
+        from tuning.gains.metrics_function import MetricsFunction
+
+        # A user's function gets no default weights: it is minimised as it is.
+        return Objective(**user_weights, function=MetricsFunction(self.objective), limit=limit)
+
+    def known(self) -> "list[EarlierGains]":
+        """Return the contents of the gain files to start from. Raise `InputError`. This imports jax."""
+        from tuning.gains.transfer import EarlierGains
+
+        start: Any = self.start
+        alone = isinstance(start, (str, os.PathLike)) or hasattr(start, "document")
+        sources: Any = [start] if alone else start
+        tuned = []
+        for source in sources:
+            loaded = arguments.load_gains(source, "start")
+            label = str(source) if isinstance(source, (str, os.PathLike)) else loaded.mechanism.name
+            if loaded.compensator != self.compensator:
+                allowed = f"gains of {self.compensator}"
+                raise ArgumentError("start", f"gains of {loaded.compensator}", allowed, to_one_line(label))
+            tuned.append(EarlierGains(loaded.mechanism, loaded.gains, label))
+        return tuned

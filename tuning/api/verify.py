@@ -1,0 +1,147 @@
+"""Function `tuning.verify`: checks that the rig's runtime reproduces the simulated controller.
+
+A bundle is checked file by file, then by its own self-test in an isolated interpreter, and then its gain file
+is verified.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from jaxhil.errors import InputError, format_value
+from jaxhil.simulation.jax_environment import jax_context
+from tuning import terminal
+from tuning.api import arguments
+from tuning.api.arguments import ArgumentError
+from tuning.api.options import (
+    AllowedValues,
+    SeedRange,
+    add_options,
+    check_options,
+    number_option,
+    text_option,
+)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Result of `verify`.
+
+    Attributes:
+        document: all results, as `jaxhil verify --json` prints them.
+    """
+
+    document: dict[str, Any]
+
+    @property
+    def good(self) -> bool:
+        """Return whether the runtime agrees with the simulation."""
+        return self.document["verdict"]
+
+    @property
+    def reasons(self) -> list[str]:
+        """Return the reasons for a bad verdict; an empty list for a good one."""
+        return list(self.document["reasons"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyOptions:
+    """Options of `verify`."""
+
+    key: Annotated[
+        str | None,
+        text_option(
+            "KEY", "The bundle must be signed by this public key (Ed25519, PEM); needs jaxhil[sign]."
+        ),
+    ] = None
+    scenarios: Annotated[
+        int, number_option("Runs to replay: the nominal one, then draws."), AllowedValues(1)
+    ] = 6
+    seed: Annotated[int, number_option("SeedRange of the draws."), SeedRange] = 0
+
+
+@arguments.convert_os_errors
+@add_options(VerifyOptions)
+def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification:
+    """Replay recorded signals through the rig's runtime.
+
+    For a bundle, the self-test runs first. No code of a bundle is run unless the bundle is byte for byte what
+    this version exports for its gains.
+
+    Args:
+        path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.
+        progress: report the progress on standard error.
+        **options: OPTIONS
+
+    Returns:
+        The verdict with its reasons, and all results.
+
+    Raises:
+        InputError: If there is nothing to read, or the compensator has no runtime; the message has one line.
+
+    Example:
+        >>> import tuning
+        >>> tuned = tuning.tune("rig-300kg", "phase_lead", scenarios=4, starts=1, validation=4)
+        >>> tuning.verify(tuned, scenarios=2).good
+        True
+    """
+    settings = VerifyOptions(**options)
+    check_options(settings)
+    arguments.check_booleans(progress=progress)
+    key, scenarios, seed = settings.key, settings.scenarios, settings.seed
+    from tuning.bundle.manifest import is_bundle
+
+    is_result = hasattr(path, "document")
+    folder = None if is_result else arguments.check_path("path", path)
+    if folder is not None and _is_folder(folder) and is_bundle(folder):
+        return Verification(_verify_bundle(folder, key, scenarios, seed, progress))
+    file = path if is_result else arguments.find_gain_file(path, "path")
+    if key is not None:
+        raise ArgumentError("key", format_value(str(key)), "only with a bundle: gain files are not signed")
+    label = {} if is_result else {"file": str(file)}
+    return Verification(_verify_gains(file, label, scenarios, seed, progress))
+
+
+def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: bool) -> dict[str, Any]:
+    """Return the document of the verification of a bundle."""
+    from tuning.bundle.checking import check_bundle, run_selftest
+    from tuning.bundle.signing import load_verifier
+
+    signed_by = None if key is None else load_verifier(arguments.check_path("key", key))
+    with jax_context(), terminal.show_stages(2, progress) as stages:
+        stages.begin("making the bundle anew from its gains")
+        checked = check_bundle(folder, signed_by)
+        document = {"bundle": str(folder), "signature": checked.signature, "self_test": []}
+        reasons = checked.reasons
+        if not reasons:
+            stages.begin("running its self-test")
+            document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
+    if reasons:
+        return {**document, "verdict": False, "reasons": reasons}
+    return _verify_gains(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)
+
+
+def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
+    """Return the document of the verification of a gain file, or of gains in memory."""
+    with jax_context():
+        import msgspec
+
+        from tuning.verification.runtime_replay import verify
+
+        try:
+            loaded = arguments.load_gains(gains)
+        except InputError as error:
+            return {**document, "verdict": False, "reasons": [str(error)]}
+        arguments.check_has_runtime(loaded.compensator)
+        with terminal.show_stages(3, progress) as stages:
+            result = verify(loaded, scenarios, seed, stages.begin)
+        return {**document, "mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
+
+
+def _is_folder(path: Path) -> bool:
+    """Return whether a path is a folder; False if it cannot be read."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False

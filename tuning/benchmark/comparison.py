@@ -1,0 +1,335 @@
+"""Comparison of compensators, each with tuned gains, on the same scenarios and probes.
+
+Laws, and groups of mechanisms that share a program, are distributed to as many processes as there are cores,
+each with few devices, since most of the time is compilation, which uses one core per process. Results do not
+depend on the process. The result of a law on a group is cached at once, if there is a cache
+(`tuning.caches.checkpoints`).
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from jaxhil.errors import to_one_line
+from jaxhil.mechanism.file import to_plain_data
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.jax_environment import DEVICE_COUNT_FLAG, MIN_DEVICES, prepare_jax
+from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
+from tuning.caches.cluster import WorkUnit, run_on_workers
+from tuning.caches.worker import get_process_setting
+from tuning.statistics.intervals import Estimate
+
+LITERATURE_GAINS, TUNED_GAINS = "literature", "tuned"
+SEED_OFFSET = 0xFA1  # offset of the evaluation's seed, which differs from those of tuning and its validation
+MESSAGE_INTERVAL = 1.0  # least time between two messages of a process [s]
+
+ComparisonProgress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """Settings of a comparison."""
+
+    scenarios: int = 32  # number of training scenarios
+    starts: int = 3  # starts of the solver
+    steps: int = 16  # largest number of solver steps per start
+    polish: int = 20  # evaluations without derivatives per gain
+    scanned: int = 64  # points of a scan for starts
+    judged: int = 256  # number of scenarios for the evaluation
+    limit: float = 0.01  # error beyond which a contact counts as a failure [1]
+    seed: int = 0  # seed of scenarios, starts and resampling
+    tuned: bool = True  # whether to tune
+
+
+class LawMetrics(NamedTuple):
+    """Metrics of one law on one mechanism.
+
+    There are no tuned gains of a law that has no gains to tune, or that has settings for any mechanism.
+    """
+
+    law: str
+    mechanism: str
+    gains: dict[str, dict[str, float]]  # by "literature", names of settings and "tuned"
+    figures: dict[str, dict[str, Estimate]]  # metrics under each of `gains` (`tuning.transparency.metrics`)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Return the names of the evaluated settings."""
+        return tuple(which for which in self.figures if which not in (LITERATURE_GAINS, TUNED_GAINS))
+
+
+class LawFailure(NamedTuple):
+    """Failure of the evaluation of a law on a group of mechanisms, with its reason."""
+
+    law: str
+    reason: str
+
+
+GroupResult = tuple[list[Any], str, list[LawMetrics] | LawFailure]  # scenes of a group, law, result
+
+
+def compare_laws(
+    mechanisms: Sequence[Mechanism],
+    laws: Sequence[str],
+    settings: CompareSettings,
+    processes: int,
+    tell: Callable[[str, float, float], None] = lambda text, done, kept: None,
+    pieces: Checkpoints = NO_CHECKPOINTS,
+    scheduler: str | None = None,
+) -> Iterator[LawMetrics | LawFailure]:
+    """Yield the metrics of each law on every mechanism, in the order in which they are complete.
+
+    They are computed in `processes` processes; with 0 processes, in this one, where an error ends the
+    comparison; or with a `scheduler`, by the workers of a cluster. `tell` is called with a description of the
+    current work, the number of results, with shares of unfinished ones, and the number of cached results.
+    """
+    cached = _read_cached_results(mechanisms, laws, settings, pieces) if pieces.is_resuming else []
+    yield from cached
+    complete = {(result.mechanism, result.law) for result in cached}
+    # Results of a group and a law are cached for all its mechanisms or for none.
+    left = [m for m in mechanisms if any((m.name, law) not in complete for law in laws)]
+    if not left:
+        return
+
+    def report(text: str, done: float) -> None:
+        tell(text, len(cached) + done, len(cached))
+
+    report(f"{len(cached)} results as kept, contacts in space" if cached else "contacts in space", 0)
+
+    def missing(scenes: list[list[Any]]) -> list[tuple[list[Any], str]]:
+        """Return the missing tasks, those with the longest compilation first, to balance the processes."""
+        order = sorted(laws, key=_count_gains, reverse=True) if processes or scheduler else laws
+        return [(g, law) for g in scenes for law in order if (g[0].mechanism.name, law) not in complete]
+
+    if scheduler is not None:
+        computed = _evaluate_on_cluster(
+            scheduler, missing(build_scenario_sets(left, settings)), settings, report
+        )
+    elif processes == 0:
+        computed = _evaluate_in_order(missing(build_scenario_sets(left, settings)), settings, report)
+    else:
+        computed = _evaluate_in_processes(processes, left, settings, missing, report)
+    for group, law, result in computed:
+        if isinstance(result, LawFailure):
+            yield result
+            continue
+        pieces.write(*_describe_checkpoint([scene.mechanism for scene in group], law, settings), result)
+        yield from result
+
+
+def _read_cached_results(
+    mechanisms: Sequence[Mechanism], laws: Sequence[str], settings: CompareSettings, pieces: Checkpoints
+) -> list[LawMetrics]:
+    """Return the cached results of an earlier comparison."""
+    from tuning.gains.common_program import group_by_common_program
+
+    groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]
+    read = (
+        pieces.read(*_describe_checkpoint(group, law, settings), list[LawMetrics])
+        for group in groups
+        for law in laws
+    )
+    return [result for results in read for result in results or ()]
+
+
+def _describe_checkpoint(group: list[Mechanism], law: str, settings: CompareSettings) -> tuple[str, Any]:
+    """Return name and inputs of the cached result of a law on mechanisms that share a program."""
+    return f"compare {law} {group[0].name}", ("compare", law, [to_plain_data(m) for m in group], settings)
+
+
+def _evaluate_in_order(
+    tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: ComparisonProgress
+) -> Iterator[GroupResult]:
+    done = 0
+    for group, law in tasks:
+
+        def report(text: str, share: float, group=group, done=done) -> None:
+            tell(text, done + share * len(group))
+
+        yield group, law, evaluate_law(group, law, settings, report)
+        done += len(group)
+
+
+def _evaluate_on_cluster(
+    scheduler: str, tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: ComparisonProgress
+) -> Iterator[GroupResult]:
+    pieces = [WorkUnit(i, (group, law, settings)) for i, (group, law) in enumerate(tasks)]
+    inputs = [
+        _describe_checkpoint([scene.mechanism for scene in group], law, settings) for group, law in tasks
+    ]
+    done, what = 0, f"compare-{compute_digest(inputs)[:16]}"
+    tell(f"{len(tasks)} pieces on the cluster", done)
+    for i, result in run_on_workers(scheduler, evaluate_law_or_failure, pieces, get_process_setting(), what):
+        group, law = tasks[i]
+        done += len(group)
+        tell(law, done)
+        yield group, law, result
+
+
+def evaluate_law_or_failure(
+    group: list[Any], law: str, settings: CompareSettings
+) -> list[LawMetrics] | LawFailure:
+    """Call `evaluate_law`; return the failure with its reason if it raises."""
+    try:
+        return evaluate_law(group, law, settings)
+    except Exception as error:
+        return _describe_failure(law, error)
+
+
+def _describe_failure(law: str, error: BaseException) -> LawFailure:
+    return LawFailure(law, to_one_line(f"{type(error).__name__}: {error}", 200))
+
+
+def _evaluate_in_processes(
+    processes: int,
+    mechanisms: list[Mechanism],
+    settings: CompareSettings,
+    missing: Callable[[list[list[Any]]], list[tuple[list[Any], str]]],
+    tell: ComparisonProgress,
+) -> Iterator[GroupResult]:
+    # JAX does not work after a fork, so that each process needs a new interpreter.
+    context = multiprocessing.get_context("spawn")
+    messages = context.SimpleQueue()
+    with ProcessPoolExecutor(processes, context, _initialise_worker, (messages,)) as pool:
+        try:
+            tasks = missing(pool.submit(build_scenario_sets, mechanisms, settings).result())
+            running = {
+                pool.submit(_evaluate_in_worker, i, *task, settings): i for i, task in enumerate(tasks)
+            }
+            shares = [0.0 for _ in tasks]
+            while running:
+                ended, _ = wait(running, MESSAGE_INTERVAL, return_when=FIRST_COMPLETED)
+                while not messages.empty():
+                    i, text, shares[i] = messages.get()
+                    tell(text, sum(share * len(tasks[k][0]) for k, share in enumerate(shares)))
+                for future in ended:
+                    i = running.pop(future)
+                    error = future.exception()
+                    shares[i] = 1.0
+                    yield *tasks[i], _describe_failure(tasks[i][1], error) if error else future.result()
+        except BaseException:
+            # The results of the running processes are no longer needed.
+            for child in multiprocessing.active_children():
+                child.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _count_gains(law: str) -> int:
+    """Return the number of a law's gains, with which the time of its compilation increases."""
+    from jaxhil.rig import COMPENSATORS
+
+    return len(COMPENSATORS[law].gains)
+
+
+def build_scenario_sets(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
+    """Build the scenes of all mechanisms (`tuning.benchmark.runs.Scene`), grouped by program."""
+    from tuning.benchmark.runs import build_scenario_set
+    from tuning.gains.common_program import group_by_common_program
+
+    seed = settings.seed + SEED_OFFSET
+    return [
+        [build_scenario_set(mechanisms[i], common, settings.judged, seed) for i in group]
+        for group, common in group_by_common_program(mechanisms)
+    ]
+
+
+def evaluate_law(
+    scenes: list[Any],
+    law: str,
+    settings: CompareSettings,
+    tell: ComparisonProgress = lambda text, share: None,
+) -> list[LawMetrics]:
+    """Tune one law for mechanisms of one program, and compute its metrics on each.
+
+    `tell` is called with a description of the current work and the share that is done.
+    """
+    from jaxhil.laws.compensators import COMPENSATORS, literature_gains
+    from tuning.benchmark.runs import count_evaluated_lanes, evaluate_gains
+    from tuning.gains.search_progress import SearchProgress
+    from tuning.gains.settings import TuneSettings
+    from tuning.gains.tune_all import tune_all
+
+    mechanisms = [scene.mechanism for scene in scenes]
+    further = [
+        name
+        for name in COMPENSATORS[law].settings
+        if any(literature_gains(m, law, name) != literature_gains(m, law) for m in mechanisms)
+    ]
+    gains = [
+        {which or LITERATURE_GAINS: literature_gains(mechanism, law, which) for which in (None, *further)}
+        for mechanism in mechanisms
+    ]
+    # A law with settings for any mechanism is used without tuning.
+    tuned = settings.tuned and not COMPENSATORS[law].settings
+    tuned = tuned and any(
+        gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
+    )
+    work = SearchProgress(lambda text, share, _: tell(f"{law}, {text}", share))
+    lanes = {scene.mechanism.name: count_evaluated_lanes(scene) for scene in scenes}
+    work.runs_after_group = (1 + len(further) + tuned) * sum(lanes.values())
+    if tuned:
+        tuning = TuneSettings(
+            settings.scenarios,
+            settings.starts,
+            settings.steps,
+            validation=31,
+            seed=settings.seed,
+            polish=settings.polish,
+            scanned=settings.scanned,
+        )
+        for index, result in tune_all(mechanisms, law, tuning, work, common=scenes[0].common):
+            gains[index][TUNED_GAINS] = result.gains
+    results = []
+    for scene, by_name in zip(scenes, gains, strict=True):
+        metrics = {}
+        for which, values in by_name.items():
+            work.say(f"{scene.mechanism.name}: judging {which} gains")
+            metrics[which] = evaluate_gains(scene, law, values, settings.limit, settings.seed)
+            work.report_runs(lanes[scene.mechanism.name])
+        results.append(LawMetrics(law, scene.mechanism.name, by_name, metrics))
+    return results
+
+
+def _evaluate_in_worker(
+    number: int, scenes: list[Any], law: str, settings: CompareSettings
+) -> list[LawMetrics]:
+    """Call `evaluate_law` in a worker process, which reports its progress to the parent."""
+    last = 0.0
+
+    def tell(text: str, share: float) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= MESSAGE_INTERVAL:
+            last = now
+            _messages.put((number, text, share))
+
+    return evaluate_law(scenes, law, settings, tell)
+
+
+_messages: Any = None  # queue to the parent, in a worker
+
+
+def _initialise_worker(messages: Any) -> None:
+    """Initialise a worker process with few devices, since there are as many workers as cores."""
+    global _messages
+    _messages = messages
+    # On an interrupt the parent ends the workers; if the parent is killed, they end themselves.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} {DEVICE_COUNT_FLAG}={MIN_DEVICES}".strip()
+    prepare_jax()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended for any reason."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

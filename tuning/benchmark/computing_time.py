@@ -1,0 +1,31 @@
+"""Computing time of a compensator per tick of the rig's runtime in plain Python."""
+
+import math
+import statistics
+import time
+from collections.abc import Mapping
+
+from jaxhil.rig import COMPENSATORS
+
+TIMED_TICKS = 2000
+APPROACH_DURATION, CONTACT_DURATION = 0.02, 0.2  # durations [s]
+
+
+def measure_tick_time(
+    law: str, gains: Mapping[str, float], period: float, clearance: float, velocity: float
+) -> float:
+    """Measure the median time [us] of one tick in contacts of a 2.5 Hz spring entered at `velocity` [m/s]."""
+    compensator = COMPENSATORS[law](gains, period, clearance)
+    spent = []
+    rate = math.pi / CONTACT_DURATION
+    for tick in range(TIMED_TICKS):
+        now = (tick * period) % (APPROACH_DURATION + CONTACT_DURATION) - APPROACH_DURATION
+        touching = now > 0
+        position = velocity / rate * math.sin(rate * now) if touching else velocity * now
+        speed = velocity * math.cos(rate * now) if touching else velocity
+        force = 1e5 * position if touching else 0.0
+        start = time.perf_counter()
+        command = compensator.step(force, position, speed, position)
+        compensator.position_command(position, speed, -command)
+        spent.append(time.perf_counter() - start)
+    return 1e6 * statistics.median(spent)

@@ -1,0 +1,317 @@
+"""Solution of many tasks from many starts, in rounds of solver steps.
+
+A start of a task is a problem. One compiled program solves a fixed number of problems per call. Every round
+distributes the problems that have not converged to calls again, so that hard ones do not delay easy ones.
+After the first, short round only the most promising starts of a task continue.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.simulation.jax_environment import program_folder
+from tuning.caches import program_cache
+from tuning.gains.objective import (
+    RESIDUAL_SCALE,
+    RMS_OBJECTIVE,
+    Objective,
+    SolverProblem,
+    compute_residuals,
+    join_terms,
+    list_objectives,
+)
+from tuning.gains.search_progress import SearchProgress
+from tuning.gains.tasks import TuneTask, build_gain_bounds, convert_to_gains, join_loops, list_tuned_gains
+from tuning.optimisation.solution import SOLVER_STATUSES, SolverResult
+from tuning.optimisation.unit_box import GainBounds
+from tuning.transparency.probes import LANES_PER_SCENARIO
+
+MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # problems in one call of the program
+LANES_PER_TILE = 64  # lanes computed together on a device; more exceed the processor's cache
+STEPS_BEFORE_SELECTION = 8  # steps of the first round
+MAX_CONTINUED_STARTS = 3  # starts of a task that continue after the first round
+MAX_STEPS_PER_CALL = 32  # largest number of steps of one call
+MIN_RELATIVE_IMPROVEMENT = (
+    0.005  # relative improvement in a round below which a start with probes counts as converged
+)
+STEP_LIMIT = SOLVER_STATUSES.index("step limit")
+GIVEN_UP = "given up"
+
+
+class StartResult(NamedTuple):
+    """Result of one start of the solver."""
+
+    status: str  # why the solver stopped
+    steps: int  # steps of the solver
+    rms: float  # final value of the objective (its norm, see `tuning.gains.objective`)
+    history: list[float]  # value of the objective after every step
+    gains: dict[str, float]  # all gains of the compensator
+    coordinates: np.ndarray = np.empty(0)  # unit coordinates of the gains that are tuned for any of the tasks
+    curvature: np.ndarray = np.empty((0, 0))  # J^T J, J the Jacobian of the residuals by the coordinates
+
+
+class _SolverState(NamedTuple):
+    """State of a start after a round."""
+
+    coordinates: np.ndarray  # unit coordinates
+    curvature: np.ndarray  # J^T J at the coordinates
+    loss: float  # loss at the coordinates
+    history: np.ndarray  # loss after every step
+    status: int  # index into `SOLVER_STATUSES`
+
+
+@dataclasses.dataclass
+class _StartState:
+    """State of one start during the solution."""
+
+    task: int  # index of its task
+    coordinates: np.ndarray  # current unit coordinates
+    curvature: np.ndarray  # J^T J at the coordinates
+    status: int | str = STEP_LIMIT  # index into `SOLVER_STATUSES`, or `GIVEN_UP`
+    history: list[float] = dataclasses.field(default_factory=list)  # loss after every step
+
+    @property
+    def loss(self) -> float:
+        return self.history[-1] if self.history and np.isfinite(self.history[-1]) else np.inf
+
+
+def solve_tasks(
+    tasks: list[TuneTask],
+    starts: list[Float[np.ndarray, "starts gains"]],
+    steps: int,
+    objective: Objective | Sequence[Objective] = RMS_OBJECTIVE,
+    work: SearchProgress | None = None,
+) -> list[list[StartResult]]:
+    """Solve like tasks (`tuning.gains.tasks.alike`) from every start; return the results task by task.
+
+    `starts` holds, per task, unit coordinates of the gains that are tuned for any of the tasks. No start ends
+    worse than it began. `objective` is one of all tasks or one per task; these differ by their weights only.
+    Every round is a step of the `work`.
+    """
+    work = work or SearchProgress()
+    names = list_tuned_gains(tasks)
+    bounds = [build_gain_bounds(task, names) for task in tasks]
+    nothing = np.zeros((len(names), len(names)))
+    problems = [
+        _StartState(index, coordinates, nothing)
+        for index, points in enumerate(starts)
+        for coordinates in points
+    ]
+    objectives = list_objectives(objective, len(tasks))
+    # The call's size is that of the first round, so that later rounds with fewer problems use its program.
+    advance = _build_stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)), work)
+    # Sorted by expected duration, problems of one call take about equally long.
+    order = np.argsort(
+        [-float(np.max(task.model.expected_duration(task.scenarios))) for task in tasks], kind="stable"
+    )
+    rank = {int(task): index for index, task in enumerate(order)}
+    problems.sort(key=lambda problem: rank[problem.task])
+    done, probed = 0, tasks[0].probed
+    while done < steps:
+        going = [problem for problem in problems if problem.status == STEP_LIMIT]
+        if not going:
+            break
+        several = probed or (done == 0 and max(map(len, starts)) > MAX_CONTINUED_STARTS)
+        limit = min(steps - done, STEPS_BEFORE_SELECTION if several else MAX_STEPS_PER_CALL)
+        work.say(f"{len(going)} of {len(problems)} starts, {limit} steps")
+        before = [problem.loss for problem in going]
+        advanced = work.step(
+            "round", list[_SolverState], lambda going=going, limit=limit: advance(going, limit)
+        )
+        for problem, state in zip(going, advanced, strict=True):
+            _update_start(problem, state)
+        done += limit
+        if probed and done > STEPS_BEFORE_SELECTION:
+            _mark_converged(going, before)
+        if done < steps and not probed:
+            _stop_poor_starts(problems)
+    return [
+        [_build_result(p, names, bounds[index], tasks[index]) for p in problems if p.task == index]
+        for index in range(len(tasks))
+    ]
+
+
+def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
+    """Mark problems as converged whose value fell by less than `MIN_RELATIVE_IMPROVEMENT` in the round."""
+    for problem, loss in zip(problems, before, strict=True):
+        if problem.status == STEP_LIMIT and problem.loss > (1 - MIN_RELATIVE_IMPROVEMENT) ** 2 * loss:
+            problem.status = SOLVER_STATUSES.index("converged")
+
+
+def _stop_poor_starts(problems: list[_StartState]) -> None:
+    """Give up all but the `MAX_CONTINUED_STARTS` best starts of each task."""
+    by_task: dict[int, list[_StartState]] = {}
+    for problem in problems:
+        by_task.setdefault(problem.task, []).append(problem)
+    for of_task in by_task.values():
+        for problem in sorted(of_task, key=lambda problem: problem.loss)[MAX_CONTINUED_STARTS:]:
+            if problem.status == STEP_LIMIT:
+                problem.status = GIVEN_UP
+
+
+def compute_inverse_hessian(
+    curvature: Float[np.ndarray, "gains gains"], value: float
+) -> Float[np.ndarray, "gains gains"]:
+    """Return the inverse Hessian of the relative objective, from J^T J of the loss.
+
+    It is the shape of the region in which the objective rises little, limited to a standard deviation of a
+    quarter of the box.
+    """
+    # Where derivatives overflow, the shape is unknown.
+    curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
+    loss = (value / RESIDUAL_SCALE) ** 2 / 2
+    return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
+
+
+def _build_result(
+    problem: _StartState, names: tuple[str, ...], bounds: GainBounds, task: TuneTask
+) -> StartResult:
+    history = [float(value) for value in RESIDUAL_SCALE * np.sqrt(2 * np.array(problem.history))]
+    status = problem.status if isinstance(problem.status, str) else SOLVER_STATUSES[problem.status]
+    gains = {k: float(gain) for k, gain in convert_to_gains(task, names, bounds, problem.coordinates).items()}
+    return StartResult(
+        status, len(history), history[-1], history, gains, problem.coordinates, problem.curvature
+    )
+
+
+def compile_solver(
+    tasks: list[TuneTask], starts: int, objective: Objective | Sequence[Objective] = RMS_OBJECTIVE
+) -> None:
+    """Compile the program of `solve_tasks` into the compile cache."""
+    names = list_tuned_gains(tasks)
+    bounds = [build_gain_bounds(task, names) for task in tasks]
+    nothing = np.zeros(len(names))
+    problems = [_StartState(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
+    static, call = _build_call(tasks, names, bounds, list_objectives(objective, len(tasks)), len(problems))
+    first = problems[: _choose_call_size(len(problems))]
+    program_cache.prepare_program(_solve_call, static, call(first, 1), _choose_program_folder(tasks))
+
+
+def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgress):
+    """Return a function that advances problems by up to `limit` steps and returns their states."""
+    static, call = _build_call(tasks, names, bounds, objectives, number)
+    size, runs, folder = (
+        _choose_call_size(number),
+        count_step_runs(tasks, names),
+        _choose_program_folder(tasks),
+    )
+
+    def advance(problems: list[_StartState], limit: int) -> list[_SolverState]:
+        advanced = []
+        for begin in range(0, len(problems), size):
+            members = problems[begin : begin + size]
+            solution = jax.device_get(
+                program_cache.run_program(_solve_call, static, call(members, limit), folder)
+            )
+            positions = np.argsort(assign_to_devices(size))[: len(members)]
+            advanced += [_extract_state(solution, int(position)) for position in positions]
+            work.report_runs(runs * sum(len(state.history) for state in advanced[begin:]))
+        return advanced
+
+    return advance
+
+
+def _choose_program_folder(tasks: list[TuneTask]) -> Any:
+    """Return the folder of cached programs, None with user-registered contact laws."""
+    return None if any(_has_user_law(task.scenarios) for task in tasks) else program_folder()
+
+
+def _has_user_law(scenarios: Any) -> bool:
+    """Return whether six-axis scenarios, which carry their contact laws, have a user-registered one."""
+    groups = getattr(scenarios, "groups", ())
+    return any(not type(group.law).__module__.startswith("jaxhil.") for group in groups)
+
+
+def count_step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
+    """Return the number of simulated runs of one step of one start."""
+    return (1 + len(names)) * tasks[0].lanes
+
+
+def _choose_call_size(number: int) -> int:
+    """Return the number of problems in one call, for `number` problems in total."""
+    return MIN_PROBLEMS_PER_CALL if number <= MIN_PROBLEMS_PER_CALL else MAX_PROBLEMS_PER_CALL
+
+
+def assign_to_devices(size: int) -> np.ndarray:
+    """Return the index of the problem at each position of a call.
+
+    Problems, sorted by duration, are dealt to the devices in turn; positions of a device are adjacent.
+    """
+    devices = math.gcd(jax.device_count(), size)
+    return np.arange(size).reshape(-1, devices).T.ravel()
+
+
+def _build_call(tasks, names, bounds, objectives, number):
+    """Return the program's static part, and a function of problems and steps that returns its arguments."""
+    loop = join_loops([task.loop for task in tasks])
+    fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
+    weights = [objective.weights for objective in objectives]
+    rows = [(_sort_by_duration(t), f, w, b) for t, f, w, b in zip(tasks, fixed, weights, bounds, strict=True)]
+    table = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *rows)
+    size = _choose_call_size(number)
+    lanes = tasks[0].lanes
+    terms = join_terms(objectives, tasks[0].probed, tasks[0].contacts)
+    static = (tasks[0].model, loop, names, terms), MAX_STEPS_PER_CALL, max(1, LANES_PER_TILE // lanes)
+
+    def call(members: list[_StartState], limit: int):
+        order = assign_to_devices(size)
+        # Positions that only fill the call hold copies of the first problem, and simulate nothing.
+        filled = [members[i] if i < len(members) else members[0] for i in order]
+        idle = order[:, None] >= len(members)
+        index = np.array([p.task for p in filled])
+        starts = np.stack([p.coordinates for p in filled])
+        scenarios, *columns = jax.tree.map(itemgetter(index), table)
+        return tasks[0].model.at_rest(scenarios, idle), *columns, starts, np.array(limit)
+
+    return static, call
+
+
+def _sort_by_duration(task: TuneTask) -> Any:
+    """Return the task's scenarios, sorted by duration if they have probes, which run in chunks."""
+    if not task.probed:
+        return task.scenarios
+    # The time limit is proportional to the duration of the contacts.
+    longest = np.asarray(task.scenarios.time_limit)[::LANES_PER_SCENARIO]
+    order = np.argsort(-longest, kind="stable")
+    lanes = (LANES_PER_SCENARIO * order[:, None] + np.arange(LANES_PER_SCENARIO)).ravel()
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., lanes], task.scenarios)
+
+
+def _extract_state(solution: SolverResult, i: int) -> _SolverState:
+    return _SolverState(
+        np.asarray(solution.coordinates[i]),
+        np.asarray(solution.curvature[i]),
+        float(solution.loss[i]),
+        np.asarray(solution.history[i])[: max(int(solution.steps[i]), 1)],
+        int(solution.status[i]),
+    )
+
+
+def _update_start(problem: _StartState, state: _SolverState) -> None:
+    before = problem.history[-1] if problem.history else np.inf
+    problem.history.extend(np.minimum.accumulate(np.append(before, state.history))[1:].tolist())
+    problem.status = state.status
+    # Every round starts with cautious steps, none of which ends worse than it began.
+    if np.isfinite(state.loss):
+        problem.coordinates, problem.curvature = np.clip(state.coordinates, 0, 1), state.curvature
+
+
+def _solve_call(static: tuple[Any, int, int], arguments: Any) -> SolverResult:
+    # The import is slow, and a cached program does not need it.
+    from tuning.optimisation.levenberg_marquardt import solve_least_squares
+
+    problem, longest, tile = static
+    model, loop, *_ = problem
+    scenarios, fixed, weights, bounds, starts, limit = arguments
+
+    rigs = jax.vmap(lambda scenarios: model.prepared(loop, scenarios))(scenarios)
+    problems = SolverProblem(rigs, fixed, weights)
+    return solve_least_squares(
+        compute_residuals, problem, problems, bounds, starts, limit, longest=longest, tile=tile
+    )

@@ -1,0 +1,123 @@
+"""Mechanism of an identification: the identified values replace those of the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxhil.mechanism.file import to_plain_data
+from jaxhil.mechanism.structs import Mechanism
+from tuning.identification import parameters
+from tuning.identification.contact_fit import ContactFit
+from tuning.identification.mechanism_file import make_uncertainty_tables, set_value
+from tuning.identification.options import IdentificationOptions
+from tuning.identification.parameters import SIMULATOR_PREFIX
+from tuning.identification.rational import MotionModel
+from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
+from tuning.identification.result import Estimate
+from tuning.identification.uncertainty_effect import IDENTIFIED_SOURCE_PREFIX
+
+
+def make_mechanism(
+    campaign: Campaign,
+    prior: Mechanism | None,
+    model: MotionModel | None,
+    contact: ContactFit | None,
+    estimates: Sequence[Estimate],
+    found: Mapping[str, np.ndarray],
+    options: IdentificationOptions,
+) -> dict[str, Any]:
+    """Return the content of a mechanism file in which identified values replace those of the prior."""
+    timing = campaign.timing
+    document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": DEFAULT_MECHANISM_NAME}
+    document |= {} if prior is None else to_plain_data(prior)
+    speeds = [run.speed for run in campaign.runs if run.speed]
+    values = {estimate.key: estimate.value for estimate in estimates}
+    document["source"] = _describe_source(campaign)
+    document["bodies"] = {"equivalent_mass": campaign.equivalent_mass}
+    document.setdefault("approach", {"velocity": float(np.median(speeds)) if speeds else 0.005})
+    if contact is not None:
+        document["contact"] = parameters.make_contact_section(contact.law, values)
+        if prior is None:
+            document["approach"]["contacts"] = len(document["contact"]["stiffness"])
+    else:
+        for key, value in values.items():
+            if key.startswith("contact."):
+                set_value(document, key, value)
+    rig = dict(document.get("rig", {}))
+    rig |= {
+        "control_period": timing.control_period,
+        "command_latency": timing.command_latency,
+        "command_hold": timing.command_hold,
+    }
+    rig |= {} if campaign.integrator is None else {"integrator": campaign.integrator}
+    simulator = {
+        key[len(SIMULATOR_PREFIX) :]: value
+        for key, value in values.items()
+        if key.startswith(SIMULATOR_PREFIX)
+    }
+    if simulator and model is not None:
+        before = rig.get("simulator", {})
+        simulator = {
+            **{k: v for k, v in before.items() if k.endswith("_limit")},
+            **parameters.make_simulator_section(model),
+            "delay": before.get("delay", 0.0),
+            **simulator,
+        }
+        rig["simulator"] = {**simulator, "delay": max(simulator["delay"], 0.0)}
+    for section in ("force_sensor", "position_sensor"):
+        sensor = {**rig.get(section, {})}
+        if section == "force_sensor" and contact is not None:
+            # The estimated delay includes a lag that the contacts do not resolve.
+            sensor = {k: v for k, v in sensor.items() if k not in ("time_constant", "dead_zone")}
+        prefix = f"rig.{section}."
+        sensor |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
+        rig[section] = {**sensor, "delay": max(sensor.get("delay", 0.0), 0.0)}
+    if "rig.contact_plane" in values:
+        rig["contact_plane"] = values["rig.contact_plane"]
+    document["rig"] = rig
+    if found:
+        document.pop("correlation", None)
+    document |= _merge_uncertainty(document, found, options)
+    return document
+
+
+def compute_bound_excess(key: str, draws: np.ndarray) -> float:
+    """Return the file's value minus the mean of the draws, if the lower bound 0 raises it; else 0."""
+    bounded = key.endswith(".delay") or key.startswith("contact.damping")
+    return max(-float(draws.mean()), 0.0) if bounded else 0.0
+
+
+def _merge_uncertainty(
+    document, draws_by_key: Mapping[str, np.ndarray], options: IdentificationOptions
+) -> dict[str, Any]:
+    """Return the identified parameters' uncertainty and correlation, and the prior's for all others."""
+    # A damping that is 0 in every draw has no uncertainty.
+    keys = [key for key, draws in draws_by_key.items() if np.ptp(draws) > 0.0]
+    if not keys:
+        return {}
+    floors = np.array([
+        options.clock if key.endswith(".delay")
+        else options.calibration * abs(float(draws_by_key[key].mean())) if key.startswith("contact.stiffness")
+        else 0.0
+        for key in keys
+    ])  # fmt: skip
+    off = np.array([compute_bound_excess(key, draws_by_key[key]) for key in keys])
+    tables = make_uncertainty_tables(keys, np.array([draws_by_key[key] for key in keys]).T, floors, off)
+    # An identified simulator or contact replaces all of the prior's entries of its section.
+    sections = {f"{name.rsplit('.', 1)[0]}." for name in tables["uncertainty"]} & {
+        SIMULATOR_PREFIX,
+        "contact.",
+    }
+    replaced = (*sections, *tables["uncertainty"])
+    prior = {
+        key: value for key, value in document.get("uncertainty", {}).items() if not key.startswith(replaced)
+    }
+    return {**tables, "uncertainty": {**prior, **tables["uncertainty"]}}
+
+
+def _describe_source(campaign: Campaign) -> str:
+    files = ", ".join(f"{name} (SHA-256 {digest[:12]})" for name, digest in campaign.sources.items())
+    return f"{IDENTIFIED_SOURCE_PREFIX} {files or 'a campaign in memory'}"[:9_000]

@@ -1,0 +1,429 @@
+"""Identification of a campaign in four stages: rest, free motion, contact, validation.
+
+Each stage uses the results of the previous ones; without runs for a stage, the prior's values are used. The
+logs cannot determine the hold, the latency, the row convention, the mass, or the split of the motion's delay
+between the motion and the position sensor. These are taken as specified.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import from_plain_data
+from jaxhil.mechanism.structs import Mechanism
+from tuning.identification import conditioning, free_motion, mechanism_models, parameters, validation
+from tuning.identification import contact_fit as contacts
+from tuning.identification.bootstrap import bootstrap
+from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_profile import POSTERIOR_DRAWS
+from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
+from tuning.identification.free_motion import FreeMotion
+from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
+from tuning.identification.mechanism_check import check_against_mechanism as check_file
+from tuning.identification.mechanism_check import check_file_uncertainty
+from tuning.identification.mechanism_file import to_toml
+from tuning.identification.noise import SensorNoise, estimate_noise
+from tuning.identification.notes import collect_notes, note_absent_dead_zone
+from tuning.identification.options import KEYS_FIXED_BEFORE_FIT, IdentificationOptions, check_options
+from tuning.identification.parameters import SIMULATOR_PREFIX
+from tuning.identification.rational import MotionModel
+from tuning.identification.records import Campaign, LoggedRun
+from tuning.identification.result import Identification, find_confounded_pairs
+from tuning.identification.structure_choice import MAX_RELATIVE_STD
+from tuning.identification.uncertainty_effect import compute_uncertainty_effect
+
+MIN_REST_ROWS = 200  # rows at rest that an estimate of the noise needs
+ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
+CONTACT_KINDS = ("contact", "press", "tap")
+STAGE_COUNT = 3  # free motion, contact, validation; a bootstrap adds one for each chunk of its fits
+ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
+FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
+STIFFNESS_PREFIX, POSITION_DELAY_KEY = "contact.stiffness.", "rig.position_sensor.delay"
+MIN_DELAY_SIGMAS = 2.0  # standard deviations between 0 and a force delay that would else be negative
+
+
+def _ignore_progress(text: str) -> None:
+    pass
+
+
+def identify(
+    campaign: Campaign,
+    prior: Mechanism | None = None,
+    options: IdentificationOptions | None = None,
+    say: ReportProgress = _ignore_progress,
+) -> Identification:
+    """Identify the rig and the mechanism from the runs of a campaign.
+
+    Args:
+        campaign: Runs and their timing.
+        prior: Mechanism with the values that the logs do not determine, or None.
+        options: Options of the caller.
+        say: Function that receives the name of each stage (at most `STAGE_COUNT`) and bootstrap chunk.
+
+    Returns:
+        Estimates, draws, checks and the mechanism, or a bad verdict if a required value is unknown.
+
+    Raises:
+        InputError: If the options are invalid.
+    """
+    options = options or IdentificationOptions()
+    check_options(options, prior)
+    runs = {
+        kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *CONTACT_KINDS)
+    }
+    force, position = _estimate_sensor_noise(runs)
+    say("fitting the motion simulator")
+    motion = free_motion.fit_free_motion(runs["free"], campaign.timing, options.order)
+    model = _make_prior_model(prior) if motion is None else motion.model
+    dead_zone = options.fixed.get(DEAD_ZONE_KEY, 0.0 if prior is None else prior.rig.force_sensor.dead_zone)
+    touching = [] if model is None else _select_runs_in_contact(campaign, model)
+    contact, left_out = _fit_and_check_contact(touching, model, campaign, force, dead_zone, options, say)
+    frequency = _estimate_frequency(contact, campaign.equivalent_mass)
+    apart = None if contact is None else contact.drift
+    share = _choose_position_delay(motion, None if apart else contact, prior, options)
+    draws = _draw_parameters(motion, contact, model, frequency, share, options.seed)
+    first = KEYS_FIXED_BEFORE_FIT if apart is None else (*KEYS_FIXED_BEFORE_FIT, FORCE_DELAY_KEY)
+    draws, later, denied = _condition_draws(draws, first, frequency, prior, options)
+    fixed = {**_select_fixed_before_fit(first, share, prior, options), **later}
+    draws, vague = _drop_undetermined_entries(draws)
+    used = contact if any(key.startswith(STIFFNESS_PREFIX) for key in (*draws, *fixed)) else None
+    numbers = make_estimates(draws, motion, used, force, position, fixed)
+    missing = _list_missing_parameters(prior, model, used, apart is not None and FORCE_DELAY_KEY not in fixed)
+    mechanism = None if missing else make_mechanism(campaign, prior, model, used, numbers, draws, options)
+    mechanism, lines = _check_result(mechanism, campaign, motion, contact, model, touching, options)
+    table = np.array(list(draws.values())).T if draws else np.zeros((POSTERIOR_DRAWS, 0))
+    return Identification(
+        estimates=numbers,
+        draws=table,
+        combinations=estimate_combinations(
+            draws | {k: np.full(POSTERIOR_DRAWS, v) for k, v in later.items()}, used
+        ),
+        confounded=find_confounded_pairs(list(draws), table),
+        lines=(*lines, *left_out),
+        mechanism=mechanism,
+        limit=options.limit,
+        notes=(
+            *collect_notes(motion, contact, used, force, vague),
+            *note_absent_dead_zone(contact, dead_zone),
+            *(*_note_shifted_delay(fixed, options), *_note_clipped_values(draws), *denied),
+        ),
+        missing=missing,
+        motion=motion,
+        contact=contact,
+        force_noise=force,
+        position_noise=position,
+    )
+
+
+def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[LoggedRun]:
+    """Return the runs in contact, divided into segments of similar length."""
+    period = campaign.timing.control_period
+    runs = contacts.exclude_rows_after_gaps(
+        [run for run in campaign.runs if run.kind in CONTACT_KINDS], model, period
+    )
+    return [segment for run in runs for segment in contacts.split_long_run(run, period)]
+
+
+def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:
+    """Return the contact frequency [Hz]."""
+    return (
+        ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
+    )
+
+
+def _condition_draws(
+    draws: dict[str, np.ndarray],
+    first: Sequence[str],
+    frequency: float,
+    prior: Mechanism | None,
+    options: IdentificationOptions,
+) -> tuple[dict[str, np.ndarray], dict[str, float], list[str]]:
+    """Condition the draws on the prior and on the fixed parameters that are not in `first`.
+
+    Returns:
+        The draws of the other parameters, these fixed parameters by key, and notes on contradictions.
+    """
+    if options.bayes and prior is not None:
+        draws = conditioning.condition_on_prior(draws, prior, frequency, options.seed)
+    later = {key: value for key, value in options.fixed.items() if key not in first}
+    later = conditioning.split_lists(later, list(draws))
+    draws, denied = conditioning.condition_on_fixed(draws, later)
+    return draws, later, denied
+
+
+def _drop_undetermined_entries(
+    draws_by_key: dict[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Drop the entries of the contact lists whose stiffness is hardly determined.
+
+    Returns:
+        The remaining draws, without any contact key if no entry is determined; and the vague stiffness keys.
+    """
+    keys = [key for key in draws_by_key if key.startswith(STIFFNESS_PREFIX)]
+    vague = [
+        key for key in keys if draws_by_key[key].std() > MAX_RELATIVE_STD * abs(draws_by_key[key].mean())
+    ]
+    entries = {key.split(".")[2] for key in vague}
+    if entries == {key.split(".")[2] for key in keys}:
+        return {
+            key: draws
+            for key, draws in draws_by_key.items()
+            if vague == [] or key.startswith(SIMULATOR_PREFIX)
+        }, vague
+    # The remaining entries determine a damping that all entries share.
+    shared = sum(key.startswith("contact.damping.") for key in draws_by_key) == 1
+    lists = (STIFFNESS_PREFIX,) if shared else (STIFFNESS_PREFIX, "contact.damping.")
+    dropped = tuple(f"{name}{entry}" for name in lists for entry in entries)
+    left = {
+        k: v
+        for k, v in draws_by_key.items()
+        if not any(k == key or k.startswith(f"{key}.") for key in dropped)
+    }
+    return left, vague
+
+
+def _list_missing_parameters(
+    prior: Mechanism | None, model: MotionModel | None, contact: ContactFit | None, untold: bool
+) -> tuple[str, ...]:
+    """Return the parameters that neither the logs nor the prior determine, each with the run that would.
+
+    `untold` says that the force delay is one of them.
+    """
+    missing = ["rig.simulator (a run of kind free would)"] if model is None else []
+    if prior is None and untold:
+        missing.append(f"{FORCE_DELAY_KEY} (--fix would: of two clocks nobody knows the constant)")
+    if prior is None and contact is None:
+        missing.append("contact.stiffness (a run of kind contact or press would)")
+    return tuple(missing)
+
+
+def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
+    return None if prior is None else mechanism_models.make_motion_model(prior)
+
+
+def _estimate_sensor_noise(
+    runs: Mapping[str, Sequence[LoggedRun]],
+) -> tuple[SensorNoise | None, SensorNoise | None]:
+    """Return the noise of the force and position sensors at rest.
+
+    The noise of the force sensor comes from free motion if no run is at rest.
+    """
+    force = position = None
+    for run in (*runs["rest"], *runs["free"]):
+        if run.valid.sum() < MIN_REST_ROWS:
+            continue
+        if force is None and run.force_measured is not None:
+            force = estimate_noise(_select_finite(run.force_measured, run.valid))
+        if position is None and run.kind == "rest":
+            position = estimate_noise(
+                _select_finite(run.position_measured - run.position_desired[0], run.valid)
+            )
+    return force, position
+
+
+def _select_finite(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return values[valid & np.isfinite(values)]
+
+
+def _fit_and_check_contact(
+    runs: list[LoggedRun],
+    model: MotionModel | None,
+    campaign: Campaign,
+    force: SensorNoise | None,
+    dead_zone: float,
+    options: IdentificationOptions,
+    say: ReportProgress,
+) -> tuple[ContactFit | None, list[validation.CheckResult]]:
+    """Fit all contacts, and check a fit to most of them on those left out; None without contacts."""
+    if model is None or not runs:
+        return None, []
+    plane = options.fixed.get("rig.contact_plane")
+    say(f"fitting the contact to {len(runs)} touches")
+    fit = contacts.fit_contact(
+        runs, model, campaign.timing, force, options.law, plane, options.seed, dead_zone
+    )
+    if options.bootstrap:
+        say(f"fitting {options.bootstrap} times to contacts drawn again")
+        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
+    say("judging the fit by touches left out of it")
+    left_out = select_held_out_contacts(runs, options.hold_out)
+    if not left_out.any():
+        return fit, []
+    partial_fit = contacts.refit_without(fit, left_out, options.seed)
+    return fit, validation.check_held_out_contacts(partial_fit, runs, campaign.equivalent_mass, left_out)
+
+
+def _check_result(
+    mechanism: dict[str, Any] | None,
+    campaign: Campaign,
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: MotionModel | None,
+    touching: list[LoggedRun],
+    options: IdentificationOptions,
+) -> tuple[dict[str, Any] | None, list[validation.CheckResult]]:
+    """Return the mechanism, or None if its file is invalid, and the checks of that file or of the fits."""
+    written, refused = _parse_written_mechanism(mechanism)
+    lines = _check_written_file(campaign, written, motion if options.order is None else None)
+    if lines is None:
+        lines = [*refused, *_check_fits(motion, contact, model, touching, campaign.equivalent_mass, written)]
+    return None if refused else mechanism, lines
+
+
+def _parse_written_mechanism(
+    mechanism: dict[str, Any] | None,
+) -> tuple[Mechanism | None, list[validation.CheckResult]]:
+    """Return the mechanism as its file would contain it, or that file's error as a line of the verdict."""
+    if mechanism is None:
+        return None, []
+    try:
+        return from_plain_data(tomllib.loads(to_toml(mechanism)), "identified mechanism"), []
+    except InputError as error:
+        return None, [validation.CheckResult("mechanism file", str(error), True, 1.0)]
+
+
+def _check_written_file(
+    campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
+) -> list[validation.CheckResult] | None:
+    """Check the written mechanism, as `identify --check` does.
+
+    `motion` is fitted with any order. Returns None if no file is written or the file cannot be checked.
+    """
+    if written is None or campaign.timing.two_clocks:
+        return None
+    if not any(run.kind in (*CONTACT_KINDS, "free") for run in campaign.runs):
+        return None
+    try:
+        return list(check_file(campaign, written, fitted=motion).lines)
+    except InputError:
+        return None
+
+
+def _check_fits(
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: MotionModel | None,
+    touching: list[LoggedRun],
+    mass: float,
+    written: Mechanism | None,
+) -> list[validation.CheckResult]:
+    """Check the fits themselves, if there is no file that can be checked."""
+    frequency, lines = _estimate_frequency(contact, mass), []
+    if motion is not None:
+        lines = [
+            *validation.check_motion_model(motion, frequency),
+            validation.check_delay_sign(motion, frequency),
+        ]
+    if contact is not None and model is not None:
+        lag = contacts.compute_force_lag(contact, model, frequency)
+        all_touches = np.ones(len(touching), bool)
+        lines += [
+            validation.check_stiffness_sign(contact),
+            *validation.check_contact_model(contact, touching, mass, frequency, lag, all_touches),
+        ]
+    if written is not None:
+        lines += check_file_uncertainty(
+            compute_uncertainty_effect(written), any(run.kind == "press" for run in touching)
+        )
+    return lines
+
+
+def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
+    """Return a note for each parameter that is 0 in the file because the logs indicate a negative value."""
+    notes = []
+    for key, draws in draws_by_key.items():
+        if compute_bound_excess(key, draws) > 0.0:
+            interval = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {get_unit(key)}"
+            notes.append(
+                f"{key}: {interval}: the file has its least value, 0, and the difference as uncertainty"
+            )
+    return notes
+
+
+def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndarray:
+    """Return a flag for each run that is left out of a fit: a `share` of the contacts of each speed.
+
+    At least one contact of each speed is left out if there are three or more.
+    """
+    flags = np.zeros(len(runs), bool)
+    speeds = [round(1e4 * (run.speed or 0.0)) if run.kind == "contact" else -1 for run in runs]
+    for speed in set(speeds) - {-1}:
+        members = [i for i, speed_of_run in enumerate(speeds) if speed_of_run == speed]
+        count = max(1, round(share * len(members))) if share > 0.0 and len(members) >= 3 else 0
+        # At regular intervals, so that contacts of every entry of the lists remain in the fit.
+        for i in members[1 :: max(1, len(members) // max(count, 1))][:count]:
+            flags[i] = True
+    return flags
+
+
+def _draw_parameters(
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    model: MotionModel | None,
+    frequency: float,
+    share: float,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Return draws of every parameter by its key, in the key's unit.
+
+    `share` [s] is the part of the delays that belongs to the position sensor.
+    """
+    result, lag = {}, np.zeros(POSTERIOR_DRAWS)
+    if motion is not None and model is not None:
+        rng = np.random.default_rng([seed, 1])
+        result, lag = parameters.draw_simulator_parameters(
+            model, motion.covariance, frequency, POSTERIOR_DRAWS, rng
+        )
+    if contact is not None:
+        # The force delay is relative to the motion, so an error of the motion's lag enters with a minus.
+        result |= parameters.convert_contact_draws(contact)
+        result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] - lag
+    if motion is not None:
+        result["rig.simulator.delay"] = result["rig.simulator.delay"] - share
+    if contact is not None:
+        result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] + share
+        if contact.drift is not None:
+            # No log shows the constant between two clocks, which adds to the force delay.
+            del result[FORCE_DELAY_KEY]
+    return result
+
+
+def _select_fixed_before_fit(
+    keys: Sequence[str], share: float, prior: Mechanism | None, options: IdentificationOptions
+) -> dict[str, float]:
+    """Return the fixed parameters, and the position sensor's delay if it differs from the prior."""
+    first = {key: options.fixed[key] for key in keys if key in options.fixed}
+    if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
+        first[POSITION_DELAY_KEY] = share
+    return first
+
+
+def _choose_position_delay(
+    motion: FreeMotion | None,
+    contact: ContactFit | None,
+    prior: Mechanism | None,
+    options: IdentificationOptions,
+) -> float:
+    """Return the position sensor's delay [s]; it is raised if the force delay would be negative."""
+    if POSITION_DELAY_KEY in options.fixed:
+        return options.fixed[POSITION_DELAY_KEY]
+    specified = 0.0 if prior is None else prior.rig.position_sensor.delay
+    if motion is None or contact is None:
+        return specified
+    delay = contact.posterior.draws[:, 0]
+    return (
+        specified if delay.mean() + specified >= 0.0 else float(MIN_DELAY_SIGMAS * delay.std() - delay.mean())
+    )
+
+
+def _note_shifted_delay(fixed: Mapping[str, float], options: IdentificationOptions) -> list[str]:
+    """Return a note if an unspecified part of the motion's delay was assigned to the position sensor."""
+    if POSITION_DELAY_KEY not in fixed or POSITION_DELAY_KEY in options.fixed:
+        return []
+    share = f"{1e3 * fixed[POSITION_DELAY_KEY]:.3g} ms of the motion's delay were taken as its"
+    return [f"the position sensor lags more than the force sensor: {share}"]

@@ -1,0 +1,136 @@
+"""Reconstruction of lost rows, and division of a log at longer gaps.
+
+A lost row also lost its command. Up to `MAX_RECONSTRUCTED_ROWS` successive commands are reconstructed. The
+numerical model
+
+    x(n+1) = x(n) + T v(n+1),   v(n+1) = v(n) - T F_c(n) / M        (semi-implicit Euler)
+
+gives the first and the last of them from the neighbouring rows, exactly to the digits of the log. A cubic
+gives those between, or all of them if velocity or force command are not logged. Sensor readings are never
+reconstructed: they are NaN, and the row is not valid. A longer gap divides the log.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from tuning.identification.logs.scale_fit import fit_scale
+
+MAX_RECONSTRUCTED_ROWS = 3  # rows, longest gap that is reconstructed
+INTEGRATOR_SPAN_ROWS = 32  # rows over which the integrator is recognizable despite rounding and jitter
+MAX_INTEGRATOR_DISTANCE = 0.2  # half periods, largest distance of the estimate from an integrator
+MIN_INTEGRATOR_SIGMAS = 4.0  # standard errors of a reliable estimate
+MIN_VELOCITY_CHANGE_SHARE = 0.1  # share of the largest change of velocity, above which a row is used
+
+ChannelValues = Mapping[str, np.ndarray | None]
+
+
+class LogSegment(NamedTuple):
+    """Segment of a log without a longer gap, with a row for every tick."""
+
+    tick: np.ndarray  # int64
+    channels: dict[str, np.ndarray | None]
+    valid: np.ndarray  # bool
+
+
+def split_at_gaps(
+    tick: np.ndarray, channels: ChannelValues, cuts: np.ndarray, period: float, mass: float
+) -> list[LogSegment]:
+    """Return the segments between longer gaps and before the rows in `cuts`."""
+    before = np.flatnonzero(np.diff(tick) > MAX_RECONSTRUCTED_ROWS + 1) + 1
+    edges = [0, *np.union1d(before, cuts).astype(int).tolist(), len(tick)]
+    return [
+        _fill_lost_ticks(
+            tick[a:b], {n: None if c is None else c[a:b] for n, c in channels.items()}, period, mass
+        )
+        for a, b in itertools.pairwise(edges)
+        if b > a
+    ]
+
+
+def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str | None:
+    """Return the integrator of the numerical model in a log; None if the log does not determine it."""
+    if v is None:
+        return None
+    step = np.diff(x)
+    by = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
+    errors = {name: np.abs(step - period * velocity) for name, velocity in by.items()}
+    # Without force all integrators agree, and jumps come from a reset of the rig.
+    pulled = np.abs(np.diff(v))
+    usable = np.isfinite(step) & (pulled > 0)
+    usable &= pulled <= 10 * np.nanmedian(pulled[usable]) if np.any(usable) else False
+    sums = {name: float(np.nansum(error[usable])) for name, error in errors.items()}
+    best, second, _ = sorted(sums, key=sums.__getitem__)
+    return best if sums[best] < 0.5 * sums[second] else _detect_integrator_over_span(x, v, period)
+
+
+def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
+    """Return the integrator from the motion over `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
+
+    The integrators differ in the weights of the velocities at both ends of a step.
+    """
+    finite = np.isfinite(v)
+    summed = np.cumsum(np.where(finite, v, 0.0))
+    complete = np.convolve(~finite, np.ones(INTEGRATOR_SPAN_ROWS + 1, int), "valid") == 0
+    changed = np.where(complete, v[INTEGRATOR_SPAN_ROWS:] - v[:-INTEGRATOR_SPAN_ROWS], 0.0)
+    pulled = np.abs(changed) > MIN_VELOCITY_CHANGE_SHARE * np.max(np.abs(changed), initial=0.0)
+    middle = summed[INTEGRATOR_SPAN_ROWS:] - summed[:-INTEGRATOR_SPAN_ROWS] - changed / 2
+    left = (x[INTEGRATOR_SPAN_ROWS:] - x[:-INTEGRATOR_SPAN_ROWS] - period * middle)[pulled]
+    fit = fit_scale(left, period / 2 * changed[pulled], INTEGRATOR_SPAN_ROWS) if np.any(pulled) else None
+    if fit is None:
+        return None
+    places = {"semi_implicit_euler": 1.0, "explicit_euler": -1.0, "zoh": 0.0}
+    best = min(places, key=lambda name: abs(fit.slope - places[name]))
+    return (
+        best
+        if abs(fit.slope - places[best]) < MAX_INTEGRATOR_DISTANCE
+        and MIN_INTEGRATOR_SIGMAS * fit.error < 0.5 - MAX_INTEGRATOR_DISTANCE
+        else None
+    )
+
+
+def _fill_lost_ticks(tick: np.ndarray, channels: ChannelValues, period: float, mass: float) -> LogSegment:
+    """Return a segment with a row for every tick."""
+    index = tick - tick[0]
+    rows = int(index[-1]) + 1
+    valid = np.zeros(rows, bool)
+    valid[index] = True
+    spread: dict[str, np.ndarray | None] = {}
+    for name, values in channels.items():
+        if values is None or rows == len(tick):
+            spread[name] = values
+            continue
+        spread[name] = filled = np.full(rows, -1 if values.dtype.kind == "i" else np.nan, values.dtype)
+        filled[index] = values
+    if rows > len(tick):
+        _reconstruct_commands(spread, valid, period, mass)
+    return LogSegment(np.arange(rows, dtype=np.int64) + tick[0], spread, valid)
+
+
+def _reconstruct_commands(
+    channels: dict[str, np.ndarray | None], valid: np.ndarray, period: float, mass: float
+) -> None:
+    """Reconstruct the commands of the lost rows, in place."""
+    x, v, force = (channels[name] for name in ("position_desired", "velocity_desired", "force_command"))
+    assert x is not None
+    index, valid_rows = channels["contact_index"], np.flatnonzero(valid)
+    if index is not None:
+        index[~valid] = index[valid_rows[np.searchsorted(valid_rows, np.flatnonzero(~valid)) - 1]]
+    after = np.flatnonzero(valid[:-1] & ~valid[1:])
+    until = np.flatnonzero(~valid[:-1] & valid[1:]) + 1
+    is_known = valid.copy()
+    if v is not None and force is not None and detect_integrator(x, v, period) == "semi_implicit_euler":
+        x[after + 1] = x[after] + period * (v[after] - period * force[after] / mass)
+        several = until - after > 2
+        x[until[several] - 1] = x[until[several]] - period * v[until[several]]
+        is_known[after + 1] = is_known[until - 1] = True
+    for a, b in zip(after, until, strict=True):
+        gap = np.flatnonzero(~is_known[a:b]) + a
+        near = np.flatnonzero(is_known[max(0, a - 3) : b + 4]) + max(0, a - 3)
+        if len(gap):
+            near = near[np.argsort(np.abs(near - (a + b) / 2), kind="stable")[:4]]
+            x[gap] = np.polynomial.Polynomial.fit(near, x[near], len(near) - 1)(gap)

@@ -1,0 +1,205 @@
+"""Check of logs against a mechanism file: its model is compared with every run; nothing is estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import to_plain_data
+from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import clock_drift, free_motion, mechanism_models, validation
+from tuning.identification import contact_fit as contacts
+from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_problem import MAX_FORCE_DELAY, CoefficientFit, ContactProblem
+from tuning.identification.contact_profile import Posterior
+from tuning.identification.edge_check import check_contact_edges
+from tuning.identification.force_readings import ForceReadings
+from tuning.identification.free_motion import FreeMotion
+from tuning.identification.motion import MotionResponse
+from tuning.identification.noise import SensorNoise, estimate_noise
+from tuning.identification.rational import MotionModel
+from tuning.identification.records import Campaign, LoggedRun
+from tuning.identification.result import (
+    PRESS_EXPERIMENT,
+    UNCERTAINTY_CHECK,
+    Identification,
+    suggest_experiment,
+)
+from tuning.identification.uncertainty_effect import UncertaintyEffect, compute_uncertainty_effect
+
+MIN_DELAY_STD = 2e-5  # s, least standard deviation of any delay
+ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
+
+
+def check_against_mechanism(
+    campaign: Campaign, mechanism: Mechanism, limit: float = 0.01, fitted: FreeMotion | None = None
+) -> Identification:
+    """Compare logs with a mechanism, without estimating anything.
+
+    The noise of the force sensor comes from runs at rest or in free motion, else from the mechanism.
+
+    Args:
+        campaign: The logs.
+        mechanism: Mechanism that the logs are compared with.
+        limit: Largest allowed effect on e and on e - e*.
+        fitted: Motion simulator fitted to the free runs with any order, if it is available. Only a fit
+            reveals a wrong hold or latency that the mechanism's delay compensates.
+
+    Returns:
+        An identification without estimates.
+
+    Raises:
+        InputError: If the logs have neither free motion nor contact, or the contact law cannot be compared
+            with logs.
+    """
+    clock_drift.reject_separate_clocks(campaign.timing)
+    model = mechanism_models.make_motion_model(mechanism)
+    free = [run for run in campaign.runs if run.kind == "free"]
+    mass, period = campaign.equivalent_mass, campaign.timing.control_period
+    touches = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
+    touches = contacts.exclude_rows_after_gaps(touches, model, period) if touches else []
+    touching = [piece for run in touches for piece in contacts.split_long_run(run, period)]
+    motion = free_motion.compare_free_motion(free, campaign.timing, model)
+    contact = None
+    if touching:
+        contact = _make_contact_fit(touching, model, campaign, mechanism)
+    elif motion is None:
+        raise InputError("logs: found neither free motion nor contact, expected runs of either kind")
+    frequency = (
+        ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
+    )
+    lines = []
+    if motion is not None:
+        fitted = fitted or free_motion.fit_free_motion(free, campaign.timing)
+        assert fitted is not None
+        motion = replace(motion, other_hold_gain=max(motion.other_hold_gain, fitted.other_hold_gain))
+        lines = [
+            *validation.check_motion_model(motion, frequency),
+            validation.check_delay_sign(fitted, frequency),
+        ]
+    if contact is not None:
+        lag = contacts.compute_force_lag(contact, model, frequency)
+        flags = np.ones(len(touching), bool)
+        lines += validation.check_contact_model(contact, touching, mass, frequency, lag, flags)
+    effect = compute_uncertainty_effect(mechanism)
+    if contact is not None and not _has_uncertain_dead_zone(mechanism):
+        lines += check_contact_edges(contact, touching, effect)
+    lines += check_file_uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
+    return Identification(
+        estimates=(),
+        draws=np.zeros((0, 0)),
+        combinations=(),
+        confounded=(),
+        lines=tuple(lines),
+        mechanism=to_plain_data(mechanism),
+        limit=limit,
+        motion=motion,
+        contact=contact,
+    )
+
+
+def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
+    """Return whether the dead zone is less certain than a reading: edges of contact are not predicted."""
+    stated = mechanism.uncertainty.get("rig.force_sensor.dead_zone")
+    return stated is not None and (stated.std or 0.0) > mechanism.rig.force_sensor.noise_std
+
+
+def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[validation.CheckResult]:
+    """Return a check of the effect of the file's own uncertainty, with advice for further runs.
+
+    The list is empty if the file does not come from an identification.
+    """
+    if not effect.parts:
+        return []
+    largest = sorted(effect.parts, key=lambda key: -effect.parts[key])[:2]
+    finding = f"{' and '.join(largest)} above all"
+    if len(largest) == 2:
+        advice = suggest_experiment(*largest)
+        if pressed and advice == PRESS_EXPERIMENT:
+            advice = "a longer or stronger press run with a multisine to 45 Hz"
+        finding += f"; {advice} would tell them better"
+    return [
+        validation.CheckResult(UNCERTAINTY_CHECK, finding, True, effect.restitution, on_error=effect.error)
+    ]
+
+
+def _make_contact_fit(
+    runs: Sequence[LoggedRun], model: MotionModel, campaign: Campaign, mechanism: Mechanism
+) -> ContactFit:
+    """Return the mechanism's contact in the form of a fit."""
+    rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
+    law = mechanism_models.make_regression_law(contact)
+    delay = rig.force_sensor.delay - rig.position_sensor.delay
+    plane, lag = rig.contact_plane, rig.force_sensor.time_constant
+    motion = MotionResponse(model, runs, campaign.timing, max(MAX_FORCE_DELAY, delay) + period)
+    noise = _estimate_force_noise(campaign.runs)
+    hidden = rig.force_sensor.dead_zone > 0.0
+    std, whitening = rig.force_sensor.noise_std, (1.0,)
+    if noise is not None and not noise.silent:
+        std, whitening = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
+    if hidden or not std:
+        whitening = (1.0,)
+    readings = ForceReadings.of(runs, std or 1.0, whitening, std if hidden else 0.0)
+    numbers = [
+        number
+        for entry in readings.entries
+        for number in mechanism_models.get_regression_coefficients(contact, entry)
+    ]
+    numbers.append(-rig.force_sensor.dead_zone if hidden else rig.force_sensor.bias)
+    values = np.array(numbers)
+    if not std:
+        std = _estimate_row_noise(ContactProblem(motion, readings, law, plane, lag), delay, plane, values)
+        readings = ForceReadings.of(runs, std)
+    if hidden:
+        predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
+        readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))
+    problem = ContactProblem(motion, readings, law, plane, lag)
+    inner = CoefficientFit(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
+    delays, planes = _draw_delay_and_surface(mechanism)
+    # The motion is only computed up to this delay.
+    delays = np.clip(delays, problem.min_delay, max(MAX_FORCE_DELAY, delay))
+    posterior = Posterior(
+        ["delay", "plane", *problem.names],
+        np.column_stack([delays, planes, np.tile(values, (validation.CONTACT_STATE_DRAWS, 1))]),
+        np.array([delay]),
+        np.zeros(1),
+        (delay, plane, inner),
+    )
+    error = 0.0 if noise is None or noise.silent else noise.std_std / max(noise.std, 1e-300)
+    return ContactFit(law, (), problem, posterior, len(problem.kept), error, hidden)
+
+
+def _estimate_force_noise(runs: Sequence[LoggedRun]) -> SensorNoise | None:
+    """Return the force sensor's noise at rest, else in free motion; None for fewer than 200 readings."""
+    for kind in ("rest", "free"):
+        for run in runs:
+            if run.kind == kind and run.force_measured is not None:
+                readings = run.force_measured[run.valid & np.isfinite(run.force_measured)]
+                if len(readings) >= 200:
+                    return estimate_noise(readings)
+    return None
+
+
+def _estimate_row_noise(problem: ContactProblem, delay: float, plane: float, values: np.ndarray) -> float:
+    """Return the standard deviation [N] of the force that the law leaves unexplained, from row to row."""
+    left = problem.readings.force - problem.force(delay, plane, values)
+    steps = np.diff(left, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
+    return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)
+
+
+def _draw_delay_and_surface(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+    """Return draws of the relative force delay [s] and the surface [m] from the mechanism's uncertainty."""
+    count, rig = validation.CONTACT_STATE_DRAWS, mechanism.rig
+    drawn = draw(mechanism, count, 0)
+
+    def of(key: str, nominal: float) -> np.ndarray:
+        return drawn.get(key, np.full(count, nominal))
+
+    delay = of("rig.force_sensor.delay", rig.force_sensor.delay)
+    delay = delay - of("rig.position_sensor.delay", rig.position_sensor.delay)
+    clock = MIN_DELAY_STD * np.random.default_rng(0).standard_normal(count)
+    return delay + clock, of("rig.contact_plane", rig.contact_plane)

@@ -1,0 +1,87 @@
+"""Uncertainty of a mechanism file's parameters: standard deviations, correlation, and steps."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.uncertainty import draw
+
+UNCERTAINTY_DRAWS = 4096  # number of draws for standard deviations and correlations
+READING_PREFIXES = (
+    "contact.",
+    "rig.simulator.",
+    "rig.force_sensor.",
+    "rig.position_sensor.",
+    "rig.contact_plane",
+)
+# Least standard deviations of a clock [s] and of a force sensor's scale [1].
+MIN_DELAY_STD, MIN_SCALE_STD = 2e-5, 1e-3
+DELAY_KEYS, STIFFNESS_KEY = ("rig.simulator.delay", "rig.force_sensor.delay"), "contact.stiffness"
+
+
+class UncertainParameter(NamedTuple):
+    """Parameter of a mechanism file, or one entry of a list, with its standard deviation."""
+
+    path: str
+    entry: tuple[int, ...] | None  # index in a list; None: all entries together
+    std: float  # in the key's unit; for a whole list, that of its first entry
+
+    def step_parameter(self, mechanism: Mechanism) -> Mechanism:
+        """Return the mechanism with this parameter increased by one standard deviation."""
+        structs, names = [mechanism], self.path.split(".")
+        for name in names[:-1]:
+            structs.append(getattr(structs[-1], name))
+        value: Any = _step_value(getattr(structs[-1], names[-1]), self.entry, self.std)
+        for struct, name in zip(reversed(structs), reversed(names), strict=True):
+            value = msgspec.structs.replace(struct, **{name: value})
+        return value
+
+
+def list_uncertain_parameters(mechanism: Mechanism) -> tuple[list[UncertainParameter], np.ndarray]:
+    """Return the parameters that affect the readings, and their correlation.
+
+    These are the entries of `[uncertainty]`, and in any case the delays and the stiffness.
+    """
+    result, columns = [], []
+    drawn = draw(mechanism, UNCERTAINTY_DRAWS, 0)
+    for path in [name for name in mechanism.uncertainty if name.startswith(READING_PREFIXES)]:
+        values = drawn[path].reshape(UNCERTAINTY_DRAWS, -1)
+        independent = mechanism.uncertainty[path].independent
+        places = [*np.ndindex(drawn[path].shape[1:])] if independent else [None]
+        for index, column in zip(places, values.T, strict=False):
+            if column.std() > 0.0:
+                result.append(
+                    UncertainParameter(path, index, max(float(column.std()), get_min_std(mechanism, path)))
+                )
+                columns.append(column)
+    correlation = np.atleast_2d(np.corrcoef(columns)) if columns else np.zeros((0, 0))
+    missing = [
+        path for path in (*DELAY_KEYS, STIFFNESS_KEY) if path not in {number.path for number in result}
+    ]
+    result += [UncertainParameter(path, None, get_min_std(mechanism, path)) for path in missing]
+    matrix = np.eye(len(result))
+    matrix[: len(columns), : len(columns)] = correlation
+    return result, matrix
+
+
+def get_min_std(mechanism: Mechanism, path: str) -> float:
+    """Return the least standard deviation of a parameter."""
+    if path in DELAY_KEYS:
+        return MIN_DELAY_STD
+    return MIN_SCALE_STD * float(np.ravel(value_at(mechanism, path))[0]) if path == STIFFNESS_KEY else 0.0
+
+
+def _step_value(value: Any, entry: tuple[int, ...] | None, step: float) -> Any:
+    """Return a scalar or list after a step of one entry, or of all entries if `entry` is None."""
+    table = np.array(value, float)
+    if entry is not None and table.ndim:
+        table[entry] += step
+    elif table.ndim and np.ptp(table) > 0.0:
+        table *= 1.0 + step / table.flat[0]  # Draws scale a list in the same way.
+    else:
+        table += step
+    return table.tolist()

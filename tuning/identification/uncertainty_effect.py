@@ -1,0 +1,232 @@
+"""Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
+
+e* is the restitution of the ideal contact, e that of the rig. To first order a change dF of the contact force
+changes the rebound by its mechanical work,
+
+    d e* = -(integral of dF v dt) / (M v_0^2 e*),
+
+and an additional delay tau of the force adds the energy tau times the integral of F^2 / M:
+
+    e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*),
+
+which is (pi/2) w tau for a linear spring. Damping and delay of the force thus cancel in e, but not in e - e*:
+gains tuned with too little damping reproduce a contact with too little damping.
+
+Without compensation a rig rebounds faster by the factor c = 1 + J tau / e*, and d e = c (d e* + J d tau).
+With gains that compensate the delay, c = 1. The larger of both effects counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from jaxhil.contact.laws import CONTACT_KEYS
+from jaxhil.errors import InputError
+from jaxhil.mechanism.structs import Contact, Mechanism
+from jaxhil.mechanism.uncertainty import draw
+from tuning.identification import mechanism_models
+from tuning.identification.contact_laws import Law
+
+EFFECT_DRAWS = 1024
+EFFECT_PROBABILITY = 0.99  # probability that the effect is smaller than stated
+CONTACT_STEPS = 400  # integration steps in the estimated duration of a contact
+MAX_CONTACT_DURATION_RATIO = 4.0  # times the estimated duration, after which the integration stops
+RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences by a parameter of the motion simulator
+MAX_DEPTH = 1.0  # m; a deeper contact is taken to have no rebound
+FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
+IDENTIFIED_SOURCE_PREFIX = "identified from"  # beginning of the `source` of an identified file
+FORCE_AGE_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
+CONTACT_KEYS = (
+    *("contact.stiffness", "contact.damping"),
+    *(f"contact.{key.name}" for key in CONTACT_KEYS.values() if key.default is None),
+)
+
+
+class UncertaintyEffect(NamedTuple):
+    """Effects of the uncertainty that are not exceeded with a probability of 99 %."""
+
+    restitution: float  # change of e
+    error: float  # change of e - e*
+    parts: dict[str, float]  # change of e or e - e* by each key alone
+
+
+class _IdealContact(NamedTuple):
+    """Nominal contact of the file and its sensitivities."""
+
+    restitution: float  # e*
+    coefficient_sensitivity: np.ndarray  # slopes of e*
+    age_sensitivity: float  # slope of e - e* [1/s]
+
+
+def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
+    """Compute by how much the identified parameters may change e and e - e*.
+
+    The parameters are those of the file's `[correlation]`, or, without it, the normal entries of
+    `[uncertainty]`. Other entries of the file describe variations, not the uncertainty of the identification.
+
+    Returns:
+        The 99 % quantiles of the effects, for the entry of the contact lists where they are largest.
+    """
+    keys = _list_identified_keys(mechanism)
+    if not keys:
+        return UncertaintyEffect(0.0, 0.0, {})
+    try:
+        law = mechanism_models.make_regression_law(mechanism.contact)
+    except InputError:
+        return UncertaintyEffect(0.0, 0.0, {})
+    drawn = draw(mechanism, EFFECT_DRAWS, 0)
+    worst = UncertaintyEffect(0.0, 0.0, {})
+    for entry in range(len(mechanism.contact.stiffness)):
+        contact, frequency = _simulate_ideal_contact(mechanism, law, entry)
+        if contact is None:
+            continue
+        changes = {
+            key: _compute_change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys
+        }
+        gain = 1.0 + contact.age_sensitivity * _compute_force_age(mechanism, frequency) / contact.restitution
+        ideal, error = np.sum(list(changes.values()), axis=0)
+        entry_effect = UncertaintyEffect(
+            gain * _compute_effect_quantile(ideal + error),
+            max(_compute_effect_quantile(error), _compute_effect_quantile(gain * (ideal + error) - ideal)),
+            {key: _compute_effect_quantile(a + b) for key, (a, b) in changes.items()},
+        )
+        if max(entry_effect[:2]) > max(worst[:2]):
+            worst = entry_effect
+    return worst
+
+
+def _list_identified_keys(mechanism: Mechanism) -> list[str]:
+    """Return the keys whose uncertainty comes from an identification."""
+    if not mechanism.source.startswith(IDENTIFIED_SOURCE_PREFIX):
+        return []
+    if mechanism.correlation is not None:
+        keys = mechanism.correlation.keys
+    else:
+        keys = [key for key, entry in mechanism.uncertainty.items() if entry.distribution == "normal"]
+    return [
+        key for key in keys if key in (*FORCE_AGE_KEYS, *CONTACT_KEYS) or key.startswith(SIMULATOR_PREFIX)
+    ]
+
+
+def _compute_change(
+    mechanism: Mechanism, contact: _IdealContact, entry: int, frequency: float, key: str, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes of e* and of e - e* for draws of one parameter."""
+    nothing = np.zeros(len(values))
+    if key in CONTACT_KEYS:
+        nominal = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
+        name = key.removeprefix("contact.")
+        contacts = [_replace_contact_value(mechanism.contact, name, value) for value in values.tolist()]
+        moved = np.array([mechanism_models.get_regression_coefficients(one, entry) for one in contacts])
+        return (moved - nominal) @ contact.coefficient_sensitivity, nothing
+    if key in FORCE_AGE_KEYS:
+        older = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])
+        return nothing, older * contact.age_sensitivity
+    name = key.removeprefix(SIMULATOR_PREFIX)
+    value = getattr(mechanism.rig.simulator, name)
+    if not isinstance(value, float):
+        return nothing, nothing
+    low, high = (
+        _compute_motion_lag(_replace_simulator_value(mechanism, name, value + side), frequency)
+        for side in (0.0, RELATIVE_DIFFERENCE_STEP * max(value, 1e-3))
+    )
+    return nothing, (values - value) * (high - low) / (
+        RELATIVE_DIFFERENCE_STEP * max(value, 1e-3)
+    ) * contact.age_sensitivity
+
+
+def _replace_contact_value(contact: Contact, name: str, value: Any) -> Contact:
+    return msgspec.structs.replace(contact, **{name: value})
+
+
+def _replace_simulator_value(mechanism: Mechanism, name: str, value: float) -> Mechanism:
+    simulator = msgspec.structs.replace(mechanism.rig.simulator, **{name: value})
+    rig = msgspec.structs.replace(mechanism.rig, simulator=simulator)
+    return msgspec.structs.replace(mechanism, rig=rig)
+
+
+def _compute_motion_lag(mechanism: Mechanism, frequency: float) -> float:
+    """Return the delay of the motion's phase at a frequency [Hz], in s, with the position sensor's delay."""
+    model = mechanism_models.make_motion_model(mechanism)
+    angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
+    return -angle / (2.0 * np.pi * frequency)
+
+
+def _compute_force_age(mechanism: Mechanism, frequency: float) -> float:
+    """Return the total delay of the force relative to the command at a frequency [Hz], in s."""
+    sensor = mechanism.rig.force_sensor
+    total = _compute_motion_lag(mechanism, frequency) + sensor.delay + sensor.time_constant
+    return max(total - mechanism.rig.position_sensor.delay, 0.0)
+
+
+def _compute_effect_quantile(values: np.ndarray) -> float:
+    return float(np.quantile(np.abs(values), EFFECT_PROBABILITY))
+
+
+def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_IdealContact | None, float]:
+    """Return the ideal contact of one entry of the lists and its frequency [Hz]; None without a rebound."""
+    mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
+    coefficients = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
+
+    def force(depth: float, rate: float) -> float:
+        functions = law.entry_functions(np.array([max(depth, 0.0)]), np.array([rate]))
+        total = float(sum(c * column[0] for c, column in zip(coefficients, functions, strict=True)))
+        return total if law.pulls else max(total, 0.0)
+
+    deepest = _find_max_depth(force, 0.5 * mass * speed**2)
+    if deepest is None:
+        return None, 0.0
+    step = np.pi * deepest / speed / CONTACT_STEPS
+    states = [(0.0, speed)]
+    for _ in range(round(MAX_CONTACT_DURATION_RATIO * CONTACT_STEPS)):
+        states.append(_take_runge_kutta_step(force, mass, states[-1], step))
+        if states[-1][0] <= 0.0:
+            break
+    depth, rate = np.array(states).T
+    # The last step ends out of contact; only its share in contact counts.
+    last, past = depth[-2:]
+    weights = np.full(len(depth) - 1, step)
+    weights[-1] *= min(last / max(last - past, 1e-300), 1.0)
+    restitution = -float(rate[-1]) / speed
+    if past > 0.0 or restitution <= 0.0:
+        return None, 0.0
+    middle, moving = (0.5 * (values[1:] + values[:-1]) for values in (depth, rate))
+    middle = np.maximum(middle, 0.0)
+    columns = np.array(
+        [np.broadcast_to(column, middle.shape) for column in law.entry_functions(middle, moving)]
+    )
+    total = coefficients @ columns
+    touching = np.ones(len(middle), bool) if law.pulls else total > 0.0
+    scale = mass * speed**2 * restitution
+    by_coefficient = -(columns * touching) @ (moving * weights) / scale
+    by_age = float(np.sum(np.where(touching, total, 0.0) ** 2 * weights)) / mass / scale
+    return _IdealContact(restitution, by_coefficient, by_age), speed / deepest / (2.0 * np.pi)
+
+
+def _find_max_depth(force: Any, energy: float) -> float | None:
+    """Return the depth at which the undamped force has absorbed `energy` [J], to 1e-3, or None."""
+    depth, work = 1e-9, 0.0
+    while work < energy:
+        work += force(1.005 * depth, 0.0) * 0.01 * depth
+        depth *= 1.01
+        if depth > MAX_DEPTH:
+            return None
+    return depth
+
+
+def _take_runge_kutta_step(
+    force: Any, mass: float, state: tuple[float, float], step: float
+) -> tuple[float, float]:
+    """Return the depth [m] and rate [m/s] after one Runge-Kutta step."""
+    depth, rate = state
+    k1 = -force(depth, rate) / mass
+    k2 = -force(depth + 0.5 * step * rate, rate + 0.5 * step * k1) / mass
+    k3 = -force(depth + 0.5 * step * (rate + 0.5 * step * k1), rate + 0.5 * step * k2) / mass
+    k4 = -force(depth + step * (rate + 0.5 * step * k2), rate + step * k3) / mass
+    return (
+        depth + step * (rate + step * (k1 + k2 + k3) / 6.0),
+        rate + step * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0,
+    )

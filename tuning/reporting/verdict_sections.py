@@ -1,0 +1,358 @@
+"""Content of a report: requirements, verdict, assumptions and gains, as sections with tables."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jaxhil.errors import to_one_line
+from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.six_axes import numeric_keys_of
+from jaxhil.mechanism.structs import Mechanism, Uncertainty, numeric_keys, value_at
+from jaxhil.mechanism.uncertainty import PHASE_KEY
+from jaxhil.simulation.contact_plot import CURVE_LABELS
+from tuning.bundle.summary import describe_alarm_rates, is_user_limit
+from tuning.bundle.writers import gain_entries, limit_entries
+from tuning.reporting.drawings import ScenarioPlot, SvgPlot
+from tuning.reporting.result_files import Results
+from tuning.sweeps.columns import find_key_unit
+
+GOOD, BAD, UNKNOWN = "good", "bad", "unknown"
+UNKNOWN_NAME = "(not known)"
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """Table; the columns from index `numbers` on hold numbers."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numbers: int = 1
+
+
+@dataclass(frozen=True)
+class Section:
+    """Section of the page."""
+
+    name: str  # anchor in the page
+    title: str
+    texts: Sequence[str] = ()
+    tables: Sequence[ReportTable] = ()
+    drawings: Sequence[SvgPlot] = ()
+    traces: Sequence[ScenarioPlot] = ()
+    lines: Sequence[str] = field(default=())  # commands as typed in a shell
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Requirement and its result."""
+
+    what: str
+    required: str
+    result: str
+    margin: str
+    verdict: str  # good, bad or unknown
+
+
+def collect_requirements(results: Results) -> list[Requirement]:
+    """Return the requirements by which the results were evaluated."""
+    of_rig = (*_identification_requirement(results), *_monitoring_requirement(results))
+    return [*_sweep_requirement(results), *_watchdog_requirements(results), *of_rig]
+
+
+def combine_verdicts(items: Sequence[Requirement]) -> str:
+    """Return bad if any requirement is bad, good if all are good, else unknown."""
+    verdicts = {requirement.verdict for requirement in items}
+    if BAD in verdicts:
+        return BAD
+    return GOOD if verdicts == {GOOD} else UNKNOWN
+
+
+def assumption_section(results: Results) -> Section | None:
+    """Return the section with every number of the mechanism, its uncertainty and its origin."""
+    subject = results.subject
+    if subject is None:
+        return None
+    mechanism, origins = subject.mechanism, _identified_origins(results)
+    rows = []
+    keys = numeric_keys_of(mechanism) if results.axes == 6 else numeric_keys()
+    for path, allowed in keys.items():
+        if path.startswith("uncertainty"):
+            continue
+        value = value_at(mechanism, path)
+        if value is None or value == [] or np.all(np.isinf(value)):
+            continue
+        unit = find_key_unit(mechanism, path) or allowed.unit
+        uncertain = mechanism.uncertainty.get(path)
+        varies = "fixed"
+        if path == PHASE_KEY:
+            varies = "uniform, 0 to 1" + ("" if results.axes == 6 else ", each contact its own")
+        varies = varies if uncertain is None else _describe_distribution(uncertain, unit)
+        rows.append((path, _format_value(value), unit, varies, origins.get(path, "the file")))
+    texts = [
+        f"{_describe_contact_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}; "
+        f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}.",
+        f"Source of the file: {to_one_line(mechanism.source, 1000) or UNKNOWN_NAME}",
+    ]
+    if mechanism.correlation is not None:
+        texts.append("Some of these numbers vary together, as the file's [correlation] says.")
+    heads = ("key", "value", "unit", "varies", "known from")
+    return Section(
+        "assumptions", "What is assumed, and how it is known", texts, [ReportTable(heads, rows, 9)]
+    )
+
+
+def _describe_contact_laws(mechanism: AnyMechanism) -> str:
+    """Return a text with the contact laws of a mechanism."""
+    if isinstance(mechanism, Mechanism):
+        return f"Law of the contact: {mechanism.contact.law}"
+    laws = (f"{name} {contact.law}" for name, contact in mechanism.contact.items())
+    return f"Laws of the contacts: {', '.join(laws) or 'none'}"
+
+
+def gain_section(results: Results) -> Section | None:
+    """Return the section with the gains, their bounds, the rig's limits, and errors on fresh scenarios."""
+    subject = results.subject
+    if subject is None:
+        return None
+    document = subject.document
+    rows = [
+        (
+            name,
+            format_number(gain.value, 6),
+            gain.unit,
+            f"{format_number(gain.lower, 4)} to {format_number(gain.upper, 4)}",
+        )
+        for name, gain in gain_entries(document).items()
+    ]
+    tables = [ReportTable(("gain", "value", "unit", "bounds"), rows)] if rows else []
+    limits = [
+        (name, format_number(limit.value, 5), limit.unit)
+        for name, limit in limit_entries(document).items()
+        if is_user_limit(name)
+    ]
+    tables += [ReportTable(("limit on the rig", "value", "unit"), limits)] if limits else []
+    keys = ("rms", "99th percentile", "largest", "mean e - e*", "peak / reference")
+    if results.axes == 6:
+        keys = (*keys[:3], "mean", keys[4])
+        errors = {"energy error": "energy_error", "twist error": "twist_error"}
+    else:
+        errors = {"error |e - e*|": "robust"}
+    for name, key in errors.items():
+        error_rows = list(_error_rows(document.get("figures"), key))
+        tables += [ReportTable((f"{name} on fresh scenarios", *keys), error_rows)] if error_rows else []
+    return Section("gains", f"Gains of {subject.compensator}", () if rows else ("It has none.",), tables)
+
+
+def format_number(value: Any, digits: int = 4) -> str:
+    """Return a number with `digits` significant digits; a dash for None or a non-finite number."""
+    is_finite = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return f"{value:.{digits}g}" if is_finite else "–"  # noqa: RUF001
+
+
+def _sweep_requirement(results: Results) -> Iterator[Requirement]:
+    """Yield the requirement on the failure probability of a sweep."""
+    sweep = results.sweep
+    if sweep is None:
+        return
+    limit = "" if sweep.limit is None else f" with {results.error} beyond {sweep.limit:g}, or"
+    what = f"scenarios{limit} that do not end well"
+    share = sweep.failure_probability
+    result = (
+        f"{sweep.failed} of {sweep.scenarios}: {share.value:.4g} (95 %: {share.low:.3g} to {share.high:.3g})"
+    )
+    if sweep.acceptable is None:
+        required, margin = "none", f"{sweep.failed} too many"
+        if sweep.failed == 0:
+            margin = _error_margin(sweep.limit, sweep.worst[0].worst_error if sweep.worst else None)
+    else:
+        required = f"95 % interval ends at or below {sweep.acceptable:g}"
+        margin = f"{sweep.acceptable - share.high:+.3g}"
+    yield Requirement(what, required, result, margin, _as_verdict(sweep.verdict))
+
+
+def _error_margin(limit: float | None, largest: float | None) -> str:
+    """Return a text with the difference of a sweep's limit and its largest error."""
+    if limit is None or largest is None:
+        return "none"
+    return f"{limit - abs(largest):+.2g} of the error"
+
+
+def _watchdog_requirements(results: Results) -> Iterator[Requirement]:
+    """Yield the requirements on the rates of false and missed alarms."""
+    rates = watchdog_rates(results)
+    faulty = [
+        rate for rate in rates.get("fault_runs", ()) if isinstance(rate, Mapping) and rate.get("counted")
+    ]
+    kinds = [(rates.get("false_alarms"), "good runs that the watchdog stops")]
+    kinds += [(rate, f"bad runs that it misses, with {rate.get('meaning')}") for rate in faulty]
+    drawn = rates.get("missed_alarms")
+    # With injected faults, the missed alarms of drawn runs count only if they are bad.
+    if not faulty or (isinstance(drawn, Mapping) and drawn.get("low", 0) > drawn.get("allowed", 1)):
+        kinds.append((drawn, "bad runs that it misses"))
+    for rate, what in kinds:
+        if not isinstance(rate, Mapping) or not isinstance(rate.get("allowed"), (int, float)):
+            continue
+        low, high, allowed = rate.get("low"), rate.get("high"), rate["allowed"]
+        interval = f"95 %: {format_number(low, 2)} to {format_number(high, 2)}"
+        result = f"{rate.get('alarms')} of {rate.get('runs')} ({interval})"
+        has_interval = isinstance(high, (int, float)) and isinstance(low, (int, float))
+        verdict = (
+            UNKNOWN if not has_interval else GOOD if high <= allowed else BAD if low > allowed else UNKNOWN
+        )
+        margin = format_number(allowed - high if has_interval else None, 2)
+        yield Requirement(what, f"at most {allowed:g}", result, margin, verdict)
+
+
+def _identification_requirement(results: Results) -> Iterator[Requirement]:
+    """Yield the requirement on the effect of what an identification leaves uncertain."""
+    document = results.identification
+    if document is not None:
+        effects = [value for value in (document.effect, document.effect_on_error) if value is not None]
+        effect, limit = max(effects, default=None), document.limit
+        margin = format_number(None if effect is None or limit is None else limit - effect, 3)
+        what = "change of e or e - e* by what the identified model leaves unexplained or uncertain"
+        # An identification cannot support gains that were tuned for another mechanism.
+        is_other_mechanism = results.subject is not None and not is_identified(results)
+        verdict = UNKNOWN if is_other_mechanism else _as_verdict(document.verdict)
+        yield Requirement(what, f"below {format_number(limit)}", format_number(effect), margin, verdict)
+
+
+def _monitoring_requirement(results: Results) -> Iterator[Requirement]:
+    """Yield the requirement that the rig still matches the mechanism file."""
+    document = results.monitoring
+    if document is not None:
+        since = "in all" if document.since is None else f"since contact {document.since}"
+        result = f"{to_one_line(document.state, 20)} {since} of {len(document.contacts)} contacts"
+        verdict = BAD if document.state == "bad" else GOOD if document.state in (GOOD, "watch") else UNKNOWN
+        verdict = UNKNOWN if is_other_file_monitored(results) else verdict
+        what = "whether the rig still is that of the mechanism file"
+        yield Requirement(what, "within the file's uncertainty", result, format_number(None), verdict)
+
+
+def is_other_file_monitored(results: Results) -> bool:
+    """Return whether the monitored contacts were compared with another file than that of the gains."""
+    monitoring, subject = results.monitoring, results.subject
+    if monitoring is None or subject is None:
+        return False
+    return monitoring.mechanism_sha256 != subject.document.get("mechanism_sha256")
+
+
+def watchdog_rates(results: Results) -> Mapping[str, Any]:
+    """Return the alarm rates of the watchdog in the bundle; an empty dictionary if there are none."""
+    figures = {} if results.bundle is None else results.bundle.document.get("figures")
+    rates = figures.get("watchdog") if isinstance(figures, Mapping) else None
+    return rates if isinstance(rates, Mapping) else {}
+
+
+def watchdog_section(results: Results) -> Section | None:
+    """Return the section on the rates of false and missed alarms."""
+    rates = watchdog_rates(results)
+    texts = [f"{text[:1].upper()}{text[1:]}." for text in describe_alarm_rates(rates)]
+    return Section("watchdog", "The watchdog", texts) if texts else None
+
+
+def _as_verdict(verdict: str) -> str:
+    """Return a verdict of a file as good, bad or unknown."""
+    return verdict if verdict in (GOOD, BAD) else UNKNOWN
+
+
+def _error_rows(figures: Any, key: str) -> Iterator[tuple[str, ...]]:
+    """Yield the table rows of errors on fresh scenarios, by gains."""
+    by_gains = figures.get(key) if isinstance(figures, Mapping) else None
+    # These intervals are for all errors together, not for the parts of six axes.
+    intervals = figures.get("tuned_intervals") if isinstance(figures, Mapping) and key == "robust" else None
+    for name, errors in by_gains.items() if isinstance(by_gains, Mapping) else ():
+        if name not in CURVE_LABELS or not isinstance(errors, Mapping):
+            continue
+        cells = []
+        for key in ("rms", "p99", "max", "mean", "peak_ratio"):
+            text, span = format_number(errors.get(key)), None
+            if name == "tuned" and isinstance(intervals, Mapping):
+                span = intervals.get(key)
+            if isinstance(span, Mapping):
+                text += f" ({format_interval(span.get('low'), span.get('high'))})"
+            cells.append(text)
+        yield (CURVE_LABELS[name], *cells)
+
+
+def _identified_origins(results: Results) -> dict[str, str]:
+    """Return the origin of each key that was identified or fixed in an identification."""
+    document = results.identification
+    if document is None or not is_identified(results):
+        return {}
+    origins = {}
+    for estimate in document.estimates:
+        path, _, index = estimate.key.rpartition(".")
+        key = path if index.isdigit() else estimate.key
+        text = "given to the identification"
+        if not estimate.known:
+            text = f"the logs, 95 %: {format_interval(estimate.low, estimate.high)}"
+        origins[key] = text if key not in origins else f"{origins[key]}; {text}"
+    return origins
+
+
+def is_identified(results: Results) -> bool:
+    """Return whether all numbers of the gains' mechanism equal the identified ones."""
+    subject, raw = results.subject, results.identified
+    if subject is None:
+        return False
+    for path in numeric_keys():
+        value: Any = raw
+        for part in path.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if value is not None and not path.startswith("uncertainty"):
+            nominal = value_at(subject.mechanism, path)
+            try:
+                if not np.array_equal(np.asarray(nominal, float), np.asarray(value, float)):
+                    return False
+            except (TypeError, ValueError):
+                return False
+    return True
+
+
+def _describe_distribution(uncertain: Uncertainty, unit: str) -> str:
+    """Return a distribution in words."""
+    if uncertain.std is not None:
+        text = f"normal, standard deviation {uncertain.std:.4g} {unit}"
+    elif uncertain.factor is not None:
+        low, high = uncertain.factor
+        text = f"{uncertain.distribution}, {low:g} to {high:g} times"
+    else:
+        low, high = format_number(uncertain.low), format_number(uncertain.high)
+        text = f"{uncertain.distribution}, {low} to {high} {unit}"
+    return text + (", each entry its own" if uncertain.independent else "")
+
+
+def _format_value(value: Any) -> str:
+    """Return a number, or up to eight entries of a list, as text."""
+    if isinstance(value, (list, tuple)):
+        entries = [_format_value(entry) for entry in value[:8]]
+        return ", ".join(entries) + (f", ... ({len(value)} in all)" if len(value) > len(entries) else "")
+    return format_number(value, 6)
+
+
+def format_interval(low: Any, high: Any) -> str:
+    """Return the ends of an interval as text."""
+    return f"{format_number(low)} to {format_number(high)}"
+
+
+def report_title(results: Results) -> str:
+    """Return the title of the report: the mechanism and, if known, the compensator."""
+    subject = results.subject
+    if subject is not None:
+        return f"{to_one_line(subject.mechanism.name, 80)}: {subject.compensator}"
+    if results.map is not None:
+        return f"{to_one_line(results.map.mechanism, 80)}: {to_one_line(results.map.compensator, 40)}"
+    names = [entry.mechanism for entry in results.comparison.mechanisms] if results.comparison else []
+    if not names and not results.identified and results.monitoring is not None:
+        names = [results.monitoring.mechanism]
+    return to_one_line(", ".join(names), 80) or _identified_name(results.identified)
+
+
+def _identified_name(raw: Mapping[str, Any]) -> str:
+    """Return the name in an identified mechanism file."""
+    name = raw.get("name")
+    return to_one_line(name, 80) if isinstance(name, str) else "an identification"

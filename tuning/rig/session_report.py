@@ -1,0 +1,154 @@
+"""Report of a session: every contact compared with its ideal contact, and a verdict with reasons."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxhil.mechanism.structs import Mechanism
+from tuning.rig.contact_watch import MAX_CONTACT_DURATION, RigContact
+from tuning.rig.rig_task import MAX_COMMAND_AGE, STALLED
+from tuning.rig.session import CAUSE_CONTROLLER, LoopReport, SessionReport, SessionSettings
+
+
+def ideal_restitutions(mechanism: Mechanism, contacts: Sequence[RigContact]) -> list[float]:
+    """Return e* of the ideal contact of each contact, with the approach speed on the rig; imports JAX."""
+    if not contacts:
+        return []
+    from jaxhil.simulation.jax_environment import prepare_jax
+
+    prepare_jax()
+    import jax
+
+    from jaxhil.contact.laws import find_contact_law
+    from jaxhil.simulation.outcome import parameters_by_slot
+    from jaxhil.simulation.scenario import build_scenarios
+
+    scenario = build_scenarios(mechanism)
+    number = np.array([contact.number for contact in contacts])
+    parameters = jax.tree.map(lambda leaf: leaf[number], scenario.contact)
+    speeds = [contact.approach_velocity for contact in contacts]
+    velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
+    mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
+    law = find_contact_law(mechanism.contact.law).simulated
+    ideal = jax.jit(lambda contact, *motion: law.reference(parameters_by_slot(contact), *motion))
+    return [float(value) for value in np.asarray(ideal(parameters, mass, velocity).restitution)[:, 0]]
+
+
+def is_stalled(contact: RigContact, setup: SessionSettings, run: LoopReport | None) -> bool:
+    """Return whether only the machine caused commands older than `MAX_COMMAND_AGE` periods in a contact.
+
+    Such a contact does not evaluate the controller. With injected faults the result is always False.
+    """
+    if run is None or setup.injection.any or contact.oldest_command <= MAX_COMMAND_AGE:
+        return False
+    first, last = contact.packets
+    return not np.any(run.causes[first : last + 1] == CAUSE_CONTROLLER)
+
+
+def evaluate_session(
+    setup: SessionSettings,
+    session: SessionReport,
+    references: Sequence[float],
+    limit: float,
+    compensator: str,
+) -> dict[str, Any]:
+    """Return the session as a document in SI units: loops, contacts, commands, verdict and reasons."""
+    contacts = [
+        {
+            **contact._asdict(),
+            "status": STALLED if is_stalled(contact, setup, session.run) else contact.status,
+            "reference_restitution": reference,
+            "error": contact.restitution - reference if contact.status == "ok" else None,
+        }
+        for contact, reference in zip(session.contacts, references, strict=True)
+    ]
+    errors = [contact["error"] for contact in contacts if contact["status"] == "ok"]
+    reasons = _failure_reasons(setup, session, [contact["status"] for contact in contacts], errors, limit)
+    good = f"no missed tick is the controller's fault, every error is within {limit:g}."
+    if session.tripped:
+        good = "tripped with a cause under injected faults, every command finite and within its limits."
+    return {
+        "mechanism": setup.mechanism.name,
+        "compensator": compensator,
+        "control_period": setup.mechanism.rig.control_period,
+        "duration": setup.duration,
+        "seed": setup.seed,
+        "realtime": setup.priority,
+        "injection": setup.injection._asdict(),
+        "empty_loop": _loop_document(session.empty),
+        "run": _loop_document(session.run),
+        "contacts": contacts,
+        "judged": len(errors),
+        "stalled": sum(contact["status"] == STALLED for contact in contacts),
+        "largest_error": max(errors, key=abs, default=None),
+        "commanded": None if session.commanded is None else session.commanded._asdict(),
+        "stroke": setup.stroke,
+        "tripped": session.tripped,
+        "resets": session.resets,
+        "interrupted": session.interrupted,
+        "limit": limit,
+        "reasons": reasons,
+        "good": good,
+        "verdict": "bad" if reasons else "good",
+    }
+
+
+def _loop_document(loop: LoopReport | None) -> dict[str, Any] | None:
+    if loop is None:
+        return None
+    figures = loop.figures._asdict()
+    for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
+        figures[name] = figures[name]._asdict()
+    record = {key: loop.controller[key] for key in ("ended", "status", "ignored", "stale", "made_up", "jax")}
+    # The process of an older bundle may not report quality flags ("doubts").
+    record["doubts"] = loop.controller.get("doubts", {})
+    times = loop.controller["replayed"]["cpu"]
+    return {
+        **figures,
+        "controller": record,
+        "replayed": len(times),
+        "replayed_most": max(times, default=0) * 1e-9,
+    }
+
+
+def _failure_reasons(
+    setup: SessionSettings,
+    session: SessionReport,
+    statuses: Sequence[str],
+    errors: Sequence[float],
+    limit: float,
+) -> list[str]:
+    reasons = []
+    run, commanded = session.run, session.commanded
+    if run is not None:
+        missed = run.figures.missed_by_controller
+        if missed:
+            reasons.append(f"{missed} missed tick{'s are' if missed > 1 else ' is'} the controller's fault.")
+        if run.controller["ended"] not in ("stopped",):
+            reasons.append(f"the controller's process ended {run.controller['ended']}, before the run did.")
+    wrong = [error for error in errors if not abs(error) <= limit]
+    if wrong:
+        worst = max(wrong, key=abs)
+        kind = "divergence" if worst > 0 else "convergence"
+        reasons.append(
+            f"{len(wrong)} of {len(errors)} contacts have an error beyond {limit:g}, the largest "
+            f"{worst:+.4f} ({kind})."
+        )
+    failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
+    if failed:
+        reasons.append(f"{len(failed)} contacts did not end well: {', '.join(sorted(set(failed)))}.")
+    if "timeout" in failed:
+        reasons.append(f"timeout: not over after {MAX_CONTACT_DURATION:g} s, the limit of a contact.")
+    if session.tripped and not setup.injection.any:
+        reasons.append("it tripped though no faults were injected.")
+    if commanded is not None and commanded.not_finite:
+        reasons.append(f"{commanded.not_finite} commands were not finite.")
+    if commanded is not None and commanded.beyond_limits:
+        reasons.append(f"{commanded.beyond_limits} position commands were beyond their limits.")
+    if not errors and not session.tripped and not session.interrupted:
+        reasons.append("no contact could be judged: the run was too short, or the machine too busy.")
+    if math.isnan(sum(errors)):
+        reasons.append("an error is not a number.")
+    return reasons

@@ -1,0 +1,164 @@
+"""Parts of a store: rows of a sweep as Parquet files with a checksum.
+
+The metadata of a part hold the manifest's digest and a SHA-256 of the file, computed with zeros in place of
+its own digits. pandas, DuckDB and Arrow read a part like any Parquet file. The checksum is checked before the
+file is parsed; the rows' outcomes must then follow from their errors and statuses.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from tuning.sweeps.columns import Column, classify_outcomes, list_allowed_texts, list_contact_columns
+from tuning.sweeps.manifest import Manifest, load_gains
+
+SWEEP_DIGEST_KEY = b"jaxhil.sweep.sha256"
+CHECKSUM_KEY = b"jaxhil.part.sha256"
+BLANK_CHECKSUM = b"0" * 64  # replaces the checksum's digits while it is computed
+FORCE_RANGE_KEY = "rig.force_sensor.range"
+CONTROL_PERIOD_KEY = "rig.control_period"
+
+
+def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearray:
+    """Return the content of a part's file."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    buffer = pa.BufferOutputStream()
+    table = to_table(manifest, rows)
+    texts = [column.name for column in manifest.columns if column.kind == "text"]
+    # Numbers hardly repeat: stronger compression would save a tenth of the size in twice the time. Rows are
+    # searched by index only, so that no other column needs statistics.
+    options: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "write_statistics": ["index"]}
+    with parquet.ParquetWriter(buffer, table.schema, **options) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata({CHECKSUM_KEY: BLANK_CHECKSUM})
+    content = bytearray(buffer.getvalue())
+    digits = _locate_checksum(content)
+    assert content[digits] == BLANK_CHECKSUM
+    content[digits] = _compute_checksum(content)
+    return content
+
+
+def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.ndarray] | None:
+    """Return the rows that `encode_chunk` encoded; None if the content is damaged or of another part."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    digits = _locate_checksum(content)
+    if content[digits] != _compute_checksum(
+        content[: digits.start] + BLANK_CHECKSUM + content[digits.stop :]
+    ):
+        return None
+    try:
+        table = parquet.ParquetFile(pa.BufferReader(content)).read()
+        return _check_rows(manifest, part, table)
+    except (pa.ArrowException, InputError, LookupError, OSError, TypeError, ValueError):
+        # The checksum is valid, but another program wrote the content.
+        return None
+
+
+def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarray] | None:
+    """Return the rows of a table; None if they are not those of this part or contradict themselves."""
+    first, number = manifest.chunk_range(part)
+    if (table.schema.metadata or {}).get(
+        SWEEP_DIGEST_KEY
+    ) != manifest.sha256.encode() or table.num_rows != number:
+        return None
+    if not table.schema.equals(build_arrow_schema(manifest)):
+        return None
+    rows = from_table(manifest, table)
+    if not np.array_equal(rows["index"], np.arange(first, first + number)):
+        return None
+    mechanism = load_gains(manifest).mechanism
+    if isinstance(mechanism, SixAxisMechanism):
+        # The range is the least of the three force channels, drawn or nominal.
+        forces = [f"{FORCE_RANGE_KEY}_{axis}" for axis in (1, 2, 3)]
+        ranges = zip(forces, mechanism.rig.force_sensor.range[:3], strict=True)
+        values = (rows.get(name, nominal) for name, nominal in ranges)
+        force_range = np.min(np.broadcast_arrays(*values), axis=0)
+    else:
+        force_range = rows.get(FORCE_RANGE_KEY, np.array(mechanism.rig.force_sensor.range))
+    period = rows.get(CONTROL_PERIOD_KEY, np.array(mechanism.rig.control_period))
+    evaluated = classify_outcomes(
+        rows, list_contact_columns(mechanism), force_range, period, manifest.error_limit
+    )
+    return None if list_different_columns(evaluated, rows) else rows
+
+
+def list_different_columns(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> list[str]:
+    """Return the names of the columns that differ in type or in any bit, where all NaN are equal."""
+    return [
+        name
+        for name in a
+        if a[name].dtype != b[name].dtype
+        or not np.array_equal(a[name], b[name], equal_nan=a[name].dtype.kind == "f")
+    ]
+
+
+def build_arrow_schema(manifest: Manifest) -> Any:
+    """Return the Arrow schema of every part; units and meanings are metadata of the fields."""
+    import pyarrow as pa
+
+    kinds = {
+        "integer": pa.int64(),
+        "input": pa.float64(),
+        "number": pa.float64() if manifest.precision == "float64" else pa.float32(),
+        "flag": pa.bool_(),
+        "text": pa.dictionary(pa.int8(), pa.string()),
+    }
+
+    def field(column: Column):
+        metadata = {"unit": column.unit, "meaning": column.meaning}
+        return pa.field(column.name, kinds[column.kind], metadata=metadata)
+
+    return pa.schema(
+        [field(column) for column in manifest.columns], metadata={SWEEP_DIGEST_KEY: manifest.sha256}
+    )
+
+
+def to_table(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> Any:
+    """Convert rows to an Arrow table with null for NaN and texts for their indices."""
+    import pyarrow as pa
+
+    arrays = []
+    for column, field in zip(manifest.columns, target := build_arrow_schema(manifest), strict=True):
+        values = rows[column.name]
+        if column.kind == "text":
+            arrays.append(
+                pa.DictionaryArray.from_arrays(pa.array(values), list(list_allowed_texts(column.name)))
+            )
+        else:
+            # Without NaN, Arrow need not copy the values.
+            gaps = values.dtype.kind == "f" and bool(np.any(np.isnan(values)))
+            arrays.append(pa.array(values, field.type, from_pandas=gaps))
+    return pa.Table.from_arrays(arrays, schema=target)
+
+
+def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
+    """Convert a table of `to_table` back to rows."""
+    rows = {}
+    for column in manifest.columns:
+        array = table.column(column.name).combine_chunks()
+        if column.kind == "text":
+            # Arrow may return the dictionary's texts in another order.
+            indices = {text: index for index, text in enumerate(list_allowed_texts(column.name))}
+            translated = np.array([indices[text.as_py()] for text in array.dictionary], np.int8)
+            rows[column.name] = translated[array.indices.to_numpy(zero_copy_only=False)]
+        else:
+            rows[column.name] = array.to_numpy(zero_copy_only=False)
+    return rows
+
+
+def _locate_checksum(content: bytes | bytearray) -> slice:
+    """Return the position of the checksum's digits, behind its name, a header byte and a length byte."""
+    start = content.rfind(CHECKSUM_KEY) + len(CHECKSUM_KEY) + 2
+    return slice(start, start + len(BLANK_CHECKSUM))
+
+
+def _compute_checksum(content: bytes | bytearray) -> bytes:
+    return hashlib.sha256(content).hexdigest().encode("ascii")

@@ -1,0 +1,266 @@
+"""Share of missed alarms in runs with an injected fault that makes the error just too large.
+
+With good gains an error beyond the limit is so rare that random draws cannot bound the missed share. So a
+fault that neither controller nor watchdog knows is injected, and scaled in every scenario until the
+restitution error is between 1 and `MAX_FAULT_ERROR` times the limit. This is the hardest case, since a larger
+error is farther from the expected restitution. The rate is conditional on such a fault, not the probability
+that one occurs. Every fault has fresh and independent scenarios, so that the exact binomial interval is
+valid.
+
+A scenario does not count if its error exceeds the limit without the fault, or if no fault of up to
+`MAX_FAULT_MULTIPLE` gives an error within the band. A fault that makes fewer than half of the scenarios bad
+is reported but does not count, since the gains are insensitive to it.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.simulation.evaluation import count_lanes
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.metrics import OK
+from jaxhil.simulation.one_axis import evaluate
+from jaxhil.simulation.plausibility import summarise_mechanism
+from jaxhil.simulation.scenario import Scenario
+from tuning.statistics.intervals import binomial_interval, estimate_deciding_scenarios
+from tuning.sweeps.draws import draw_scenarios
+from tuning.watchdog.alarms import BAD_ERROR_FACTOR, evaluate_runs, find_alarms
+from tuning.watchdog.audit import AuditRules, find_first_true
+from tuning.watchdog.expectation import Expectation
+from tuning.watchdog.recording import record_runs
+
+MAX_FAULT_ERROR = 1.25  # largest error of a fault run over the limit [1]
+MIN_BAD_SHARE = 0.5  # least share of scenarios that a fault must make bad in order to count
+FIRST_SCENARIO_INDEX = 2**31  # index of the first scenario; lower ones are for sweeps and calibration
+MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS = 64, 4096  # least and largest number of scenarios of a fault
+MAX_FAULT_MULTIPLE = (
+    32.0  # largest fault over the delay that alone causes an error of the limit, uncompensated
+)
+FAULT_MULTIPLES = tuple(MAX_FAULT_MULTIPLE / 2.0**step for step in range(6, -1, -1))
+BISECTION_STEPS = 4  # bisections of the interval between two steps of the ladder
+MAX_DELAY_SHARE = 0.5  # longest injected delay over the ideal contact's duration [1]
+
+FaultSizes = Float[np.ndarray, "lanes"]
+
+
+class InjectedFault(NamedTuple):
+    """Fault that the controller does not know."""
+
+    name: str
+    meaning: str  # description for messages
+    unit: str  # unit of its size
+
+
+FORCE_DELAY_FAULT = InjectedFault("force_delay", "the force measured later than told", "s")
+POSITION_DELAY_FAULT = InjectedFault("position_delay", "the position measured later than told", "s")
+SIMULATOR_DELAY_FAULT = InjectedFault("simulator_delay", "the motion simulator later than told", "s")
+GAIN_FAULT = InjectedFault("gains", "the gains nearer to no compensation", "1")
+INJECTED_FAULTS = (FORCE_DELAY_FAULT, POSITION_DELAY_FAULT, SIMULATOR_DELAY_FAULT, GAIN_FAULT)
+
+
+class _FaultCase(NamedTuple):
+    """Fault with its scenarios and sizes."""
+
+    fault: InjectedFault
+    scenarios: Scenario
+    unit: float  # size of one multiple, in the fault's unit
+    most: float  # largest size, in the fault's unit
+
+
+def compute_fault_rates(
+    loaded: LoadedGains,
+    rules: AuditRules,
+    free_distance: float,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+    number: int,
+    seed: int,
+    progress: Callable[[int], None] = lambda runs: None,
+) -> list[dict[str, Any]]:
+    """Return the share of missed alarms for every fault, with an exact 95 % interval, as plain data.
+
+    Args:
+        loaded: the gain file.
+        rules: rules of the watchdog's audit.
+        free_distance: free distance [m] of the guards.
+        expectation: expected restitution of the watchdog.
+        limits: limits of the gain file by name.
+        limit: limit of the restitution error [1], beyond which a run must be stopped.
+        number: number of scenarios for each fault.
+        seed: seed of the scenarios.
+        progress: called with the number of further runs that are complete.
+    """
+    cases = _build_cases(loaded, limit, number, seed)
+    loop = _build_widest_loop(loaded, cases)
+    rates = []
+    for case in cases:
+        sizes, usable = _find_just_bad_faults(loop, loaded, case, limit)
+        rates.append(
+            _compute_missed_rate(
+                loop, loaded, case, sizes, usable, rules, free_distance, expectation, limits, limit
+            )
+        )
+        progress(number)
+    return rates
+
+
+def count_fault_scenarios(allowed: float) -> int:
+    """Return the number of scenarios of a fault that decides whether at most the share `allowed` is missed.
+
+    It is twice the number for no missed alarm, to allow for a few missed alarms and unusable scenarios.
+    """
+    if not 0 < allowed < 1:
+        return MIN_FAULT_SCENARIOS if allowed >= 1 else MAX_FAULT_SCENARIOS
+    needed = estimate_deciding_scenarios(0, 0, allowed)
+    return (
+        MAX_FAULT_SCENARIOS
+        if needed is None
+        else int(np.clip(2 * needed, MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS))
+    )
+
+
+def _build_cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> list[_FaultCase]:
+    """Return the faults that the compensator can have, each with fresh scenarios."""
+    cases, duration = [], _compute_ideal_duration(loaded)
+    # e = exp(pi omega tau/2) - 1 of a net delay tau, and pi/omega is the duration.
+    delay = 2 * duration / math.pi**2 * math.log1p(limit)
+    for index, fault in enumerate(INJECTED_FAULTS):
+        if fault == GAIN_FAULT and not _find_neutral_gains(loaded):
+            continue
+        _, scenarios = draw_scenarios(
+            loaded.mechanism, "random", seed, FIRST_SCENARIO_INDEX + index * number, number
+        )
+        unit, most = (
+            (1 / MAX_FAULT_MULTIPLE, 1.0) if fault == GAIN_FAULT else (delay, MAX_DELAY_SHARE * duration)
+        )
+        cases.append(_FaultCase(fault, scenarios, unit, most))
+    return cases
+
+
+def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
+    """Return the neutral values of the gains that have one and differ from it."""
+    return {
+        gain.name: float(gain.neutral)
+        for gain in COMPENSATORS[loaded.compensator].gains
+        if gain.neutral is not None and loaded.gains[gain.name] != gain.neutral
+    }
+
+
+def _compute_ideal_duration(loaded: LoadedGains) -> float:
+    """Return the duration [s] of the first nominal ideal contact; half an oscillation if it never ends."""
+    first = summarise_mechanism(loaded.mechanism).contacts[0]
+    return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
+
+
+def _inject_fault(
+    loaded: LoadedGains, case: _FaultCase, sizes: FaultSizes
+) -> tuple[Mapping[str, Any], Scenario]:
+    """Return gains and scenarios with the fault of these sizes."""
+    scenarios, fault = case.scenarios, case.fault
+    gains = {name: np.full(len(sizes), value) for name, value in loaded.gains.items()}
+    if fault == GAIN_FAULT:
+        moved = {
+            name: gains[name] + sizes * (to - gains[name]) for name, to in _find_neutral_gains(loaded).items()
+        }
+        return {**gains, **moved}, scenarios
+    part = {
+        FORCE_DELAY_FAULT: "force_sensor",
+        POSITION_DELAY_FAULT: "position_sensor",
+        SIMULATOR_DELAY_FAULT: "simulator",
+    }[fault]
+    device: Any = getattr(scenarios, part)
+    return gains, scenarios._replace(**{part: device._replace(delay=np.asarray(device.delay) + sizes)})
+
+
+def _build_widest_loop(loaded: LoadedGains, cases: list[_FaultCase]) -> Any:
+    """Return the loop that serves every fault at its largest."""
+    largest = [
+        _inject_fault(
+            loaded, case, _limit_sizes(case, np.full(count_lanes(case.scenarios), MAX_FAULT_MULTIPLE))
+        )[1]
+        for case in cases
+    ]
+    joined: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *largest)
+    return build_loop(loaded.mechanism, loaded.compensator, joined)
+
+
+def _limit_sizes(case: _FaultCase, multiples: FaultSizes) -> FaultSizes:
+    """Return the sizes of the multiples, limited to the largest size."""
+    return np.minimum(multiples * case.unit, case.most)
+
+
+def _find_just_bad_faults(
+    loop: Any, loaded: LoadedGains, case: _FaultCase, limit: float
+) -> tuple[FaultSizes, np.ndarray]:
+    """Return per scenario the size with an error just beyond the limit, and whether there is such a size."""
+    number = count_lanes(case.scenarios)
+
+    def errors(multiples: Any) -> FaultSizes:
+        gains, scenarios = _inject_fault(loaded, case, _limit_sizes(case, multiples))
+        outcome = evaluate(loop, gains, scenarios)
+        size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.wanted, np.inf, 0.0))
+        return np.max(size, axis=0)
+
+    # Multiples whose error is within the limit and beyond it bracket the searched size.
+    below, above = np.zeros(number), np.full(number, np.nan)
+    beyond = np.full(number, np.inf)
+    usable = errors(np.zeros(number)) <= limit
+    for multiple in FAULT_MULTIPLES:
+        error = errors(np.full(number, multiple))
+        first = np.isnan(above) & (error > BAD_ERROR_FACTOR * limit)
+        above, beyond = np.where(first, multiple, above), np.where(first, error, beyond)
+        below = np.where(np.isnan(above), multiple, below)
+    usable &= ~np.isnan(above)
+    above = np.where(usable, above, MAX_FAULT_MULTIPLE)
+    for _ in range(BISECTION_STEPS):
+        middle = np.where(below > 0, np.sqrt(below * above), above / 2)
+        error = errors(middle)
+        bad = error > BAD_ERROR_FACTOR * limit
+        above, beyond = np.where(bad, middle, above), np.where(bad, error, beyond)
+        below = np.where(bad, below, middle)
+    return _limit_sizes(case, above), usable & (beyond <= MAX_FAULT_ERROR * limit)
+
+
+def _compute_missed_rate(
+    loop: Any,
+    loaded: LoadedGains,
+    case: _FaultCase,
+    sizes: FaultSizes,
+    usable: np.ndarray,
+    rules: AuditRules,
+    free_distance: float,
+    expectation: Expectation,
+    limits: Mapping[str, float | None],
+    limit: float,
+) -> dict[str, Any]:
+    """Return the rate of missed alarms of a fault and its statistics, as plain data."""
+    gains, scenarios = _inject_fault(loaded, case, sizes)
+    chunk = record_runs(loop, loaded._replace(gains=gains), scenarios)  # pyright: ignore[reportArgumentType]
+    runs = evaluate_runs(chunk, rules, free_distance)
+    bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR_FACTOR * limit)
+    usable = usable & np.any(bad, axis=0)
+    alarmed = find_alarms(runs, expectation, limits, rules.mass)
+    missed = (find_first_true(alarmed) > find_first_true(bad))[usable]
+    number, count = int(np.sum(usable)), int(np.sum(missed))
+    _, low, high = binomial_interval(count, number)
+    error = np.nanmax(np.where(np.isfinite(runs.error), np.abs(runs.error), 0.0), axis=0)[usable]
+    return {
+        **case.fault._asdict(),
+        "scenarios": len(sizes),
+        "largest_size": min(MAX_FAULT_MULTIPLE * case.unit, case.most),
+        "size": float(np.median(sizes[usable])) if number else None,
+        "error": float(np.median(error)) if number else None,
+        "runs": number,
+        "alarms": count,
+        "rate": count / number if number else None,
+        "low": float(low),
+        "high": float(high),
+        "counted": number >= MIN_BAD_SHARE * len(sizes),
+    }
