@@ -142,7 +142,7 @@ def test_verification_reports_a_wrong_runtime(varying, monkeypatch, runtime, sta
     if runtime is Leading:
         assert all(lane.difference <= 1e-13 for lane in report.replay)
         in_the_loop = [one for one in report.reasons if one.startswith("closed loop, contact 1: restitution")]
-        assert len(in_the_loop) == 1 and in_the_loop[0].endswith("expected 1e-09")
+        assert len(in_the_loop) == 1 and in_the_loop[0].endswith("limit 1e-09")
 
 
 def test_verification_refuses_single_precision(varying):

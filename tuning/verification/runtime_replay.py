@@ -331,6 +331,6 @@ def _list_closed_loop_reasons(
         if not difference <= CLOSED_LOOP_LIMIT:
             yield (
                 f"{where}: restitution found {contact.restitution!r}, simulated "
-                f"{contact.simulated_restitution!r}: they differ by {difference:.1e}, expected "
+                f"{contact.simulated_restitution!r}: they differ by {difference:.1e}, limit "
                 f"{CLOSED_LOOP_LIMIT:.0e}"
             )
