@@ -11,8 +11,8 @@ def choose_rig_model(mechanism: AnyMechanism) -> RigModel:
 
     Example:
         >>> import jaxhil
-        >>> from jaxhil.rig_models import rig_model
-        >>> rig_model(jaxhil.load("rig-300kg")).axes
+        >>> from jaxhil.rig_models import choose_rig_model
+        >>> choose_rig_model(jaxhil.load("rig-300kg")).axes
         1
     """
     if not isinstance(mechanism, SixAxisMechanism):

@@ -138,8 +138,8 @@ DIGEST = """
 import hashlib, os, sys
 if sys.argv[1] == "1" and hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-from jaxhil.simulation.jax_environment import prepare
-prepare()
+from jaxhil.simulation.jax_environment import prepare_jax
+prepare_jax()
 import jax
 from test_evaluation import evaluate, setting
 content = b"".join(leaf.tobytes() for leaf in jax.tree.leaves(evaluate(*setting(lanes=100))))

@@ -27,7 +27,7 @@ SLOW = ["tuning.compare", "tuning.export", "tuning.map", "tuning.report"]
 
 def run_examples(path):
     """Return the number of examples of a docstring that ran, after checking that none failed."""
-    [test] = doctest.DocTestFinder(recurse=False).find(resolve_name(path), path, globs={})
+    [test] = doctest.DocTestFinder(recurse=False).find(resolve_name(path), path)
     report = []
     result = doctest.DocTestRunner(verbose=False).run(test, out=report.append)
     assert not result.failed, "".join(report)

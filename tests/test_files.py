@@ -143,7 +143,7 @@ import os, signal, sys
 from pathlib import Path
 from jaxhil import files
 os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-files.write_whole(Path(sys.argv[1]) / "file", b"new")
+files.write_atomically(Path(sys.argv[1]) / "file", b"new")
 """
     ended = subprocess.run([sys.executable, "-c", killed, tmp_path], timeout=60)
     assert ended.returncode == -signal.SIGKILL

@@ -247,7 +247,7 @@ def test_external_calls_of_a_program_are_all_listed():
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "full"), TypeError("cannot pickle"), KeyError("private")]
 )
-@pytest.mark.parametrize("step", ["remove_stale", "_to_bytes", "write_sealed"])
+@pytest.mark.parametrize("step", ["remove_stale", "_serialise_program", "write_checksummed"])
 def test_program_that_cannot_be_cached_costs_no_result(tmp_path, monkeypatch, step, error):
     def fails(*arguments, **named):
         raise error
@@ -261,15 +261,15 @@ SOLVES = """
 import sys
 from functools import partial
 from pathlib import Path
-from jaxhil.simulation.jax_environment import prepare
-prepare()
+from jaxhil.simulation.jax_environment import prepare_jax
+prepare_jax()
 import jax, jax.numpy as jnp, numpy as np
-from jaxhil.simulation import kept_programs
+from jaxhil.simulation import cached_programs
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 def solved(static, matrix):
     print("traced")
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), jnp.ones(2))
-print(kept_programs.run(solved, 1, np.diag([4.0, 0.5])))
+print(cached_programs.run_program(solved, 1, np.diag([4.0, 0.5])))
 """
 
 

@@ -68,7 +68,7 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
 def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
     runs = []
     work = SearchProgress()
-    monkeypatch.setattr(work, "ran", runs.append)
+    monkeypatch.setattr(work, "report_runs", runs.append)
     task = build_task(lead_task().mechanism, "phase_lead", 32, 0)
     validation = build_validation([task], 15, 0, work)
     chosen = choose_starts(validation, 4, seed)[0]

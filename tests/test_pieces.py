@@ -54,7 +54,7 @@ def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch)
     assert reader.other == ["one"] * 3
     # Read with another type than it was written with.
     assert reader.read("one", inputs, int) is None
-    for name in ("sources_sha256", "versions", "xla_flags"):
+    for name in ("sources_sha256", "dependency_versions", "active_xla_flags"):
         with monkeypatch.context() as patched:
             patched.setattr(checkpoints, name, lambda: "others")
             assert reader.read("one", inputs, Point) is None

@@ -176,7 +176,7 @@ def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
     first = jaxhil(*again, *STUDIES, "--json")
     assert (folder / "verdict.json").read_text() == first[1] and "as kept" not in first[2]
     assert sorted(path.name for path in (folder / "studies").iterdir()) == [Path(one).name for one in KEPT]
-    no_study(monkeypatch, "error_indices", "rare_failure")
+    no_study(monkeypatch, "compute_error_indices", "estimate_rare_failure")
     second = jaxhil(*again, *STUDIES, "--json")
     assert second[1] == first[1]
     assert all(f"as kept in {folder / one}\n" in second[2] for one in KEPT)
@@ -214,7 +214,7 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick
     so_far = json.loads((folder / "verdict.json").read_text())
     assert so_far["verdict"] == "bad" and so_far["drivers"]["evaluations"] == 80 and "rare" not in so_far
     assert [(folder / one).exists() for one in KEPT] == [True, False]
-    no_study(monkeypatch, "error_indices")
+    no_study(monkeypatch, "compute_error_indices")
     result = document(jaxhil(*again, *STUDIES, "--json"))
     assert result["drivers"] == so_far["drivers"] and result["rare"]["limit"] == 1.6
 

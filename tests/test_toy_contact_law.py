@@ -19,16 +19,18 @@ import numpy as np
 
 from jaxhil.contact.arrays import jnp
 from jaxhil.contact.base import ContactLaw
-from jaxhil.contact.float_law import clamped
-from jaxhil.contact.keys import Key
-from jaxhil.contact.regression import Family, Regression
+from jaxhil.contact.float_law import clamp_force
+from jaxhil.contact.keys import ContactKey
+from jaxhil.contact.regression import RegressionFamily, Regression
 
 
 class Toy(ContactLaw):
     """F = max(0, k d (1 + d/d_2) + b d'), d_2 the `doubling_depth`."""
 
     name: ClassVar[str] = "toy"
-    keys: ClassVar = (Key("doubling_depth", "where {laws} is twice as stiff", "m", {"gt": 0.0}, neutral=1.0),)
+    keys: ClassVar = (
+        ContactKey("doubling_depth", "where {laws} is twice as stiff", "m", {"gt": 0.0}, neutral=1.0),
+    )
 
     @property
     def arcs(self):
@@ -56,14 +58,14 @@ class Toy(ContactLaw):
         def spring(depth, rate):
             return stiffness * depth * (1.0 + depth / contact.doubling_depth) + damping * rate
 
-        return clamped(spring, lambda rate: damping * rate)
+        return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
         names = ("stiffness", "square", "damping")
         return Regression("toy", lambda d, v: [d, d**2], names, lambda d, v: [v])
 
     def families(self, deepest, entries):
-        return [Family(lambda _: self.regression(None))] if entries == 1 else []
+        return [RegressionFamily(lambda _: self.regression(None))] if entries == 1 else []
 
     def coefficients(self, contact, stiffness, damping):
         return [stiffness, stiffness / contact.doubling_depth, damping]
@@ -77,8 +79,8 @@ WITHOUT_JAX = """
 import sys
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import load
-from jaxhil.mechanism.keys import tables
-from tuning.rig.plant import Plant
+from jaxhil.mechanism.keys import describe_tables
+from tuning.rig.plant import RigHardware
 
 toy = {"contact.law": "toy", "contact.damping": [400.0], "contact.doubling_depth": 3e-4}
 mechanism = load("rig-300kg", toy).mechanism
@@ -87,9 +89,9 @@ for wrong in ({"contact.law": "toy"}, {"contact.law": "hertz"}, {**toy, "contact
         load("rig-300kg", wrong)
     except InputError as error:
         print(error)
-[key] = [key for table in tables() for key in table.keys if key.name == "doubling_depth"]
+[key] = [key for table in describe_tables() for key in table.keys if key.name == "doubling_depth"]
 print(key.meaning, key.unit, key.allowed, key.users, sep="; ")
-plant = Plant(mechanism)
+plant = RigHardware(mechanism)
 plant.begin(-1e-5, 0.01, -1e-5, 0)
 for tick in range(80):
     plant.move(-1e-5 + 0.01 * 0.001 * tick)
@@ -101,7 +103,7 @@ import jaxhil, numpy as np, tuning
 from jaxhil.mechanism.uncertainty import draw
 from tuning.__main__ import main
 from tuning.transparency.damping_perturbations import perturb_damping
-from tuning.transparency.probes import probed_scenarios
+from tuning.transparency.probes import build_probed_scenarios
 
 toy = {"contact.law": "toy", "contact.damping": [400.0], "contact.doubling_depth": 3e-4}
 mechanism = jaxhil.load("rig-300kg", toy)
@@ -114,7 +116,7 @@ print(tuned.document["mechanism"]["contact"]["doubling_depth"])
 print(tuning.sweep("gains.json", scenarios=16).table.num_rows)
 
 draws = draw(mechanism, 6, 0)
-probed = probed_scenarios(mechanism, draws)
+probed = build_probed_scenarios(mechanism, draws)
 perturbed, values = perturb_damping(mechanism, draws)
 print(np.all((probed.early > 0) & (probed.late > 0)), perturbed.contact.law)
 print(np.min(values["contact.damping"]), np.max(values["contact.damping"]) > 1000)

@@ -28,3 +28,69 @@ def test_docstrings_begin_with_a_verb_or_a_noun(package):
         if FIRST_WORDS.match(text)
     ]
     assert not wrong, "\n".join(wrong)
+
+
+# Names that say nothing about the value that they hold.
+EMPTY_NAMES = set("found one own told known place given kept met said some each held carried likely".split())
+# "found" names the part of a message that says what was found.
+MESSAGE_PARTS = {"found"}
+
+
+def bound_names(path: Path):
+    """Yield line and name of everything that functions of a file bind: parameters and variables."""
+    for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            parameters = function.args
+            for parameter in (*parameters.posonlyargs, *parameters.args, *parameters.kwonlyargs):
+                yield function.lineno, parameter.arg
+            for node in ast.walk(function):
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                    yield node.lineno, node.id
+
+
+@pytest.mark.parametrize("package", ["jaxhil", "tuning"])
+def test_functions_bind_no_empty_names(package):
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for line, name in bound_names(path)
+        if name in EMPTY_NAMES - MESSAGE_PARTS
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def concept(path: Path, name: str) -> str:
+    """Return the concept behind a class: sides of a compensator, and one axis and six, share theirs."""
+    relative = path.relative_to(ROOT).as_posix()
+    if relative.startswith("jaxhil/laws/") or relative in ("jaxhil/rig/filters.py", "jaxhil/rig/registry.py"):
+        return "compensator"
+    if relative.startswith(("jaxhil/sixdof/", "jaxhil/mechanism/", "jaxhil/simulation/")):
+        return "rig model"
+    return relative
+
+
+def test_class_names_are_unique_except_within_a_concept():
+    concepts = {}
+    for package in ("jaxhil", "tuning"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    concepts.setdefault(node.name, set()).add(concept(path, node.name))
+    shared = {name: sorted(homes) for name, homes in concepts.items() if len(homes) > 1}
+    assert not shared
+
+
+# Words that the glossary retires, as patterns, and the ordinary uses that stay.
+RETIRED = {
+    r"\bbank of hypotheses\b": (),
+    r"\bfarewell\b": (),
+    r"\bhonesty\b|\bblindness\b": ("--pareto-against", '"honesty"'),
+    r"\bdamped twins?\b": (),
+    r"\bdoubts\b": (),
+    r"\bforeign\b|\bfrom elsewhere\b": (),
+    r"\bin space\b": (),
+    r"\bmeanings?\b": ("meaning",),
+    r"\bretrospective_(reference|delay_bank)\b": (),
+    r"\buntold\b|\btold\b": (),
+    r"\bhypothes[ie]s bank\b|\bmodel bank of ours\b": (),
+}

@@ -21,8 +21,8 @@ def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
         axes: number of axes of motion, 1 or 6.
 
     Example:
-        >>> from jaxhil.laws import names
-        >>> names(6)
+        >>> from jaxhil.laws import built_in_compensators
+        >>> built_in_compensators(6)
         ('none', 'phase_lead', 'phase_lead_per_axis')
     """
     folders = sorted(path.parent.name for path in _FOLDER.glob("*/simulation.py"))

@@ -104,7 +104,6 @@ class Controller:
             GainFileError: if the document is invalid.
 
         Example:
-            >>> from jaxhil.rig import Controller, digest
             >>> document = {
             ...     "schema": "jaxhil/gains/1",
             ...     "compensator": "none",

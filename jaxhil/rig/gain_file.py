@@ -49,7 +49,6 @@ def digest(document: Mapping[str, Any]) -> str:
         ValueError: if the document has numbers that JSON cannot express (NaN, infinity).
 
     Example:
-        >>> from jaxhil.rig import digest
         >>> digest({"schema": "jaxhil/gains/1"}) == digest({"schema": "jaxhil/gains/1", "created": "now"})
         True
     """

@@ -80,7 +80,7 @@ def gains() -> str:
 
 def python() -> str:
     """The functions and classes of the two front doors."""
-    homes = {f"jaxhil.{name}": f"{home}.{name}" for name, home in jaxhil._HOMES.items()}
+    homes = {f"jaxhil.{name}": f"{home}.{name}" for name, home in jaxhil._MODULES.items()}
     homes |= {f"tuning.{name}": f"tuning.api.{name}.{name}" for name in tuning.__all__}
     options = {"show_root_heading": "false", "show_root_toc_entry": "false", "heading_level": "3"}
     stated = "".join(f"\n      {option}: {value}" for option, value in options.items())

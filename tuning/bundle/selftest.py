@@ -397,9 +397,8 @@ def look_again():
     """Check this file against the manifest without the functions above, which may be damaged."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
-        own = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))["files"]["selftest.py"][
-            "sha256"
-        ]
+        manifest = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))
+        own = manifest["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
         return  # the checks above have reported
     if hashlib.sha256(read_plain_file(here, os.path.basename(__file__))).hexdigest() != own:

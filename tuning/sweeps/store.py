@@ -80,7 +80,7 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
         raise InputError(f"{where}: was made with other inputs: {'; '.join(differing[:3])}")
     if old and (differing := list_code_differences(old, manifest)):
         allowed = "a new folder, or --resume with the version that made this one"
-        raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}: allowed {allowed}")
+        raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}: expected {allowed}")
     with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with report_write_errors(folder / CHUNK_FOLDER):

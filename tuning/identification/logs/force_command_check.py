@@ -108,23 +108,21 @@ def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> N
 
 def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: str) -> str | None:
     """Raise `InputError` for another row convention; return a note if the log does not determine it."""
-    written, clear = "sent" if row == "sent" else "tick", False
+    clearest, choice = 0.0, None
     for by_way in fits.values():
-        (best_row, integrator), best = _select_best_fit(by_way)
+        way, best = _select_best_fit(by_way)
         other_rms = max(fit.rms for fit in by_way.values()) + ROUNDING_ERROR
-        # Equal errors of both conventions carry no information.
-        likelier = best.rows * np.log(other_rms / (best.rms + ROUNDING_ERROR))
-        if likelier <= MIN_LOG_LIKELIHOOD_RATIO or other_rms < MIN_ROW_ERROR_RATIO * (
-            best.rms + ROUNDING_ERROR
-        ):
-            continue
-        clear = True
-        if best_row != written:
+        likelihood_ratio = best.rows * np.log(other_rms / (best.rms + ROUNDING_ERROR))
+        # Nearly equal errors of both conventions come from rounding, and carry no information.
+        if other_rms >= MIN_ROW_ERROR_RATIO * (best.rms + ROUNDING_ERROR) and likelihood_ratio > clearest:
+            clearest, choice = likelihood_ratio, way
+    if choice is not None and clearest > MIN_LOG_LIKELIHOOD_RATIO:
+        best_row, integrator = choice
+        if best_row != ("sent" if row == "sent" else "tick"):
             raise InputError(
                 f'{label}: timing.row: found "{row}", but position_desired is what force_command makes of '
                 f'{mass:g} kg ({integrator}) in rows that are "{best_row}"'
             )
-    if clear:
         return None
     return f"{label}: timing.row: force_command is too coarse, or its stamps scatter too much, to tell it"
 
