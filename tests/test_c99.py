@@ -31,7 +31,7 @@ from jaxhil.rig import COMPENSATORS, GainFileError
 from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES
 from jaxhil.rig.faults import FAULTS, LAW_IN_DOUBT, fault_names
 from jaxhil.rig.gain_file import GainFile, check_gain_document
-from jaxhil.rig.law_status import STATUS_NAMES, STATUSES
+from jaxhil.rig.law_status import STATUS_NAMES, STATUSES, UNSTATED
 from jaxhil.rig.limits import LIMITS, complete_limits
 from tuning.bundle.c99 import generate_c99
 from tuning.bundle.c99_tables import UNUSABLE, format_double
@@ -164,6 +164,7 @@ def test_c99_rejects_delay_longer_than_delay_line_until_next_begin(law, delay, b
         assert np.all(results[:, 0] == 0.0) and np.all(
             results[:, c99_cases.RESULT.index("cause")] == UNUSABLE
         )
+        assert np.all(results[:, c99_cases.RESULT.index("law_status")] == UNSTATED)
         # The drives hold the first position read, or else that of the numerical model.
         commanded = rows[:, 0] != c99_cases.STEP_ONLY
         assert len(np.unique(results[commanded, 1])) == 1

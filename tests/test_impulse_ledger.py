@@ -6,8 +6,8 @@
 import numpy as np
 import pytest
 from c99_cases import ROW
+from law_contacts import run
 from rig_lock_step import controller
-from test_law_status import run
 
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.laws.impulse_ledger.contact_model.rig import DELAY, PARAMETERS, ContactModel, features, slope

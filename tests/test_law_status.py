@@ -1,33 +1,29 @@
 """Status of the impulse ledger, tick by tick and over a contact, and how the watchdog uses it.
 
-`pytest -m slow -s tests/test_law_status.py` prints how often an identified contact errs. The counting in C is
-compared with the one in Python.
+The counting in C is compared with the one in Python.
 """
 
 import ctypes
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import NamedTuple
 
 import c99_cases
 import numpy as np
 import pytest
-from c99_cases import ROW
 from gain_documents import gain_document
+from law_contacts import LAW, Ran, run
 from rig_lock_step import controller
 
 from jaxhil import laws
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import load, to_plain_data
+from jaxhil.mechanism.file import load
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig import Controller
 from jaxhil.rig.faults import LAW_IN_DOUBT, RESTITUTION, fault_names
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.rig.law_status import (
     IDENTIFIED,
-    MAX_DOUBTFUL_SHARE,
     NOISY,
     NOT_REACHED,
     OUT_OF_CONTACT,
@@ -42,12 +38,6 @@ from jaxhil.rig.law_status import (
     contact_record,
 )
 from jaxhil.rig.limits import NO_LIMITS
-from tuning.rig.plant import RigHardware
-from tuning.rig.udp_protocol import NumericalModel
-
-LAW = "impulse_ledger"
-AFTER = 60  # ticks that are simulated after both have left the surface
-LONGEST = 2000
 
 
 class Kind(NamedTuple):
@@ -75,40 +65,6 @@ LIMITS = {
     "no energies": WATCHED,
     "energies": {**WATCHED, "equivalent_mass": 350.0, "energy_balance": 1e-6},
 }
-
-
-class Ran(NamedTuple):
-    """Record of a contact by tick: rows of `c99_cases.ROW`, the controller's faults and the law's status."""
-
-    rows: np.ndarray
-    faults: np.ndarray
-    said: list[str]
-
-
-def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
-    """Simulate one contact in lock-step with the rig's plant, until both have been outside for a while."""
-    plant, model = RigHardware(mechanism, seed), NumericalModel(to_plain_data(mechanism))
-    period, quiet, entered = law.control_period, 0, False
-    surface = min(mechanism.rig.contact_plane, 0.0)
-    position, velocity = model.start
-    model.place(position, velocity)
-    plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
-    rows, faults, statuses = [], [], []
-    for tick in range(LONGEST):
-        force, measured = plant.read()
-        readings = [force, model.position, model.velocity, measured, tick * period]
-        command = law.step(*readings)
-        model.integrate(0.0 if tick == 0 else command)
-        motion = [model.position, model.velocity, model.acceleration]
-        plant.move(law.position_command(*motion))
-        rows.append([c99_cases.TICK, *readings, 1.0, *motion])
-        faults.append(law.faults)
-        statuses.append(law.law_status)
-        touching = readings[1] > surface or measured > surface
-        entered, quiet = entered or touching, 0 if touching else quiet + 1
-        if entered and quiet > AFTER:
-            break
-    return Ran(np.array(rows), np.array(faults), statuses)
 
 
 def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainFile]:
@@ -323,144 +279,3 @@ def test_contact_status_follows_from_status_counts(counts, status):
     assert (record.number, record.status) == (7, STATUS_NAMES[status])
     assert record.ticks == sum(counts.values()) - counts.get(OUT_OF_CONTACT, 0)
     assert record.in_doubt == (status in (UNSURE, SATURATED, TOO_SHORT, NOISY, UNEXPLAINED))
-
-
-def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = ()) -> Iterator[Mechanism]:
-    """Yield that many draws of a suite, with the changes."""
-    drawn = draw(load(f"suite-{suite}", list(changes)).mechanism, number, seed)
-    for index in range(number):
-        one = {path: values[index].tolist() for path, values in drawn.items()}
-        one["approach.phase"] = one["approach.phase"][0]
-        yield load(
-            f"suite-{suite}", [*changes, *(f"{path}={value}" for path, value in one.items())]
-        ).mechanism
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
-def test_share_of_doubtful_ticks_separates_short_contacts(suite):
-    """Print the share of ticks in doubt, and check the gap that contains `MAX_DOUBTFUL_SHARE`.
-
-    A contact is too short if the law says so on any tick.
-    """
-    contacts = 200
-    doubt, short = np.empty((2, contacts))
-    for index, mechanism in enumerate(contacts_of(suite, 5, contacts)):
-        law = controller(mechanism, LAW, literature_gains(mechanism, LAW))
-        run(mechanism, law, index)
-        record = law.last_contact
-        assert record.number == 1
-        doubts = record.unsure + record.too_short + record.noisy
-        doubt[index] = doubts / record.ticks
-        short[index] = record.too_short > 0
-    known = doubt[short == 0]
-    print(
-        f"{suite}: {len(known)} contacts that are not too short, in doubt on up to "
-        f"{np.max(known):.2f} of their ticks"
-    )
-    assert np.max(known) < MAX_DOUBTFUL_SHARE
-    if np.any(short):
-        least, most = np.quantile(doubt[short > 0], [0.0, 0.05])
-        print(f"{int(np.sum(short))} that are, on {least:.2f} and more, all but a twentieth on {most:.2f}")
-        assert most > MAX_DOUBTFUL_SHARE
-
-
-def test_contact_that_seems_to_add_energy_is_unexplained():
-    """The force is 1 ms older than specified; some errors are too small for the test of the energy alone."""
-    nominal = load("suite-noisy").mechanism
-    errors, statuses = [], []
-    for index, mechanism in enumerate(contacts_of("hardening", 6, 10, ("rig.force_sensor.delay=0.009",))):
-        law = controller(mechanism, LAW, literature_gains(nominal, LAW))
-        velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
-        errors.append(abs(abs(velocity[-1]) / velocity[0] - 1))
-        statuses.append(law.last_contact.status)
-    wrong = [status for error, status in zip(errors, statuses, strict=True) if error > 0.015]
-    assert len(wrong) > 2 and "identified" not in wrong
-
-
-class Wrong(NamedTuple):
-    """Differences from the nominal mechanism, and those of them that the controller knows."""
-
-    changes: tuple[str, ...] = ()
-    known: tuple[str, ...] = ()
-
-
-WRONG = {
-    "nothing": Wrong(),
-    "surface 1 mm deeper": Wrong(("rig.contact_plane=1e-3",)),
-    "surface 1 mm nearer": Wrong(("rig.contact_plane=-1e-3",)),
-    "force 1 ms older than specified": Wrong(("rig.force_sensor.delay=0.009",)),
-    "unmodelled sensor lag of 1 ms": Wrong(("rig.force_sensor.time_constant=1e-3",)),
-    "unmodelled sensor lag of 3 ms": Wrong(("rig.force_sensor.time_constant=3e-3",)),
-    "specified sensor lag of 3 ms": Wrong(known=("rig.force_sensor.time_constant=3e-3",)),
-    "position noise of 1 ms x v0": Wrong(known=("rig.position_sensor.noise_std=5e-6",)),
-    "force noise of 9 %, dead zone of 12 N": Wrong(
-        known=("rig.force_sensor.noise_std=2.667", "rig.force_sensor.dead_zone=12.0")
-    ),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", WRONG)
-def test_identified_contacts_hardly_ever_err(wrong):
-    """Expect few errors above 1.5 %, whatever is wrong; if nothing is wrong, 98 in 100 are identified."""
-    (changes, known), contacts = WRONG[wrong], 100
-    mechanism_known = load("suite-noisy", list(known)).mechanism
-    odd = identified = 0
-    for suite in ("noisy", "hertz", "hardening", "layered"):
-        errors, statuses = np.empty(contacts), []
-        for index, mechanism in enumerate(contacts_of(suite, 6, contacts, (*changes, *known))):
-            law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
-            velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
-            errors[index] = 100 * (abs(velocity[-1]) / velocity[0] - 1)
-            statuses.append(law.last_contact.status)
-        counts = {status: statuses.count(status) for status in sorted(set(statuses))}
-        passed = np.abs(errors[[status == "identified" for status in statuses]])
-        rms = float(np.sqrt(np.mean(errors**2)))
-        print(f"{wrong}, {suite}: error {rms:.2f} % rms, {np.max(np.abs(errors)):.2f} % at most")
-        print(f"  {counts}, identified: {np.max(passed, initial=0.0):.2f} % at most")
-        odd, identified = odd + int(np.sum(passed > 1.5)), identified + len(passed)
-    assert odd <= 0.01 * 4 * contacts
-    if not (changes or known):
-        assert identified >= 0.98 * 4 * contacts
-
-
-def restitution(mechanism: Mechanism) -> float:
-    """Return the restitution of linear damped contact that does not adhere.
-
-    Its force is 0 where the speed is largest.
-    """
-    [stiffness], [damping] = mechanism.contact.stiffness, mechanism.contact.damping
-    ratio = damping / (2 * math.sqrt(stiffness * mechanism.bodies.mass))
-    return math.exp(-ratio / math.sqrt(1 - ratio**2) * (math.pi - 2 * math.asin(ratio)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
-def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
-    """Cover a damper whose loss is offset by the unmodelled lag, so that it reads like no damper."""
-    contacts, mechanism_known = 60, load("suite-damped").mechanism
-    errors, statuses = np.empty(contacts), []
-    changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()
-    for index, mechanism in enumerate(contacts_of("damped", 6, contacts, changes)):
-        law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
-        velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
-        errors[index] = 100 * (abs(velocity[-1]) / velocity[0] - restitution(mechanism))
-        statuses.append(law.last_contact.status)
-    identified = np.array([status == "identified" for status in statuses])
-    wrong = np.sum(identified & (np.abs(errors) > 1.5))
-    print(f"damped, lag {lag:g} s: error {np.sqrt(np.mean(errors**2)):.2f} % rms, {np.sum(identified)} of")
-    print(f"  {contacts} identified, of these {wrong} wrong by more than 1.5 %")
-    assert wrong <= 0.01 * contacts
-    assert lag or np.mean(identified) >= 0.9
-
-
-@pytest.mark.slow
-def test_slow_contacts_are_identified():
-    """Run contacts of 0.4 to 1.4 Hz."""
-    changes = ("contact.stiffness=[8000.0]",)
-    mechanism_known = load("suite-noisy", list(changes)).mechanism
-    for index, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):
-        law = controller(mechanism, LAW, literature_gains(mechanism_known, LAW))
-        run(mechanism, law, index)
-        assert law.last_contact.status == "identified", index

@@ -10,10 +10,9 @@ from jax import export
 from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.rig_models import choose_rig_model
-from jaxhil.simulation import jax_environment
+from jaxhil.simulation import cached_programs, jax_environment
 from jaxhil.simulation.evaluation import run_tiles
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, build_xla_flags, supported_options
-from tuning.caches import program_cache
 from tuning.gains.multistart_solver import compile_solver
 from tuning.gains.tasks import build_task
 
@@ -67,9 +66,9 @@ def test_batch_lowers_for_cuda_without_external_calls():
 def test_tuning_lowers_for_cuda(monkeypatch):
     """Lower the whole solver; the card's own Cholesky decomposition computes its steps."""
     programs = []
-    monkeypatch.setattr(program_cache, "prepare_program", lambda *program: programs.append(program))
+    monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
     compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
-    ((function, static, arguments, _),) = programs
+    ((function, static, arguments),) = programs
     result = calls(lambda arguments: tuple(function(static, arguments)), arguments)
     assert result == CHOLESKY
 

@@ -13,10 +13,10 @@ from scipy.signal import bilinear, lfilter
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation import cached_programs
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.caches import program_cache
 from tuning.gains import pareto_search
 from tuning.gains.objective import Objective, evaluate_objective
 from tuning.gains.pareto import compute_fronts, find_dominated
@@ -56,9 +56,9 @@ def results():
 @pytest.fixture(scope="module")
 def made(results):
     """Return fronts, and the number of programs needed to solve them."""
-    program_cache._load_or_build_program.cache_clear()
+    cached_programs._programs.clear()
     every = dict(compute_fronts(results, POINTS))
-    count = program_cache._load_or_build_program.cache_info().misses
+    count = sum(key[0].__name__ == "_advance" for key in cached_programs._programs)
     return [every[index] for index in range(len(MECHANISMS))], count
 
 

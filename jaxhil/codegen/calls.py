@@ -19,6 +19,7 @@ from .subset import (
     CExpression,
     Locations,
     ValueType,
+    as_float,
     implies_sign,
 )
 
@@ -37,7 +38,7 @@ MATH_DOMAIN_ERRORS = {
 }
 INT_CONVERSIONS = {"int": "{}", "floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
 FLOAT_TESTS = ("isfinite", "isnan", "isinf")
-MAX_INT64_DOUBLE = "9223372036854774784.0"  # the largest double that an int64_t holds
+MAX_INT64_DOUBLE = "9007199254740992.0"  # LARGEST_INT
 
 
 class CallLowering(ListLowering):
@@ -45,6 +46,7 @@ class CallLowering(ListLowering):
 
     share: Callable[[ast.AST, Locations, CExpression], None]
     changed: Callable[[CExpression, bool], None]
+    replace: Callable[[ast.expr, Locations], None]
 
     def lower_attribute(self, node: ast.Attribute) -> CExpression:
         name = getattr(node.value, "id", "")
@@ -82,11 +84,8 @@ class CallLowering(ListLowering):
                 return self._record(target, node)
             raise self.refuse(node, f"{target.__name__}(...) here", "`self.name = Class(...)` in `__init__`")
         name = target if isinstance(target, str) else getattr(target, "__name__", "?")
-        return (
-            self._math(node, name)
-            if not isinstance(target, str) or name == "round"
-            else self._no_call(node, name)
-        )
+        is_unknown = isinstance(target, str) and name != "round"
+        return self._no_call(node, name) if is_unknown else self._math(node, name)
 
     def _no_call(self, node: ast.Call, name: str) -> CExpression:
         is_sum = name in ("sum", "fsum", "hypot", "pow")
@@ -124,7 +123,7 @@ class CallLowering(ListLowering):
         return self.builtin_max(node, "<")
 
     def builtin_float(self, node: ast.Call) -> CExpression:
-        return self.as_float(self.number(node.args[0]))
+        return as_float(self.number(node.args[0]))
 
     def builtin_bool(self, node: ast.Call) -> CExpression:
         return self.truth(node.args[0])
@@ -140,7 +139,7 @@ class CallLowering(ListLowering):
         return CExpression(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
 
     def builtin_int(self, node: ast.Call, form: str = "{}") -> CExpression:
-        """Lower a conversion to int, which fails for values that are not finite or beyond 2^63."""
+        """Lower a conversion to int, which fails for values that are not finite or beyond 2^53."""
         value = self.number(node.args[0])
         if value.type.kind == "int" or len(node.args) > 1:
             return value if len(node.args) == 1 else self._no_call(node, "round to digits")
@@ -162,7 +161,7 @@ class CallLowering(ListLowering):
             return self.builtin_int(node, INT_CONVERSIONS[name])
         if (name not in MATH_DOMAIN_ERRORS and name not in FLOAT_TESTS) or node.keywords:
             return self._no_call(node, name)
-        values = [self.as_float(operand) for operand in self.operands(node.args, self.number)]
+        values = [as_float(operand) for operand in self.operands(node.args, self.number)]
         reads: Locations = frozenset().union(*(operand.reads for operand in values))
         if name in FLOAT_TESTS:
             return CExpression(f"{name}({values[0].text})", BOOL, reads=reads)
@@ -210,6 +209,10 @@ class CallLowering(ListLowering):
         texts += [self.program.stored(called.parameters[name], values[name]) for name in called.parameters]
         writes = called.writes | {key for name in called.changes for key in values[name].reads}
         self.note(writes)
+        self.replace(node, called.replaced)
+        for name in [name for name in called.parameters if values[name].type.kind in ("list", "object")]:
+            if values[name].reads & called.replaced:
+                raise self.refuse(node, f"{name}, which {called.node.name} replaces", "a copy, `list(...)`")
         for name in called.changes:
             self.changed(values[name], True)
         for name in called.retained:
@@ -221,10 +224,8 @@ class CallLowering(ListLowering):
         texts += [array] * bool(array) + [self.function.error] * called.fails
         self.function.reason = self.function.reason or called.reason
         self.function.fails = self.function.fails or called.fails
-        text, reads = (
-            f"{called.name}({', '.join(texts)})",
-            called.reads | (receiver.reads if receiver else frozenset()),
-        )
+        text = f"{called.name}({', '.join(texts)})"
+        reads = called.reads | (receiver.reads if receiver else frozenset())
         if not array:
             return CExpression(
                 text, returns._replace(sign=""), ATOM, reads, writes, called.fails, returns.sign
@@ -235,13 +236,9 @@ class CallLowering(ListLowering):
 
     def _argument(self, node: ast.AST, name: str, wanted: ValueType, value: CExpression) -> ValueType:
         """Return the type that a parameter has in this call."""
-        kind = value.type.kind
-        if wanted.kind == kind == "list" and wanted.length in (None, value.type.length):
+        if wanted.kind == value.type.kind == "list" and wanted.length in (None, value.type.length):
             return value.type
-        if wanted.kind != kind and not (wanted.kind == "float" and kind == "int"):
-            raise self.refuse(node, f"a {kind} for {name}", f"a {wanted.kind}")
-        if wanted.sign and not (value.sign and implies_sign(value.sign, wanted.sign)):
-            raise self.refuse(node, f"a number of unknown sign for {name}", f"one that is {wanted.sign}")
+        self.fit(node, wanted, value, f"for {name}")
         return wanted
 
     def pointer(self, value: CExpression) -> str:

@@ -20,6 +20,7 @@ from .subset import (
     SUM,
     UNARY,
     CExpression,
+    as_float,
     implies_sign,
     sign_of,
 )
@@ -41,7 +42,17 @@ COMPARISONS = {
     ast.NotEq: ("!=", operator.ne),
 }
 HELPER_OPERATORS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
-MAX_SQUARABLE_INT = 3037000499  # largest int whose square is an int64_t
+LARGEST_INT = 2**53  # of the ints of the subset; a double holds each of them
+MAX_SQUARABLE_INT = 94906265  # largest int whose square is at most LARGEST_INT
+# A sum of these that is only compared is not tested: terms of at most LARGEST_INT cannot overflow.
+TERMS = (ast.BinOp, ast.Add, ast.Sub, ast.Name, ast.Attribute, ast.Constant, ast.expr_context)
+SMALL = 2**10  # a count that grows by this every millisecond needs 278 years to LARGEST_INT
+
+
+def is_small(value: CExpression) -> bool:
+    """Return whether adding the int again and again cannot lead beyond LARGEST_INT."""
+    has_bound = value.type.is_index or bool(value.below) or value.type.c_int != "int64_t"
+    return has_bound or (value.span is not None and max(map(abs, value.span)) <= SMALL)
 
 
 class ExpressionLowering(Lowering):
@@ -62,14 +73,6 @@ class ExpressionLowering(Lowering):
             raise self.refuse(node, f"the name {node.id}", "one that is assigned before, here or above")
         return self.program.named_constant(node.id, self.function.namespace) or self.unknown(node, node.id)
 
-    def as_float(self, value: CExpression) -> CExpression:
-        """Convert an int to a double."""
-        if value.type.kind != "int":
-            return value
-        if value.constant is not None and value.text.lstrip("-").isdigit():
-            return value._replace(text=f"{value.text}.0", type=FLOAT, constant=float(value.constant))
-        return value._replace(text=f"(double){value.at(UNARY)}", type=FLOAT, rank=UNARY)
-
     def lower_binop(self, node: ast.BinOp) -> CExpression:
         if isinstance(node.left, (ast.List, ast.Tuple)):
             return self.expression(ast.copy_location(ast.Call(ast.Name("list"), [node], []), node))
@@ -81,7 +84,7 @@ class ExpressionLowering(Lowering):
             writes = left.writes | right.writes
             return CExpression(f"{first}{mark}{right.at(UNARY)}", INT, BITS, reads, writes)
         if "float" in (left.type.kind, right.type.kind) or op in (ast.Div, ast.Pow):
-            left, right, kind = self.as_float(left), self.as_float(right), "float"
+            left, right, kind = as_float(left), as_float(right), "float"
         if op in HELPER_OPERATORS:
             return self._helped(node, left, right, kind)
         if op not in ARITHMETIC:
@@ -91,10 +94,16 @@ class ExpressionLowering(Lowering):
             right = self._divisor(node, right)
         if op is ast.Mult and kind == "int" and not (left.span and right.span):
             left, right = self.simple(left, "factor"), self.simple(right, "factor")
-            for factor in (left, right):
+            for factor, other in ((left, right), (right, left)):
                 if factor.constant is None:
-                    large = f"{factor.text} > {MAX_SQUARABLE_INT} || {factor.text} < -{MAX_SQUARABLE_INT}"
-                    self.fail_if(large, node, "a product of ints that may be beyond 2^63")
+                    limit = LARGEST_INT // max(abs(other.constant), 1) if other.span else MAX_SQUARABLE_INT
+                    self._limit(node, factor, limit, "a product of ints that may be beyond 2^53")
+        is_free = node in self.compared or is_small(left) or is_small(right)
+        if op in (ast.Add, ast.Sub) and kind == "int" and not is_free:
+            left, right = self.simple(left, "term"), self.simple(right, "term")
+            total = self.temporary(CExpression(f"{left.text} {mark} {right.text}", INT, SUM, reads), "total")
+            self._limit(node, total, LARGEST_INT, "a sum of ints that may be beyond 2^53")
+            return total
         constants, span, constant = (left.constant, right.constant), None, None
         if op is not ast.Div and all(isinstance(constant, (int, float)) for constant in constants):
             constant = compute(*constants)
@@ -108,6 +117,10 @@ class ExpressionLowering(Lowering):
         return CExpression(
             text, type_, rank, reads, left.writes | right.writes, False, sign, span, "", constant
         )
+
+    def _limit(self, node: ast.AST, value: CExpression, limit: int, reason: str) -> None:
+        """Emit a test that the magnitude of an int is at most `limit`."""
+        self.fail_if(f"{value.text} > {limit} || {value.text} < -{limit}", node, reason)
 
     def _sign(self, op: ast.operator, left: CExpression, right: CExpression) -> str:
         if not {left.sign, right.sign} <= {"> 0", ">= 0"}:
@@ -138,9 +151,8 @@ class ExpressionLowering(Lowering):
             right = self._divisor(node, right)
             sign = right.sign if name.startswith("modulo") and right.sign in ("> 0", ">= 0") else ""
             text = self.program.helper(name, left.text, right.text)
-            return CExpression(
-                text, left.type._replace(sign=""), reads=left.reads | right.reads, sign=sign and ">= 0"
-            )
+            type_, reads = left.type._replace(sign=""), left.reads | right.reads
+            return CExpression(text, type_, reads=reads, sign=sign and ">= 0")
         left, right = self.simple(left, "base"), self.simple(right, "exponent")
         value = self.temporary(CExpression(self.program.helper(name, left.text, right.text), FLOAT), "power")
         base, exponent = left.text, right.text
@@ -182,6 +194,9 @@ class ExpressionLowering(Lowering):
             name = ast.Name("in")
             parts: list[ast.expr] = [ast.Compare(name, [kind()], [item]) for item in comparator.elts]
             return self.expression(ast.fix_missing_locations(ast.BoolOp(joint(), parts)))
+        for operand in (node.left, *node.comparators):
+            if all(isinstance(part, TERMS) for part in ast.walk(operand)):
+                self.compared += [part for part in ast.walk(operand) if isinstance(part, ast.BinOp)]
         values = self.operands([node.left, *node.comparators])
         if len(values) > 2:
             values[1:-1] = [self.simple(middle, "middle") for middle in values[1:-1]]
@@ -189,15 +204,14 @@ class ExpressionLowering(Lowering):
         for mark, left, right in zip(node.ops, values, values[1:], strict=False):
             kinds = {left.type.kind, right.type.kind}
             if type(mark) not in COMPARISONS or not (kinds == {"bool"} or kinds <= {"int", "float"}):
-                raise self.refuse(
-                    node, f"{type(mark).__name__} of {left.type.kind}", "a comparison of numbers"
-                )
+                found = f"{type(mark).__name__} of {left.type.kind}"
+                raise self.refuse(node, found, "a comparison of numbers")
             text, compare = COMPARISONS[type(mark)]
             if left.constant is not None and right.constant is not None:
                 parts_.append(self.program.literal(compare(left.constant, right.constant)))
                 continue
             if len(kinds) > 1:
-                left, right = self.as_float(left), self.as_float(right)
+                left, right = as_float(left), as_float(right)
             rank = EQUALITY if text in ("==", "!=") else RELATION
             writes = left.writes | right.writes
             text = f"{left.at(SUM)} {text} {right.at(SUM)}"
@@ -217,11 +231,10 @@ class ExpressionLowering(Lowering):
 
     def _together(self, parts: list[CExpression], is_and: bool) -> CExpression:
         """Join conditions by `and` or `or`."""
-        if any(part.constant is not None and part.constant != is_and for part in parts):
-            index = next(
-                i for i, part in enumerate(parts) if part.constant is not None and part.constant != is_and
-            )
-            parts = parts[: index + 1] if any(part.writes for part in parts[:index]) else [parts[index]]
+        decided = [i for i, part in enumerate(parts) if part.constant is not None and part.constant != is_and]
+        if decided:
+            is_kept = any(part.writes for part in parts[: decided[0]])
+            parts = parts[0 if is_kept else decided[0] : decided[0] + 1]
         parts = [part for part in parts if part.constant is None or len(parts) == 1]
         if len(parts) < 2:
             return parts[0] if parts else self.program.literal(is_and)
@@ -261,7 +274,7 @@ class ExpressionLowering(Lowering):
         if body.type.kind == "text":
             return body
         if {body.type.kind, orelse.type.kind} == {"int", "float"}:
-            body, orelse = self.as_float(body), self.as_float(orelse)
+            body, orelse = as_float(body), as_float(orelse)
         if body.type.kind != orelse.type.kind or body.type.kind not in ("int", "float", "bool"):
             raise self.refuse(node, f"{body.type.kind} or {orelse.type.kind}", "two numbers of one type")
         sign = common([body.sign, orelse.sign])

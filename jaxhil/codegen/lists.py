@@ -69,9 +69,8 @@ class ListLowering(ExpressionLowering):
         """Copy a list to another list."""
         length = source.type.length
         if length is None or target.type.length != length:
-            raise self.refuse(
-                node, f"{length or 'any number of'} elements", f"a list of {target.type.length}"
-            )
+            found = f"{length or 'any number of'} elements"
+            raise self.refuse(node, found, f"a list of {target.type.length}")
         with self._each(str(length)) as index:
             left, right = (CExpression(f"{value.text}[{index}]", value.type.of) for value in (target, source))
             if left.type.kind == "list":
@@ -162,9 +161,8 @@ class ListLowering(ExpressionLowering):
             counts = {loop.count for loop in loops}
             strict = any(k.arg == "strict" and getattr(k.value, "value", 0) for k in node.keywords)
             if None in counts or (strict and len(counts) > 1):
-                raise self.refuse(
-                    node, f"{called} of lists of {counts} elements", "lists of one fixed length"
-                )
+                found = f"{called} of lists of {counts} elements"
+                raise self.refuse(node, found, "lists of one fixed length")
             count = min(number for number in counts if number is not None)
             parts = [loop.values for loop in loops]
             if called == "enumerate":
@@ -180,9 +178,8 @@ class ListLowering(ExpressionLowering):
         if value.type.kind != "list":
             raise self.refuse(node, f"a loop through a {value.type.kind}", "a list, range, zip or enumerate")
         count = value.type.length
-        return LoopRange(
-            "0", str(count or value.length), lambda i: [self.at(value, i)], count, constants=constants
-        )
+        stop = str(count or value.length)
+        return LoopRange("0", stop, lambda i: [self.at(value, i)], count, constants=constants)
 
     def _range(self, node: ast.Call) -> LoopRange:
         bounds = self.operands(node.args, self.number)

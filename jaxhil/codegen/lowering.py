@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .printing import escape_comment
 from .python_source import read_comment_before
-from .subset import BOOL, EQUALITY, RELATION, TEXT, CExpression, Locations, SubsetError, implies_sign
+from .subset import (
+    BOOL,
+    EQUALITY,
+    RELATION,
+    TEXT,
+    CExpression,
+    Locations,
+    SubsetError,
+    ValueType,
+    implies_sign,
+    refusal,
+)
 
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
@@ -34,11 +45,12 @@ class Lowering:
         self.lines: list[str] = []
         self.failures = 0  # number of tests so far that may leave the function
         self.effects: list[Locations] = []  # what calls have changed so far
+        self.compared: list[ast.expr] = []  # sums whose value is only compared
 
     def refuse(self, node: ast.AST, found: str, expected: str) -> SubsetError:
         """Return the error for a construct outside the subset."""
         line = getattr(node, "lineno", self.function.node.lineno)
-        return SubsetError(f"{self.function.file}:{line}: found {found}, expected {expected}")
+        return refusal(self.function.file, line, found, expected)
 
     def emit(self, *lines: str) -> None:
         """Add lines; `printing` indents them."""
@@ -107,6 +119,14 @@ class Lowering:
             return value
         sign = value.sign if value.sign and implies_sign(value.sign, fact.sign) else fact.sign
         return value._replace(sign=sign, span=fact.span or value.span)
+
+    def fit(self, node: ast.AST, wanted: ValueType, value: CExpression, use: str, expected: str = "") -> None:
+        """Raise SubsetError unless a value has the wanted type and sign."""
+        is_same = (wanted.kind, wanted.of) == (value.type.kind, value.type.of)
+        if not is_same and not (wanted.kind == "float" and value.is_number):
+            raise self.refuse(node, f"a {value.type.kind} {use}", expected or f"a {wanted.kind}")
+        if not implies_sign(value.sign, wanted.sign):
+            raise self.refuse(node, f"a number of unknown sign {use}", f"one that is {wanted.sign}")
 
     def number(self, node: ast.expr) -> CExpression:
         """Lower an expression that has to be a number."""

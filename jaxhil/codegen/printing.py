@@ -80,8 +80,5 @@ def _break_line(line: str) -> str:
     if not breaks:
         return line
     index = max(breaks)[1]
-    return (
-        line[:index].rstrip()
-        + "\n"
-        + _break_line(indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip())
-    )
+    rest = indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip()
+    return f"{line[:index].rstrip()}\n{_break_line(rest)}"

@@ -23,6 +23,8 @@ from .subset import (
     Locations,
     SubsetError,
     ValueType,
+    as_float,
+    refusal,
     sign_of,
     type_of_annotation,
 )
@@ -37,10 +39,9 @@ class CFunction:
         self.node, self.file = find_definition(function)
         self.function, self.owner, self.returns = function, owner, types["return"]
         self.namespace = {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
-        self.parameters = {
-            name: type_ for name, type_ in types.items() if type_.kind != "text" and name != "return"
-        }
-        self.texts = [name for name, type_ in types.items() if type_.kind == "text" and name != "return"]
+        types = {name: type_ for name, type_ in types.items() if name != "return"}
+        self.parameters = {name: type_ for name, type_ in types.items() if type_.kind != "text"}
+        self.texts = [name for name in types if name not in self.parameters]
         self.places = find_name_lines(self.node)
         names = {node.id for node in ast.walk(self.node) if isinstance(node, ast.Name)} | {*types, "self"}
         self.taken = {f"{name}_" if name in C_RESERVED_WORDS else name for name in names} | C_RESERVED_WORDS
@@ -49,6 +50,7 @@ class CFunction:
         self.changes: set[str] = set()  # parameters whose lists it changes
         self.retained: dict[str, Locations] = {}  # parameters whose lists it assigns to attributes
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
+        self.replaced: Locations = frozenset()  # attributes to which it assigns another list or object
         self.fails, self.reason = False, ""  # whether it may fail; file, line and reason
         self.name, self.error = "", "error"
         self.lines: list[str] = []
@@ -96,18 +98,15 @@ class CProgram(StructLowering):
 
     def parameters(self, function: Callable[..., Any], owner: type | None) -> dict[str, ValueType]:
         """Return the types of a function's parameters and of its result ("return")."""
-        hints = find_annotations(
-            function, next((protocol for protocol, bound in self.bindings.items() if bound is owner), None)
-        )
+        protocols = [protocol for protocol, bound in self.bindings.items() if bound is owner]
+        hints = find_annotations(function, *protocols[:1])
         types = {}
         for name in [*inspect.signature(function).parameters, "return"]:
             type_ = type_of_annotation(hints.get(name, None if name == "return" else ...), self.bindings)
             if type_ is None and name != "self":
                 node, file = find_definition(function)
                 what = f"no type in C for {name} of {function.__name__}"
-                raise SubsetError(
-                    f"{file}:{node.lineno}: found {what}, expected an annotation: float, int, bool..."
-                )
+                raise refusal(file, node.lineno, what, "an annotation: float, int, bool...")
             if name != "self" and type_ is not None:
                 types[name] = type_
         return types
@@ -129,10 +128,8 @@ class CProgram(StructLowering):
             result.name = self._name(result)
             result.lines = BodyLowering(self, result).run()
             self.under_way.pop()
-            result.writes, result.reads = (
-                frozenset(access for access in keys if access[0] not in ("local", "parameter"))
-                for keys in (result.writes, result.reads)
-            )
+            inner = {key for key in result.writes | result.reads if key[0] in ("local", "parameter")}
+            result.writes, result.reads = result.writes - inner, result.reads - inner
             if any(type_.kind == "list" and type_.of.kind == "list" for type_ in result.parameters.values()):
                 # In C a matrix cannot be passed as a pointer to constant arrays.
                 result.writes |= {("matrix", "")}
@@ -208,8 +205,7 @@ class CProgram(StructLowering):
         if wanted.kind == "object":
             return value.text if value.is_pointer else f"&{value.text}"
         if wanted.kind == "float" and value.type.kind == "int":
-            is_literal = value.constant is not None and value.text.lstrip("-").isdigit()
-            return f"{value.text}.0" if is_literal else f"(double){value.at(UNARY)}"
+            return as_float(value).text
         is_cast = wanted.kind == "int" and wanted.c_int not in ("int64_t", value.type.c_int)
         return f"({wanted.c_int}){value.at(UNARY)}" if is_cast and value.constant is None else value.text
 
@@ -222,9 +218,8 @@ class CProgram(StructLowering):
         public = [function for function in lowered if function.function in self.public]
         for function in public:
             if function.fails:
-                raise SubsetError(
-                    f"{function.reason} within {function.name}, expected what cannot raise, or try around it"
-                )
+                found = f"{function.reason} within {function.name}"
+                raise SubsetError(f"{found}, expected what cannot raise, or try around it")
         prototypes = (f"\n{format_comment(ast.get_docstring(f.node))}{self._signature(f)};\n" for f in public)
         structs = self.structs([function.owner for function in lowered if function.owner])
         functions = "".join(self._definition(function) for function in lowered)
@@ -244,16 +239,14 @@ class CProgram(StructLowering):
             for name in self.samples_in(function.owner):
                 is_first = function.node.name == "__init__"
                 parts += [f"{constant}double *{name}"] + [f"int64_t {name}_capacity"] * is_first
-        parts += [
-            self._parameter(function, self.local(name), name, type_)
-            for name, type_ in function.parameters.items()
-        ]
+        parts += [self._parameter(function, name, type_) for name, type_ in function.parameters.items()]
         parts += [f"{self.c_type(function.returns.of)} *result"] if function.returns.kind == "list" else []
         parts += ["bool *error"] if function.fails else []
         static = "" if function.function in self.public else "static "
         return f"{static}{self.c_type(function.returns)} {function.name}({', '.join(parts) or 'void'})"
 
-    def _parameter(self, function: CFunction, local: str, name: str, type_: ValueType) -> str:
+    def _parameter(self, function: CFunction, name: str, type_: ValueType) -> str:
+        local = self.local(name)
         if type_.kind == "list" and type_.of.kind == "list":
             return f"{self.c_type(type_.of.of)} (*{local})[{type_.of.length}]"
         if type_.kind == "list":

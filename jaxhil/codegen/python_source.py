@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from .subset import SubsetError
+from .subset import refusal
 
 
 @cache
@@ -29,14 +29,12 @@ def find_definition(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]
     except (OSError, SyntaxError, ValueError):
         node = None
     if not isinstance(node, ast.FunctionDef):
-        location = f"{code.co_filename}:{code.co_firstlineno}"
-        raise SubsetError(
-            f"{location}: found no source of {function.__qualname__}, expected a function in a file"
-        )
+        found = f"no source of {function.__qualname__}"
+        raise refusal(code.co_filename, code.co_firstlineno, found, "a function in a file")
     return node, code.co_filename
 
 
-def find_annotations(function: Callable[..., Any], protocol: type | None) -> dict[str, Any]:
+def find_annotations(function: Callable[..., Any], protocol: type | None = None) -> dict[str, Any]:
     """Return the annotations of a function; those of the protocol's method take precedence."""
     method = vars(protocol).get(function.__name__) if protocol is not None else None
     method = method.fget if isinstance(method, property) else method

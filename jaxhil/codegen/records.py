@@ -92,11 +92,9 @@ class StructLowering:
             return None
         owners = [owner for owner in class_.__mro__ if owner.__module__ not in ("builtins", "typing")]
         methods = [value for owner in owners for value in vars(owner).values() if inspect.isfunction(value)]
-        nodes = (node for method in methods for node in ast.walk(find_definition(method)[0]))
-        if any(
-            isinstance(node, ast.Attribute) and node.attr == name and isinstance(node.ctx, ast.Store)
-            for node in nodes
-        ):
+        nodes = [node for method in methods for node in ast.walk(find_definition(method)[0])]
+        attributes = [node for node in nodes if isinstance(node, ast.Attribute) and node.attr == name]
+        if any(isinstance(node.ctx, ast.Store) for node in attributes):
             return None
         try:
             source = inspect.getsource(next(owner for owner in owners if name in vars(owner)))
@@ -109,21 +107,19 @@ class StructLowering:
 
     def field_type(self, body: "Lowering", type_: ValueType, name: str, node: ast.AST) -> ValueType:
         """Return the annotated type of an attribute. Raise SubsetError if there is none."""
-        hinted = type_of_annotation(self._hints(type_.of).get(name, ...), self.bindings)
+        hints = typing.get_type_hints(type_.of, include_extras=True)
+        hinted = type_of_annotation(hints.get(name, ...), self.bindings)
         if hinted is None:
             what = f"{name} of {type_.of.__name__}, whose type is not known here"
             raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
         return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
-
-    def _hints(self, class_: type) -> dict[str, Any]:
-        return typing.get_type_hints(class_, include_extras=True)
 
     def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:
         """Return an attribute, None if its type is not known yet."""
         class_, name = owner.type.of, target.attr
         if owner.type.kind != "object":
             raise body.refuse(target, f"an attribute of a {owner.type.kind}", "an object")
-        fields = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *self._hints(class_)}
+        fields = {*self.samples.get(class_, ()), *self.fields.get(class_, {}), *typing.get_type_hints(class_)}
         return self.field(body, owner, name, target) if name in fields else None
 
     def new_field(
@@ -169,9 +165,8 @@ class StructLowering:
             key = str(first.slice.value)
         for name in self.samples_in(class_):
             if not key or body.function.owner is None or not target.text.startswith("self->"):
-                raise body.refuse(
-                    node, "a line of unknown length", "`Annotated[DelayLine, 'name of the gain']`"
-                )
+                expected = "`Annotated[DelayLine, 'name of the gain']`"
+                raise body.refuse(node, "a line of unknown length", expected)
             array = f"{target.text}_{name}"
             self.owned.setdefault(body.function.owner, {})[array.removeprefix("self->")] = key
             arguments += [array, f"{self.prefix}{key}_samples".upper()]

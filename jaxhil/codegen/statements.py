@@ -1,12 +1,13 @@
 """Lowering of statements: assignments, branches, loops, exceptions."""
 
 import ast
+import re
 from typing import TYPE_CHECKING
 
 from .calls import CallLowering
 from .lists import has_text
 from .lowering import NumberFact
-from .subset import ATOM, FLOAT, INT, TEXT, UNARY, CExpression, Locations, ValueType, implies_sign
+from .subset import ATOM, FLOAT, INT, TEXT, UNARY, CExpression, Locations, ValueType
 
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
@@ -19,6 +20,9 @@ class BodyLowering(CallLowering):
         super().__init__(program, function)
         self.span = (0, 0)  # lines of the block
         self.hoisted: list[str] = []  # declarations at the function's top
+        self.aliases: list[
+            tuple[str, CExpression, int]
+        ] = []  # other names of lists and objects, last line of use
         for name, type_ in function.parameters.items():
             text, is_list = program.local(name), type_.kind == "list"
             reads: Locations = frozenset({("parameter", name)}) if is_list else frozenset()
@@ -47,9 +51,8 @@ class BodyLowering(CallLowering):
                 self.explain(statement)
                 lower = getattr(self, f"do_{type(statement).__name__.lower()}", None)
                 if lower is None:
-                    raise self.refuse(
-                        statement, type(statement).__name__, "assignments, if, for, while, return"
-                    )
+                    expected = "assignments, if, for, while, return"
+                    raise self.refuse(statement, type(statement).__name__, expected)
                 leaves = bool(lower(statement)) or leaves
         self.span = outer
         return leaves
@@ -102,6 +105,7 @@ class BodyLowering(CallLowering):
             owner = self.expression(target.value)
             field = self.program.new_field(self, owner, target, ValueType("object", class_))
             self.construct(field, class_, source)
+            self.replace(node, field.reads)
         elif self.is_display(source):
             self._assign_list(node, target, source)
         else:
@@ -116,9 +120,13 @@ class BodyLowering(CallLowering):
         places = self.function.places[target.id]
         is_local = all(self.span[0] <= line <= self.span[1] for line, _ in places)
         if target.id in self.names or sum(is_store for _, is_store in places) > 1 or not is_local:
-            raise self.refuse(
-                node, f"{target.id} assigned twice", "one name for each list or object, in a block"
-            )
+            expected = "one name for each list or object, in a block"
+            raise self.refuse(node, f"{target.id} assigned twice", expected)
+        uses, tree = [line for line, _ in places], ast.walk(self.function.node)
+        loops = [n for n in tree if isinstance(n, (ast.For, ast.While)) and n.lineno > target.lineno]
+        # A use in a loop comes again after the last statement of the loop.
+        uses += [(loop.end_lineno or 0) + 1 for loop in loops if loop.lineno <= uses[-1]]
+        self.aliases.append((target.id, value, max(uses)))
         name, type_ = self.program.local(target.id), value.type
         is_own = type_.kind == "list" and any(key[0] == "local" for key in value.reads)
         if not is_own and not (type_.kind == "list" and type_.of.kind == "list"):
@@ -128,6 +136,15 @@ class BodyLowering(CallLowering):
                 self.emit(f"@const@{base} *const {name} = {text};")
             value = value._replace(text=name, is_pointer=True, rank=ATOM)
         self.names[target.id] = value
+
+    def replace(self, node: ast.stmt | ast.expr, keys: Locations, of_element: bool = False) -> None:
+        """Record attributes that get another list or object, which their other names do not get in Python."""
+        self.function.replaced |= keys
+        for name, value, last in self.aliases:
+            is_outer = of_element and value.type.kind == "list" and value.type.of.kind == "list"
+            if value.reads & keys and not is_outer and last > (node.end_lineno or 0):
+                expected = f"`[:] = ` in place, or a copy, `{name} = list(...)`"
+                raise self.refuse(node, f"another list or object than that of {name}", expected)
 
     def _assign_list(self, node: ast.stmt, target: ast.expr, source: ast.expr) -> None:
         if isinstance(target, ast.Name):
@@ -147,6 +164,7 @@ class BodyLowering(CallLowering):
         if field is None or field.type.kind != "list":
             raise self.refuse(node, "a list for an element", "a number")
         self.array(source, field)
+        self._replace_at(node, target, field)
         self.changed(field, isinstance(target, ast.Subscript))
 
     def _store(
@@ -168,6 +186,7 @@ class BodyLowering(CallLowering):
             raise self.refuse(node, "this target", "a name, an attribute or an element")
         if field.type.kind == "list":
             self.copy(field, value, node)
+            self._replace_at(node, target, field)
             self.share(node, field.reads, value)
         elif field.type.kind != "text":
             self._emit_store(node, field, value)
@@ -175,21 +194,18 @@ class BodyLowering(CallLowering):
         if value.sign:
             self.facts[field.text] = NumberFact(value.sign, field.reads)
 
+    def _replace_at(self, node: ast.stmt, target: ast.expr, field: CExpression) -> None:
+        """Record the replacement of a list by an assignment, unless it is one in place."""
+        if not (isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice)):
+            self.replace(node, field.reads, isinstance(target, ast.Subscript))
+
     def _emit_store(self, node: ast.stmt, field: CExpression, value: CExpression) -> None:
-        wanted, source = field.type, value.type
-        if (wanted.kind, wanted.of) != (source.kind, source.of) and not (
-            wanted.kind == "float" and value.is_number
-        ):
-            raise self.refuse(node, f"a {source.kind} for a {wanted.kind}", "one type for each name")
-        if wanted.sign and not (value.sign and implies_sign(value.sign, wanted.sign)):
-            raise self.refuse(node, "a number of unknown sign", f"one that is {wanted.sign}")
-        text = self.program.stored(wanted, value)
-        if text[: len(field.text) + 1] == f"{field.text} " and text[len(field.text) + 1 :][1:2] == " ":
-            rest = text[len(field.text) + 1 :]
-            if rest[0] in "+-*/&|^" and isinstance(node, ast.AugAssign):
-                self.emit(f"{field.text} {rest[0]}= {rest[2:]};")
-                return
-        if text != field.text:
+        self.fit(node, field.type, value, f"for a {field.type.kind}", "one type for each name")
+        text = self.program.stored(field.type, value)
+        own = re.match(rf"{re.escape(field.text)} ([-+*/&|^]) ", text)
+        if own and isinstance(node, ast.AugAssign):
+            self.emit(f"{field.text} {own[1]}= {text[own.end() :]};")
+        elif text != field.text:
             self.emit(f"{field.text} = {text};")
 
     def _store_name(self, node: ast.stmt, name: str, value: CExpression, wanted: ValueType | None) -> None:
@@ -199,9 +215,8 @@ class BodyLowering(CallLowering):
             type_ = wanted or value.type._replace(c_int="int64_t", sign="")
             declared = f"{self.program.c_type(type_)} {text}"
             is_once = sum(is_store for _, is_store in places) == 1
-            is_here = places[0][0] >= node.lineno and all(
-                self.span[0] <= line <= self.span[1] for line, _ in places
-            )
+            first, last = max(self.span[0], node.lineno), self.span[1]
+            is_here = all(first <= line <= last for line, _ in places)
             zero = {"float": " = 0.0", "int": " = 0", "bool": " = false"}.get(type_.kind, "")
             if is_here:
                 head = "const " if is_once else ""
@@ -257,14 +272,8 @@ class BodyLowering(CallLowering):
         return True
 
     def _return(self, node: ast.stmt, value: CExpression) -> None:
+        self.fit(node, self.function.returns, value, "returned")
         self.emit(f"return {self.program.stored(self.function.returns, value)};")
-        returns = self.function.returns
-        if (returns.kind, returns.of) != (value.type.kind, value.type.of) and not (
-            returns.kind == "float" and value.is_number
-        ):
-            raise self.refuse(node, f"a {value.type.kind} returned", f"a {returns.kind}")
-        if returns.sign and not (value.sign and implies_sign(value.sign, returns.sign)):
-            raise self.refuse(node, "a number of unknown sign", f"one that is {returns.sign}")
 
     def do_raise(self, node: ast.Raise) -> bool:
         self.fail(node, "a raise")
@@ -281,13 +290,8 @@ class BodyLowering(CallLowering):
             outer, self.lines = self.lines, []
             leaves = self.block(body)
             inner, self.lines = self.lines, outer
-            if (
-                not truth
-                and inner
-                and inner[0].startswith("if (")
-                and isinstance(body[0], ast.If)
-                and len(body) == 1
-            ):
+            is_chain = not truth and len(body) == 1 and isinstance(body[0], ast.If)
+            if is_chain and inner and inner[0].startswith("if ("):
                 self.emit(f"}} else {inner[0]}", *inner[1:-1])
             else:
                 self.emit(*["} else {"] * bool(inner and not truth), *inner)
@@ -317,11 +321,13 @@ class BodyLowering(CallLowering):
                 self.emit(f"{constant}{self.program.c_type(value.type)} {text} = {value.text};")
                 value = value._replace(text=text, reads=frozenset(), rank=ATOM)
             self.names[name] = value
+        before = len(self.aliases)
+        self.aliases += [("the loop", value, (node.end_lineno or 0) + 1) for value in loop.values(index)]
         self.block(node.body)
+        del self.aliases[before:]
         self.emit("}")
-        self.names = {k: value for k, value in self.names.items() if k not in names} | {
-            name: hidden[name] for name in names if name in hidden
-        }
+        others = {name: value for name, value in self.names.items() if name not in names}
+        self.names = others | {name: hidden[name] for name in names if name in hidden}
         self.facts = {}
 
     def do_while(self, node: ast.While) -> None:
@@ -334,13 +340,11 @@ class BodyLowering(CallLowering):
         self.emit("}")
         self.facts = {}
 
-    def do_break(self, node: ast.Break) -> bool:
-        self.emit("break;")
+    def do_break(self, node: ast.Break | ast.Continue) -> bool:
+        self.emit("break;" if isinstance(node, ast.Break) else "continue;")
         return True
 
-    def do_continue(self, node: ast.Continue) -> bool:
-        self.emit("continue;")
-        return True
+    do_continue = do_break
 
     def do_try(self, node: ast.Try) -> bool:
         """Lower a call whose exceptions are caught."""

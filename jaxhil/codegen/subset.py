@@ -10,8 +10,8 @@ class is a struct. Values of type `str` have no equivalent in C and are omitted.
     Annotated[DelayLine, "lag"]         its samples have the capacity JAXHIL_LAG_SAMPLES
 
 Exceptions of Python become an error flag: a function that may raise tests the operands (divisors, square
-roots, indices, conversions to int) and returns at once. Sums of ints are not tested, because counts do not
-reach 2^63.
+roots, indices, conversions to int, products and sums of ints) and returns at once. An int ends at 2^53,
+which counts do not reach: sums with a small term are not tested.
 """
 
 import types
@@ -73,6 +73,20 @@ class CExpression(NamedTuple):
     def is_number(self) -> bool:
         """Return whether the value is a float or an int."""
         return self.type.kind in ("float", "int")
+
+
+def as_float(value: CExpression) -> CExpression:
+    """Convert an int to a double."""
+    if value.type.kind != "int":
+        return value
+    if value.constant is not None and value.text.lstrip("-").isdigit():
+        return value._replace(text=f"{value.text}.0", type=FLOAT, constant=float(value.constant))
+    return value._replace(text=f"(double){value.at(UNARY)}", type=FLOAT, rank=UNARY)
+
+
+def refusal(file: str, line: int, found: str, expected: str) -> SubsetError:
+    """Return the error for a construct outside the subset."""
+    return SubsetError(f"{file}:{line}: found {found}, expected {expected}")
 
 
 def type_of_annotation(hint: Any, bindings: Mapping[Any, Any]) -> ValueType | None:

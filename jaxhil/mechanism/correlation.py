@@ -23,12 +23,10 @@ import numpy as np
 
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyProblem, suggest_names
-from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.six_axes import AnyMechanism
 from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
-
-AnyMechanism = Mechanism | SixAxisMechanism
 
 MIN_EIGENVALUE = 1e-10  # a matrix with a smaller eigenvalue does not count as positive definite
 

@@ -21,7 +21,7 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism import rules as mechanism_rules
 from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_mechanism, to_struct
 from jaxhil.mechanism.overrides import apply_override, parse_override
-from jaxhil.mechanism.six_axes import SIX_AXIS_SCHEMA, SixAxisMechanism, is_six_axes
+from jaxhil.mechanism.six_axes import SIX_AXIS_SCHEMA, AnyMechanism, SixAxisMechanism, is_six_axes
 from jaxhil.mechanism.six_axes_rules import check_contact_names, check_leg_values, check_six_axes
 from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
@@ -46,7 +46,6 @@ __all__ = [
 DEFAULT_MECHANISM = "varying"
 
 Overrides = Sequence[str] | Mapping[str, Any]
-AnyMechanism = Mechanism | SixAxisMechanism
 MechanismType = TypeVar("MechanismType", Mechanism, AnyMechanism)
 
 SUITE_PREFIX = "suite-"  # prefix of the names of the standard suites

@@ -25,13 +25,11 @@ from jaxhil.mechanism.structs import (
     Mechanism,
     Simulator,
     Uncertainty,
-    numeric_keys,
     value_at,
 )
 from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
 __all__ = [
-    "FIXED_KEYS",
     "KEYS_OF_MODELS",
     "check_contact_law",
     "check_mechanism_rules",
@@ -51,7 +49,6 @@ KEYS_OF_MODELS = {
     "transfer_function": ("numerator", "denominator"),
 }
 _ALL_MODEL_KEYS = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
-FIXED_KEYS = ("rig.simulator.numerator", "rig.simulator.denominator")
 
 
 def check_mechanism_rules(mechanism: Mechanism) -> None:
@@ -61,7 +58,7 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
     check_contact_law(("contact",), mechanism.contact, mechanism.uncertainty, CONTACT_KEYS.values())
     check_simulator_model(mechanism.rig.simulator)
     _check_hold(mechanism)
-    spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
+    spans = {path: check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
     check_correlation(mechanism)
     _check_velocity_limit(mechanism, spans)
     _check_gap(mechanism, spans)
@@ -291,17 +288,3 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
         *_, lead, gain = 0.0, *(simulator.numerator or [])
         return slope / value - lead / gain
     return 0.0
-
-
-def _check_uncertainty(mechanism: Mechanism, path: str) -> Span:
-    """Return the least and greatest values of an uncertain key. Raise `KeyProblem` for invalid draws."""
-    low, high = check_uncertainty(mechanism, path, numeric_keys(), FIXED_KEYS)
-    where, independent = ("uncertainty", path), mechanism.uncertainty[path].independent
-    if path == "contact.depths" and independent and np.any(high[:-1] >= low[1:]):
-        raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
-    if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
-        largest = high[2] if independent else low[2]
-        if not low[0] * low[1] > largest:
-            allowed = "a stable motion simulator throughout: a1 a2 > a3"
-            raise KeyProblem(where, "values for which it is not stable", allowed)
-    return low, high

@@ -33,16 +33,19 @@ from jaxhil.mechanism.structs import (
     STIFFNESS_UNITS,
     ContactLawName,
     Correlation,
+    Mechanism,
     Range,
     Slopes,
     Stiffness,
     Uncertainty,
+    numeric_keys,
     ranges_of,
 )
 
 __all__ = [
     "KEYS_IN_SIX_AXES",
     "SIX_AXIS_SCHEMA",
+    "AnyMechanism",
     "Approach",
     "BodyState",
     "Contact",
@@ -301,13 +304,18 @@ class SixAxisMechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     correlation: Annotated[Correlation, key_metadata("correlation of the uncertain numbers")] | None = None
 
 
+AnyMechanism = Mechanism | SixAxisMechanism
+
+
 def is_six_axes(raw: object) -> bool:
     """Return whether a raw table has the six-axis schema."""
     return isinstance(raw, Mapping) and raw.get("schema") == SIX_AXIS_SCHEMA
 
 
-def numeric_keys_of(mechanism: SixAxisMechanism) -> dict[str, Range]:
+def numeric_keys_of(mechanism: AnyMechanism) -> dict[str, Range]:
     """Return the allowed values of every real-valued key that the mechanism may have, by dotted path."""
+    if isinstance(mechanism, Mechanism):
+        return numeric_keys()
     return numeric_keys_with(tuple(mechanism.contact), tuple(mechanism.latch))
 
 

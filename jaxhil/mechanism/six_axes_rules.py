@@ -15,8 +15,8 @@ import numpy as np
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyPath, KeyProblem
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.rules import FIXED_KEYS, KEYS_OF_MODELS, check_simulator_model, check_texts
-from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start, numeric_keys_of
+from jaxhil.mechanism.rules import KEYS_OF_MODELS, check_simulator_model, check_texts
+from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start
 from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
 from jaxhil.mechanism.six_axes_rig import PER_AXIS_KEYS, Inertia, Rig, Simulator
 from jaxhil.mechanism.uncertainty_rules import check_uncertainty
@@ -250,21 +250,14 @@ def _check_sensor(rig: Rig) -> None:
 
 def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
     """Check that all draws of an uncertain key are valid. Raise `KeyProblem`."""
-    low, high = check_uncertainty(mechanism, path, numeric_keys_of(mechanism), FIXED_KEYS)
+    low, high = check_uncertainty(mechanism, path)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
         allowed = "false, or three moments: rows drawn apart are not symmetric"
         raise KeyProblem((*where, "independent"), "true", allowed)
     if path.endswith(".stiffness_matrix") and uncertainty.independent:
         raise KeyProblem((*where, "independent"), "true", "false: entries drawn apart are not symmetric")
-    if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
-        raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
     if path == "rig.simulator.stroke" and uncertainty.independent and not high[0] < low[1]:
         raise KeyProblem((*where, "independent"), "true", "false, or strokes that keep their order")
     if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:
         raise KeyProblem(where, f"a z component as far as {high[2]:g}", "draws below 0 m/s")
-    if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
-        largest = high[2] if uncertainty.independent else low[2]
-        if not low[0] * low[1] > largest:
-            allowed = "a stable motion simulator throughout: a1 a2 > a3"
-            raise KeyProblem(where, "values for which it is not stable", allowed)

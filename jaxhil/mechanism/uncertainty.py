@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 
 from jaxhil.mechanism.correlation import correlate
-from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
-from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, numeric_keys, value_at
+from jaxhil.mechanism.six_axes import AnyMechanism, numeric_keys_of
+from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, value_at
 
 __all__ = [
     "PHASE_KEY",
@@ -41,8 +41,6 @@ __all__ = [
     "draw_extremes",
     "draw_quasi_random",
 ]
-
-AnyMechanism = Mechanism | SixAxisMechanism
 
 PHASE_KEY = "approach.phase"
 DRAWS_PER_GENERATOR = 1024  # number of draws from one generator
@@ -145,7 +143,7 @@ def _draw_uniform(path: str, count: int, number: int, seed: int, first: int) -> 
 def _compute_values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values of every key from its uniform numbers."""
     has_one_axis = isinstance(mechanism, Mechanism)
-    ranges = numeric_keys() if has_one_axis else numeric_keys_of(mechanism)
+    ranges = numeric_keys_of(mechanism)
     return {
         path: _compute_key_values(
             np.asarray(value_at(mechanism, path), dtype=float),

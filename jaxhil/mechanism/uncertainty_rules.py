@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from typing import Any
 
 import numpy as np
 
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyProblem, add_magnitude_limits, suggest_names
+from jaxhil.mechanism.six_axes import AnyMechanism, numeric_keys_of
 from jaxhil.mechanism.structs import Range, Uncertainty, is_computable, value_at
 
 __all__ = ["Span", "check_uncertainty"]
 
 Span = tuple[np.ndarray, np.ndarray]
+POLYNOMIALS = ("rig.simulator.numerator", "rig.simulator.denominator")  # cannot be uncertain
 
 
-def check_uncertainty(mechanism: Any, path: str, ranges: Mapping[str, Range], fixed: Collection[str]) -> Span:
+def check_uncertainty(mechanism: AnyMechanism, path: str) -> Span:
     """Check an uncertain key; return the least and the greatest draw of each of its entries.
 
-    `ranges` are the allowed values of every numeric key; `fixed` are the polynomials, which cannot be
-    uncertain. Raise `KeyProblem`.
+    Raise `KeyProblem`.
     """
     uncertainty = mechanism.uncertainty[path]
     where = ("uncertainty", path)
-    key_ranges = {key: allowed for key, allowed in ranges.items() if key not in fixed}
+    ranges = numeric_keys_of(mechanism)
+    key_ranges = {key: allowed for key, allowed in ranges.items() if key not in POLYNOMIALS}
     if path not in key_ranges:
         allowed = f"the dotted path of a numeric key{suggest_names(path, key_ranges)}"
-        if path in fixed:
+        if path in POLYNOMIALS:
             allowed += " other than a polynomial, which fixes G(0) = 1"
         raise KeyProblem(where, "no such uncertain key", allowed)
     value = value_at(mechanism, path)
@@ -45,6 +45,13 @@ def check_uncertainty(mechanism: Any, path: str, ranges: Mapping[str, Range], fi
         beyond = [end for end in ends if not is_computable(end)]
         if beyond:
             raise KeyProblem(where, f"values as far as {beyond[0]:g}", add_magnitude_limits(key_ranges[path]))
+    if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
+        raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
+    if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
+        largest = high[2] if uncertainty.independent else low[2]
+        if not low[0] * low[1] > largest:
+            allowed = "a stable motion simulator throughout: a1 a2 > a3"
+            raise KeyProblem(where, "values for which it is not stable", allowed)
     return low, high
 
 

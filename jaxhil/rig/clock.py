@@ -3,7 +3,7 @@
 from math import inf, isfinite
 
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
-from jaxhil.rig.types import Limits, NonNegative, Positive
+from jaxhil.rig.types import Limits, NonNegative, Positive, SmallInt
 
 MAX_MISSED = 1_000_000  # periods; one gap counts no more, however wrong the clock is
 MAX_GAP = 1.5  # periods; after a longer gap a tick is missing
@@ -83,7 +83,7 @@ class Clock:
 
     def _miss(self, periods: NonNegative) -> int:
         """Count the ticks missed in a gap of `periods` control periods; return the fault."""
-        left_out = MAX_MISSED - 1
+        left_out: SmallInt = MAX_MISSED - 1
         drift = 0.0
         if periods <= MAX_MISSED:
             left_out = int(periods + 0.5) - 1

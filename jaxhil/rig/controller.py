@@ -222,17 +222,15 @@ class Controller:
             position_measured: position reading of the motion simulator [m].
             time: time of the tick [s]; without it, late and missed ticks are not detected.
         """
-        forces = self._forces
+        forces, inputs = self._forces, self._inputs
         self.faults = 0
-        # The rig passes floats: converting other types only saves time.
+        # The rig passes floats: converting only other types saves time.
         measured = position_measured if type(position_measured) is float else _float(position_measured)
-        inputs = self._inputs
         inputs.locate(measured)
         if self.cause:
             forces.fade()
             return forces.output
-        faults = 0
-        fatal = 0
+        faults = fatal = 0
         if time is not None:
             faults = self._clock.tick(time if type(time) is float else _float(time))
             if self._clock.fatal:
@@ -242,8 +240,7 @@ class Controller:
         velocity = velocity_desired if type(velocity_desired) is float else _float(velocity_desired)
         faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
         fatal |= inputs.fatal
-        law = self._law
-        watchdog = self._watchdog
+        law, watchdog = self._law, self._watchdog
         if watchdog.on and not fatal:
             status = law.status
             alarm = watchdog.tick(forces.output, status, inputs.force, position, velocity, inputs.measured)
@@ -259,14 +256,9 @@ class Controller:
         self.faults = faults
         self.seen |= faults
         if fatal:
-            self._fail(
-                fatal,
-                _detail(
-                    fatal,
-                    watchdog,
-                    (time, force_measured, position_desired, velocity_desired, position_measured),
-                ),
-            )
+            self._fail(fatal, _detail(fatal, watchdog, (
+                time, force_measured, position_desired, velocity_desired, position_measured,
+            )))  # fmt: skip
             forces.fade()
         return forces.output
 

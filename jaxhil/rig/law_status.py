@@ -13,7 +13,7 @@ and exports. Over a contact the statuses are counted. The first condition that h
     identified     otherwise
 
 Unless it is identified, the compensator did not identify the contact, or its correction had little time or
-was at its limit. `pytest -m slow -s tests/test_law_status.py` counts how often an identified contact errs.
+was at its limit.
 """
 
 from typing import NamedTuple

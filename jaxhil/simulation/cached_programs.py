@@ -45,14 +45,14 @@ MACHINE_CODE_TAG = "exec"  # JAX's tag of machine code in its pickles
 # annotations of the arrays' placement. Any other call may refer to a function of the writing process.
 CACHEABLE_CALLS = re.compile(r"lapack_\w+|Sharding|SPMD\w+|xla\.sdy\.\w+")
 
-_programs: dict[Any, Callable[..., Any]] = {}  # programs of this process
+Options = Mapping[str, int | str]  # of the compiler, by name
+NO_OPTIONS: Options = MappingProxyType({})
+
+_programs: dict[Any, Any] = {}  # programs of this process
 
 
 def run_cached(
-    function: Callable[..., Any],
-    static: Any,
-    *arguments: Any,
-    options: Mapping[str, int | str] = MappingProxyType({}),
+    function: Callable[..., Any], static: Any, *arguments: Any, options: Options = NO_OPTIONS
 ) -> Any:
     """Return `function(static, *arguments)`, compiled with the compiler's `options`.
 
@@ -64,16 +64,13 @@ def run_cached(
     return program(*leaves)
 
 
-def compile_cached(function: Callable[..., Any], static: Any, *arguments: Any) -> None:
+def compile_cached(
+    function: Callable[..., Any], static: Any, *arguments: Any, options: Options = NO_OPTIONS
+) -> None:
     """Compile the program that `run_cached` will use for these arguments."""
-    program, leaves = _find_program(function, static, arguments, {})
-    compile_program(program, leaves)
-
-
-def compile_program(program: Any, arguments: Iterable[Any]) -> None:
-    """Compile the result of `load_or_compile`, unless it is compiled already."""
+    program, leaves = _find_program(function, static, arguments, options)
     if not isinstance(program, jax.stages.Compiled):
-        program.lower(*arguments).compile()
+        program.lower(*leaves).compile()
 
 
 def _find_program(function, static, arguments, options):

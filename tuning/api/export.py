@@ -150,18 +150,12 @@ def export(
         arguments.check_has_runtime(loaded.compensator)
         check_same_mechanism(target, loaded.mechanism.name)
         format_names = _select_formats(formats)
-        calibration = _calibrate_limits(
-            loaded, sweep, user_limits, (settings.false_alarms, settings.missed), progress
-        )
+        allowed = settings.false_alarms, settings.missed
+        calibration = _calibrate_limits(loaded, sweep, user_limits, allowed, progress)
+        limits_and_rates = calibration.limits, calibration.rates
         with terminal.show_stages(2, progress) as stages:
             bundle = build_bundle(
-                loaded.document,
-                format_names,
-                calibration.limits,
-                calibration.rates,
-                settings.seed,
-                stages.begin,
-                key,
+                loaded.document, format_names, *limits_and_rates, settings.seed, stages.begin, key
             )
             if not bundle.reasons:
                 write_bundle(target, bundle.files)

@@ -29,7 +29,8 @@ from tuning.api.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.stability_map.grid import MapResults
+    from tuning.stability_map.axes import MapAxis
+    from tuning.stability_map.grid import MapResults, NominalPoint
 
 SCHEMA = "jaxhil/map/1"
 DOCUMENT_FILE, PLOT = "map.json", "map.png"
@@ -129,43 +130,55 @@ def map(
         None if folder is None else arguments.check_path("folder", folder),
     )
     with jax_context():
-        from jaxhil.laws.compensators import COMPENSATORS
-        from jaxhil.simulation.gain_choice import choose_gains
-        from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
-        from tuning.stability_map.axes import check_axes, parse_axis
-        from tuning.stability_map.grid import compute_map, count_runs
+        return _compute(checked, (x, y), compensator, gains, settings, target, progress)
 
-        name, values = choose_gains(checked, compensator, gains)
-        law = COMPENSATORS[name]
-        try:
-            axes = parse_axis("x", x, checked, law, values), parse_axis("y", y, checked, law, values)
-            check_axes(checked, axes)
-        except InputError as error:
-            error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
-            raise
-        mechanism_summary.check_can_be_simulated(checked)
-        with terminal.show_progress(count_runs(settings.points), "runs", progress) as bar:
-            checkpoints = Checkpoints(None if target is None else target / CHECKPOINT_FOLDER, settings.resume)
-            computed = compute_map(
-                checked,
-                name,
-                values,
-                axes,
-                settings.points,
-                settings.limit,
-                settings.seed,
-                bar.tell,
-                settings.scheduler,
-                checkpoints,
-            )
-        document = _build_document(checked, name, values, computed, settings.limit, settings.seed)
-        stability_map = StabilityMap(
-            document, computed.x, computed.y, computed.error, computed.restitution, computed
-        )
-        if target is not None:
-            _write(stability_map, target)
-            checkpoints.remove()
+
+def _compute(
+    mechanism: Mechanism,
+    keys: tuple[str, str],
+    compensator: str,
+    gains: Any,
+    settings: MapOptions,
+    target: Path | None,
+    progress: bool,
+) -> StabilityMap:
+    """Compute the map over the keys x and y, and write it into the folder `target` unless it is None."""
+    from jaxhil.simulation.gain_choice import choose_gains
+    from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
+    from tuning.stability_map.grid import compute_map, count_runs
+
+    name, values = choose_gains(mechanism, compensator, gains)
+    axes = _axes(mechanism, name, values, *keys)
+    mechanism_summary.check_can_be_simulated(mechanism)
+    points, limit, seed = settings.points, settings.limit, settings.seed
+    checkpoints = Checkpoints(None if target is None else target / CHECKPOINT_FOLDER, settings.resume)
+    with terminal.show_progress(count_runs(points), "runs", progress) as bar:
+        others = settings.scheduler, checkpoints
+        computed = compute_map(mechanism, name, values, axes, points, limit, seed, bar.tell, *others)
+    document = _build_document(mechanism, name, values, computed, limit, seed)
+    arrays = computed.x, computed.y, computed.error, computed.restitution
+    stability_map = StabilityMap(document, *arrays, computed)
+    if target is not None:
+        _write(stability_map, target)
+        checkpoints.remove()
     return stability_map
+
+
+def _axes(
+    mechanism: Mechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
+) -> "tuple[MapAxis, MapAxis]":
+    """Return both axes. Raise `InputError`, with the option that is wrong, if they are unusable."""
+    from jaxhil.laws.compensators import COMPENSATORS
+    from tuning.stability_map.axes import check_axes, parse_axis
+
+    law = COMPENSATORS[compensator]
+    try:
+        axes = parse_axis("x", x, mechanism, law, gains), parse_axis("y", y, mechanism, law, gains)
+        check_axes(mechanism, axes)
+    except InputError as error:
+        error.__dict__.setdefault("option", f"--{error}" if str(error)[:1] in "xy" else str(error))
+        raise
+    return axes
 
 
 def _write(stability_map: StabilityMap, folder: Path) -> None:
@@ -189,8 +202,7 @@ def _build_document(
     from jaxhil.simulation.source_fingerprint import dependency_versions
     from tuning.gain_file import VERSIONED_PACKAGES, to_json_data
 
-    closed, radii, nominal = computed.closed, computed.radii, computed.nominal
-    keys = ("low", "high")
+    closed, radii = computed.closed, computed.radii
     document = {
         "schema": SCHEMA,
         "mechanism": mechanism.name,
@@ -217,30 +229,28 @@ def _build_document(
             **({} if radii is None else {"x": radii.x, "y": radii.y, "values": radii.values}),
             "none_because": computed.no_growth,
         },
-        "nominal": {
-            "restitution": nominal.restitution,
-            "error": nominal.error,
-            "peak_force_ratio": nominal.peak_force_ratio,
-            "duration_ratio": nominal.duration_ratio,
-            "growth": nominal.growth,
-            "margins": {
-                name: None
-                if margins is None
-                else {
-                    axis: dict(zip(keys, margin, strict=True))
-                    for axis, margin in zip("xy", margins, strict=True)
-                }
-                for name, margins in (
-                    ("error", nominal.error_margins),
-                    ("contact", nominal.contact_margins),
-                    ("spectral_radius", nominal.radius_margins),
-                )
-            },
-        },
+        "nominal": _nominal(computed.nominal),
         "versions": dependency_versions(VERSIONED_PACKAGES),
     }
     document = to_json_data(document)
     return {**document, "sha256": digest(document)}
+
+
+def _nominal(nominal: "NominalPoint") -> dict[str, Any]:
+    """Return the nominal point's entry of the document."""
+    margins = {
+        "error": nominal.error_margins,
+        "contact": nominal.contact_margins,
+        "spectral_radius": nominal.radius_margins,
+    }
+    fields = ("restitution", "error", "peak_force_ratio", "duration_ratio", "growth")
+    return {
+        **{name: getattr(nominal, name) for name in fields},
+        "margins": {
+            name: None if pair is None else {"x": pair[0]._asdict(), "y": pair[1]._asdict()}
+            for name, pair in margins.items()
+        },
+    }
 
 
 __all__ = ["MapOptions", "StabilityMap", "map"]

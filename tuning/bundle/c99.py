@@ -165,7 +165,7 @@ bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const
         bool ignored = false;
         jaxhil_clear(controller);
         jaxhil_controller_guard(controller, &jaxhil_no_limits, 1.0, INFINITY, &ignored);
-        jaxhil_controller_fail(controller, JAXHIL_UNUSABLE);
+        jaxhil_controller_fail(controller, JAXHIL_UNUSABLE);{unstated}
     }}
     return !error;
 }}
@@ -244,7 +244,9 @@ def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
     tables = [gains_fragment(law), limits_fragment(), faults_fragment(), statuses_fragment()]
     declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
     defined = "\n".join(table.definitions for table in tables if table.definitions)
-    init = _INIT_TEMPLATE.format(law_error=", &error" if constructor.fails else "")
+    has_status = "status" in program.fields.get(class_, {})  # else it is a constant
+    unstated = "\n        controller->law.status = JAXHIL_UNSTATED;" * has_status
+    init = _INIT_TEMPLATE.format(law_error=", &error" if constructor.fails else "", unstated=unstated)
     return f"{declared}{output.declarations}{_PROTOTYPES_TEMPLATE}", f"{defined}\n{output.definitions}{init}"
 
 

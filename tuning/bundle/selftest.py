@@ -24,8 +24,11 @@ MANIFEST_FILE, SIGNATURE_FILE, PYTHON_CACHE = "manifest.json", "manifest.sig", "
 PATH_PATTERN = re.compile(
     r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII
 )  # path of a file in the manifest
-# Limits of a bundle, and of a text file in it; no real bundle reaches them.
-MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = 1000, 1 << 26, 1 << 23
+MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
+    1000,
+    1 << 26,
+    1 << 23,
+)  # of a bundle, and bytes of a text file in it
 SCHEMA = "jaxhil/bundle/1"
 MAX_SIMULATION_ERROR = 1e-11  # share of the range of a run's commands; the simulation rounds in another order
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences of one kind
@@ -158,8 +161,7 @@ def find_differing_lines(found, checks):
     if len(here) == len(expected):
         pairs = enumerate(zip(here, expected, strict=True), start=1)
         return [f"line {number}: differs from what was exported" for number, (a, b) in pairs if a != b]
-    shorter = min(len(here), len(expected))
-    first = next((place for place in range(shorter) if here[place] != expected[place]), shorter)
+    first = [*(a == b for a, b in zip(here, expected, strict=False)), False].index(False)
     return [f"line {first + 1}: differs from what was exported; {len(here)} lines, expected {len(expected)}"]
 
 
@@ -178,8 +180,7 @@ def find_value_differences(content, expected):
 def flatten_document(value, key):
     """Yield (dotted key, value as JSON) for all values in a JSON document."""
     if isinstance(value, (dict, list)) and value:
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        for name, inner in items:
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from flatten_document(inner, f"{key}.{name}" if key else str(name))
     else:
         yield key, json.dumps(value)
@@ -220,8 +221,8 @@ def check_gains(folder, runtime):
         return report_failure("gains.json", escape_unprintable(str(error)))
     except BaseException as error:
         return report_failure("gains.json", f"cannot be loaded: {describe_error(error)}")
-    law = " ".join(runtime.get("COMPENSATORS", ()))
-    return report_pass("gains.json", f"loads: {law}, control period {controller.control_period!r} s")
+    period, laws = controller.control_period, runtime.get("COMPENSATORS", ())
+    return report_pass("gains.json", f"loads: {' '.join(laws)}, control period {period!r} s")
 
 
 def check_vectors(folder, found, runtime):
@@ -276,9 +277,8 @@ def read_vectors(text):
     for number, line in enumerate(lines[1:], start=2):
         if number == len(lines) and not line:
             return
-        fields = line.rstrip("\r").split(",")
         try:
-            row = [float(field) if field else None for field in fields]
+            row = [float(field) if field else None for field in line.rstrip("\r").split(",")]
         except ValueError:
             row = []
         if len(row) != width or any(one is None for place, one in enumerate(row) if place != 6):
@@ -313,7 +313,7 @@ def replay_vectors(rows, gains, runtime):
 
 def are_same_bits(found, expected):
     """Return whether two floats are equal, including the sign of zero; any NaN equals any other."""
-    both_nan = found != found and expected != expected
+    both_nan = math.isnan(found) and math.isnan(expected)
     return both_nan or struct.pack("<d", found) == struct.pack("<d", expected)
 
 

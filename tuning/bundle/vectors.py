@@ -260,9 +260,8 @@ def _compare_with_simulation(
         return rows, None, None
     faulty = np.flatnonzero(acting)
     forces = np.array([row.force_command for row in rows])
-    positions = np.array([row.position_command for row in rows])
     expected = np.array([reading.force_simulated for reading in inputs])
-    error, span = compute_relative_difference(forces, expected)
+    error, _ = compute_relative_difference(forces, expected)
     near = find_threshold_ticks(type(lane.signals)(*(leaf[:number] for leaf in lane.signals)), gain_file)
     end, end_reason = number, None
     if len(faulty):
@@ -272,25 +271,10 @@ def _compare_with_simulation(
     if parted is not None and parted < end:
         end = parted
         end_reason = f"tick {end}: rounding decides at a threshold"
-    wrong = np.flatnonzero(error[:end] > REPLAY_LIMIT)
-    reason = None
-    if len(wrong):
-        tick = int(wrong[0])
-        reason = (
-            f"tick {tick}: force command found {forces[tick].item()!r} N, simulated "
-            f"{expected[tick].item()!r} N: they differ by {error[tick]:.1e} of the command's range "
-            f"{span:.4g} N, limit {REPLAY_LIMIT:.0e}"
-        )
-    elif lane.sent is not None:
-        simulated = np.asarray(lane.sent)[:end]
-        apart, span = compute_relative_difference(positions[:end], simulated)
-        if np.any(apart > REPLAY_LIMIT):
-            tick = int(np.argmax(apart > REPLAY_LIMIT))
-            reason = (
-                f"tick {tick}: position command found {positions[tick].item()!r} m, simulated "
-                f"{simulated[tick].item()!r} m: they differ by {apart[tick]:.1e} of the command's range "
-                f"{span:.4g} m, limit {REPLAY_LIMIT:.0e}"
-            )
+    reason = _disagreement("force command", "N", forces, expected, end)
+    if reason is None and lane.sent is not None:
+        positions = np.array([row.position_command for row in rows])[:end]
+        reason = _disagreement("position command", "m", positions, np.asarray(lane.sent)[:end], end)
     # The range of commands must come from the compared ticks, because the file contains no others.
     comparable = expected.copy()
     comparable[end:] = nan
@@ -301,4 +285,18 @@ def _compare_with_simulation(
         [row._replace(force_simulated=float(force)) for row, force in zip(rows, comparable, strict=True)],
         end_reason,
         reason,
+    )
+
+
+def _disagreement(name: str, unit: str, found: np.ndarray, simulated: np.ndarray, end: int) -> str | None:
+    """Describe the first command before tick `end` that differs from the simulated one, or return None."""
+    error, span = compute_relative_difference(found, simulated)
+    wrong = np.flatnonzero(error[:end] > REPLAY_LIMIT)
+    if not len(wrong):
+        return None
+    tick = int(wrong[0])
+    return (
+        f"tick {tick}: {name} found {found[tick].item()!r} {unit}, simulated {simulated[tick].item()!r} "
+        f"{unit}: they differ by {error[tick]:.1e} of the command's range {span:.4g} {unit}, "
+        f"expected {REPLAY_LIMIT:.0e}"
     )

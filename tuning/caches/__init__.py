@@ -1,1 +1,1 @@
-"""Results and compiled programs on disk, and the fingerprints that tell whether they are still valid."""
+"""Checkpoints of results on disk, and workers of a cluster."""

@@ -15,8 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxhil.simulation.jax_environment import program_folder
-from tuning.caches import program_cache
+from jaxhil.simulation import cached_programs
+from jaxhil.simulation.jax_environment import TICK_OPTIONS
 from tuning.gains.objective import (
     RESIDUAL_SCALE,
     RMS_OBJECTIVE,
@@ -190,42 +190,28 @@ def compile_solver(
     problems = [_StartState(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _build_call(tasks, names, bounds, list_objectives(objective, len(tasks)), len(problems))
     first = problems[: _choose_call_size(len(problems))]
-    program_cache.prepare_program(_solve_call, static, call(first, 1), _choose_program_folder(tasks))
+    cached_programs.compile_cached(_solve_call, static, call(first, 1), options=TICK_OPTIONS)
 
 
 def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgress):
     """Return a function that advances problems by up to `limit` steps and returns their states."""
     static, call = _build_call(tasks, names, bounds, objectives, number)
-    size, runs, folder = (
-        _choose_call_size(number),
-        count_step_runs(tasks, names),
-        _choose_program_folder(tasks),
-    )
+    size, runs = _choose_call_size(number), count_step_runs(tasks, names)
 
     def advance(problems: list[_StartState], limit: int) -> list[_SolverState]:
         advanced = []
         for begin in range(0, len(problems), size):
             members = problems[begin : begin + size]
-            solution = jax.device_get(
-                program_cache.run_program(_solve_call, static, call(members, limit), folder)
+            stepped = cached_programs.run_cached(
+                _solve_call, static, call(members, limit), options=TICK_OPTIONS
             )
+            solution = jax.device_get(stepped)
             positions = np.argsort(assign_to_devices(size))[: len(members)]
             advanced += [_extract_state(solution, int(position)) for position in positions]
             work.report_runs(runs * sum(len(state.history) for state in advanced[begin:]))
         return advanced
 
     return advance
-
-
-def _choose_program_folder(tasks: list[TuneTask]) -> Any:
-    """Return the folder of cached programs, None with user-registered contact laws."""
-    return None if any(_has_user_law(task.scenarios) for task in tasks) else program_folder()
-
-
-def _has_user_law(scenarios: Any) -> bool:
-    """Return whether six-axis scenarios, which carry their contact laws, have a user-registered one."""
-    groups = getattr(scenarios, "groups", ())
-    return any(not type(group.law).__module__.startswith("jaxhil.") for group in groups)
 
 
 def count_step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:

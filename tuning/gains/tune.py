@@ -119,14 +119,7 @@ def tune_group(
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
-        for i, result in enumerate(searched):
-            left = EVALUATION_FACTOR * tasks[0].lanes * sum(later.evaluations for later in searched[i:])
-            work.begin(f"searching everywhere, {i + 1} of {len(searched)}", left)
-            comparisons[i] = work.step(
-                "search everywhere",
-                GlobalComparison | None,
-                lambda i=i, result=result: compare_with_global_search(validation, i, result, settings),
-            )
+        comparisons = _compare_globally(validation, searched, settings)
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
@@ -156,6 +149,24 @@ def tune_group(
         )
         results.append(result)
     return results
+
+
+def _compare_globally(
+    validation: Validation, searched: list[MultistartResult], settings: TuneSettings
+) -> list[GlobalComparison | None]:
+    """Compare the gains of every task with those of a global search."""
+    work, comparisons = validation.work, []
+    for i, result in enumerate(searched):
+        left = (
+            EVALUATION_FACTOR * validation.tasks[0].lanes * sum(later.evaluations for later in searched[i:])
+        )
+        work.begin(f"searching everywhere, {i + 1} of {len(searched)}", left)
+
+        def compare(i: int = i, result: MultistartResult = result) -> GlobalComparison | None:
+            return compare_with_global_search(validation, i, result, settings)
+
+        comparisons.append(work.step("search everywhere", GlobalComparison | None, compare))
+    return comparisons
 
 
 def estimate_group_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:

@@ -71,7 +71,7 @@ def plot_bode(motion: FreeMotion) -> Figure:
         _to_decibel(modelled),
         color=BLACK,
         linewidth=1.2,
-        label=f"model: {_format_structure(motion)}",
+        label=f"model: {_compute_program_digest(motion)}",
     )
     size.plot(frequency, _to_decibel(noise), color="0.6", linewidth=1.2, label="noise of the lines")
     size.plot(
@@ -247,7 +247,7 @@ def _compute_phase(response: np.ndarray) -> np.ndarray:
     return np.degrees(np.unwrap(np.angle(response)))
 
 
-def _format_structure(motion: FreeMotion) -> str:
+def _compute_program_digest(motion: FreeMotion) -> str:
     return motion.model.structure.name.replace("_", " ")
 
 

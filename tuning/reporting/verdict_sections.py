@@ -77,14 +77,13 @@ def assumption_section(results: Results) -> Section | None:
         return None
     mechanism, origins = subject.mechanism, _identified_origins(results)
     rows = []
-    keys = numeric_keys_of(mechanism) if results.axes == 6 else numeric_keys()
-    for path, allowed in keys.items():
+    for path in numeric_keys_of(mechanism):
         if path.startswith("uncertainty"):
             continue
         value = value_at(mechanism, path)
         if value is None or value == [] or np.all(np.isinf(value)):
             continue
-        unit = find_key_unit(mechanism, path) or allowed.unit
+        unit = find_key_unit(mechanism, path)
         uncertain = mechanism.uncertainty.get(path)
         varies = "fixed"
         if path == PHASE_KEY:

@@ -138,9 +138,7 @@ def _key_axis(
         )
     nominal = float(np.asarray(value, float)[entry].flat[0])
     low, high = _default_range(mechanism, path, entry, nominal)
-    return MapAxis(
-        key, path, entry, find_key_unit(mechanism, path) or numeric_keys()[path].unit, nominal, low, high
-    )
+    return MapAxis(key, path, entry, find_key_unit(mechanism, path), nominal, low, high)
 
 
 def _default_range(

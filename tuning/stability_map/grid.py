@@ -32,9 +32,7 @@ from tuning.stability_map.contact_growth import (
 
 LINE_POINTS = 201  # points of each line through the nominal point
 MAX_TILE_RUNS = 2048  # largest number of runs computed at a time
-MAX_EIGENVALUE_COST = (
-    5e7  # cost of all eigenvalues; if the whole map costs more, the spectral radius has a coarser grid
-)
+MAX_EIGENVALUE_COST = 5e7  # cost of all eigenvalues; beyond it, the spectral radius has a coarser grid
 MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser grid
 
 
@@ -116,12 +114,11 @@ def compute_map(
     across[:, 0], up[:, 1] = lines
     point_gains, scenarios = batch(np.concatenate([_grid_points(x, y), across, up, middle]))
     worst = _run_tiles(mechanism, compensator, point_gains, scenarios, tell, scheduler, checkpoints)
-    restitution, error, force, duration, _ = worst
-    size = points**2
+    restitution, error, force, duration = (row[: points**2].reshape(points, points) for row in worst[:4])
 
     tell("eigenvalues of the loop in contact", count_runs(points))
     reason = explain_nonlinearity(mechanism, compensator)
-    radii = on_lines = nominal_growth = None
+    nominal, radii = _nominal_point(worst, points**2, axes, lines, limit), None
     if reason is None:
         plain = {name: float(value) for name, value in gains.items()}
         nominal_growth = compute_growth(mechanism, compensator, plain, batch(middle)[1])
@@ -138,20 +135,17 @@ def compute_map(
         )
         radii = SpectralRadii(grid[0], grid[1], all_radii[: coarse**2].reshape(coarse, coarse))
         on_lines = all_radii[coarse**2 :].reshape(2, LINE_POINTS)
-    closed = compute_closed_forms(mechanism, compensator, batch(_grid_points(x, y))[1])
-    nominal = _nominal_point(worst, size, axes, lines, limit)
-    if on_lines is not None and nominal_growth is not None:
         margins = _line_margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
         nominal = nominal._replace(growth=nominal_growth, radius_margins=margins)
-    shape = points, points
+    closed = compute_closed_forms(mechanism, compensator, batch(_grid_points(x, y))[1])
     return MapResults(
         axes=axes,
         x=x,
         y=y,
-        restitution=restitution[:size].reshape(shape),
-        error=error[:size].reshape(shape),
-        peak_force_ratio=force[:size].reshape(shape),
-        duration_ratio=duration[:size].reshape(shape),
+        restitution=restitution,
+        error=error,
+        peak_force_ratio=force,
+        duration_ratio=duration,
         closed=_reshape_forms(closed, points),
         radii=radii,
         no_growth=reason,

@@ -10,9 +10,9 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
+from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
+from jaxhil.mechanism.six_axes import numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import PHASE_KEY, count_dimensions
 from jaxhil.rig_models import choose_rig_model
@@ -103,17 +103,6 @@ UNENDED_METRICS = (
     "energy_in",
 )
 
-_UNITS = {
-    **dict.fromkeys(("equivalent_mass", "chaser_mass", "target_mass"), "kg"),
-    **dict.fromkeys(("velocity", "velocity_limit"), "m/s"),
-    "acceleration_limit": "m/s^2",
-    "natural_frequency": "Hz",
-    **dict.fromkeys(("control_period", "delay", "time_constant"), "s"),
-    **dict.fromkeys(("dead_zone", "bias", "range"), "N"),
-    **dict.fromkeys(("clearance", "contact_plane"), "m"),
-    **dict.fromkeys(("phase", "damping_ratio"), "1"),
-}
-
 
 class ContactColumns(NamedTuple):
     """Columns of one contact, or of one error of an episode."""
@@ -182,23 +171,15 @@ def _list_stored_metrics(mechanism: AnyMechanism, works: bool) -> list[ContactMe
 
 
 def find_key_unit(mechanism: AnyMechanism, path: str) -> str:
-    """Return the SI unit of a key of the mechanism file."""
+    """Return the SI unit of a real-valued key of the mechanism file."""
     table, _, key = path.rpartition(".")
-    name = table.removeprefix("contact.")
-    if not isinstance(mechanism, SixAxisMechanism):
-        contact = mechanism.contact if table == "contact" else None
-    else:
-        contact = mechanism.contact.get(name) if name != table else None
-    if contact is not None and key in ("stiffness", "damping"):
-        law = find_contact_law(contact.law)
+    contacts: dict[str, Any] = {"contact": mechanism.contact}
+    if not isinstance(mechanism, Mechanism):
+        contacts = {f"contact.{name}": contact for name, contact in mechanism.contact.items()}
+    if key in ("stiffness", "damping") and table in contacts:
+        law = find_contact_law(contacts[table].law)
         return law.stiffness_unit if key == "stiffness" else law.damping_unit
-    if contact is not None and key in CONTACT_KEYS:
-        return CONTACT_KEYS[key].unit or ""
-    if isinstance(mechanism, SixAxisMechanism):
-        return numeric_keys_of(mechanism)[path].unit
-    if key in ("noise_std", "quantum"):
-        return "N" if "force" in path else "m"
-    return _UNITS.get(key, "")
+    return numeric_keys_of(mechanism)[path].unit
 
 
 def list_input_columns(mechanism: AnyMechanism, path: str) -> list[str]:

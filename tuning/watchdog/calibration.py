@@ -92,11 +92,7 @@ def calibrate(
         InputError: if the store is of another gain file or holds fewer scenarios, or if no run ends.
     """
     chosen = _choose_scenarios(loaded, store, scenarios)
-    if limit is None:
-        limit = store.manifest.limit if store is not None else None
-    limit = DEFAULT_ERROR_LIMIT if limit is None else limit
-    if not 0 < limit < np.inf:
-        raise InputError(f"--limit: found {limit!r}, expected a number above 0")
+    limit = _error_limit(limit, store)
     rules, free_distance = build_audit_rules(loaded)
     parts = []
     for chunk in record_selection(loaded, chosen, lanes):
@@ -110,11 +106,8 @@ def calibrate(
         raise InputError("limits: found no run all of whose contacts end, expected gains with which they do")
     expectation = fit_reached_contacts(runs, limit, rules.mass, fitted)
     margin = choose_restitution_margin(runs, expectation, limit, rules.mass, fitted, allowed.false_alarms)
-    limits = {
-        **compute_guard_limits(loaded, runs, used, rules, free_distance),
-        **expectation.limits(),
-        "restitution_margin": margin.value,
-    }
+    limits = compute_guard_limits(loaded, runs, used, rules, free_distance) | expectation.limits()
+    limits["restitution_margin"] = margin.value
     replaced = replaced or {}
     final = {name: limits.get(name) for name in LIMITS} | dict(replaced)
     rates = compute_alarm_rates(runs, expectation, final, limit, rules.mass, ~(fitted | margin.runs))
@@ -123,16 +116,33 @@ def calibrate(
         rates["fault_runs"] = compute_fault_rates(loaded, *watchdog, limit, faulty, chosen.seed, progress)
     rates = add_verdict(rates, allowed, chosen.number)
     rates["widened_from"] = None if "restitution_margin" in replaced else margin.widened_from
-    rates["calibrated_on"] = {
+    rates["calibrated_on"] = _origin(chosen, store, used, used is good)
+    return Calibration({name: _convert_to_plain(value) for name, value in final.items()}, rates)
+
+
+def _origin(
+    chosen: ScenarioSelection, store: SweepStore | None, used: Bool[np.ndarray, "lanes"], are_good: bool
+) -> dict[str, Any]:
+    """Return the runs that the limits come from, as plain data."""
+    return {
         "scenarios": chosen.number,
         "sampling": chosen.sampling,
         "seed": chosen.seed,
         "sweep_sha256": None if store is None else store.manifest.sha256,
-        "runs": "good" if used is good else "ended, none good",
+        "runs": "good" if are_good else "ended, none good",
         "number": int(np.sum(used)),
         "margin": LIMIT_MARGIN,
     }
-    return Calibration({name: _convert_to_plain(value) for name, value in final.items()}, rates)
+
+
+def _error_limit(limit: float | None, store: SweepStore | None) -> float:
+    """Return the limit of the restitution error [1]: the given one, else the store's, else `DEFAULT_ERROR_LIMIT`."""
+    if limit is None and store is not None:
+        limit = store.manifest.limit
+    limit = DEFAULT_ERROR_LIMIT if limit is None else limit
+    if not 0 < limit < np.inf:
+        raise InputError(f"--limit: found {limit!r}, expected a number above 0")
+    return limit
 
 
 def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:

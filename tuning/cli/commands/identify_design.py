@@ -11,7 +11,6 @@ import numpy as np
 from jaxhil.errors import InputError, to_one_line
 from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.mechanism.file import load
-from jaxhil.mechanism.structs import numeric_keys
 from jaxhil.rig import digest
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.source_fingerprint import dependency_versions
@@ -73,13 +72,15 @@ def _write(path: Path, excitation: Excitation, period: float) -> None:
 
 def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesign) -> dict[str, Any]:
     """Return the JSON document of the design."""
+    from tuning.identification.estimates import get_unit
+
     effects = np.sqrt(np.mean(design.slopes**2, axis=0)) * design.std
     numbers = zip(design.keys, design.values, design.std, effects, strict=True)
     content = {
         "schema": SCHEMA,
         "mechanism": to_one_line(name),
         "predicted": [
-            {"key": key, "value": value, "std": std, "effect": effect, "unit": _unit(key)}
+            {"key": key, "value": value, "std": std, "effect": effect, "unit": get_unit(key)}
             for key, value, std, effect in numbers
         ],
         "error": design.error,
@@ -102,14 +103,6 @@ def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesig
     }
     plain = terminal.to_json_data(content)
     return {**plain, "sha256": digest(plain)}
-
-
-def _unit(key: str) -> str:
-    """Return the unit of a key, without its list indices."""
-    parts = key.split(".")
-    while parts[-1].isdigit():
-        parts.pop()
-    return numeric_keys()[".".join(parts)].unit
 
 
 def _print(document: dict[str, Any], folder: Path) -> None:

@@ -70,19 +70,8 @@ def _error_table(options: Tune, result: Any, better: bool) -> Any:
         figures = judged[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
-        rows.append(
-            (
-                *(
-                    label,
-                    figures.rms,
-                    figures.p99,
-                    figures.max,
-                    f"{figures.mean:+.4f}",
-                    f"{100 * figures.diverging:.0f} %",
-                ),
-                *(f"{figures.peak_ratio:.3f}", f"{figures.chatter:.3f}", figures.failed),
-            )
-        )
+        shares = f"{100 * figures.diverging:.0f} %", f"{figures.peak_ratio:.3f}", f"{figures.chatter:.3f}"
+        rows.append((label, *_cells(figures), *shares, figures.failed))
     count = int(result.outcomes["tuned"].wanted.sum())
     return terminal.build_table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
@@ -100,14 +89,7 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
     for key, label in names.items():
         for error in ("energy_error", "twist_error"):
             figures = entry[error][key]
-            cells = (
-                figures.rms,
-                figures.p99,
-                figures.max,
-                f"{figures.mean:+.4f}",
-                f"{figures.peak_ratio:.3f}",
-                figures.failed,
-            )
+            cells = *_cells(figures), f"{figures.peak_ratio:.3f}", figures.failed
             rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
     count = int(result.outcomes["tuned"].wanted.sum()) // 2
     return terminal.build_table(
@@ -116,6 +98,11 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
         rows,
         texts=(0, 1),
     )
+
+
+def _cells(figures: Any) -> tuple[Any, ...]:
+    """Return the cells of the size and the mean of errors."""
+    return figures.rms, figures.p99, figures.max, f"{figures.mean:+.4f}"
 
 
 def _gain_tables(options: Tune, result: Any) -> list[Any]:
