@@ -117,7 +117,8 @@ def _jittered(operation):
             return NotImplemented
         towards = Jittered.generator.choice((-math.inf, None, math.inf))
         result = operation(float(self), float(other))
-        return Jittered(result if towards is None else math.nextafter(result, towards))
+        # A result of 0 is exact.
+        return Jittered(result if towards is None or result == 0 else math.nextafter(result, towards))
 
     return operate
 

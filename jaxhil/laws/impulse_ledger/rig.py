@@ -25,7 +25,7 @@ from typing import ClassVar
 
 from jaxhil.laws.impulse_ledger.alignment.rig import Alignment
 from jaxhil.laws.impulse_ledger.contact_model.rig import HINGES, ContactModel, Vector, dot, features, slope
-from jaxhil.laws.impulse_ledger.onset_detection.rig import LEVEL, SETTLING, OnsetDetector
+from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, LEVEL, SETTLING, OnsetDetector
 from jaxhil.laws.impulse_ledger.reference_trajectory.rig import ReferenceTrajectory
 from jaxhil.rig.bounds import DAMPINGS_BY_MASS, FORCES, MASSES, STIFFNESSES_BY_MASS, TIMES
 from jaxhil.rig.law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNEXPLAINED, UNSURE
@@ -36,20 +36,16 @@ RELEASE_TIME = 0.03  # s; the compensator acts so long after the hardware has le
 LEAST_MOMENTUM = 1e-9  # kg m/s; with less, forces cannot be scaled
 LONGEST_LAG = 0.2  # s; upper bound of the lag D
 ONSET_PLACE = -0.5  # travel per period; the last free reading relative to the surface
-MISFIT = 0.003  # relative error of the contact model's force over `MISFIT_TIME`
+MISFIT = 0.005  # relative error of the contact model's force over `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
-OUTLYING = 16.0  # variances; a larger squared reading shows contact
-HOLD_TIME = 0.004  # s; time constant of the misfit in the bridge
 SLOWEST = 1e-9  # speed [1]; a slower motion is rest with rounding errors
 SHALLOW = 0.001  # s; depth below which the secant stiffness is not computed
-LEAST_STIFFNESS = 1.0  # 1/s^2; stiffness of the softest contact
-HIGHEST = 1.5  # upper bound of the bridged force, over the peak force
+LEAST_PEAK = 0.3  # 1/s; peak force of the softest contact, 0.05 Hz
 FEW_READINGS = 5  # readings in contact; with fewer the status is `unsure`
 LATE = 0.8  # share of the contact that is over at the onset; with more the status is `too_short`
 UNCERTAIN = 0.006  # standard deviation of the reference speed [1]; with more the status is `noisy`
-IMBALANCE = 0.014  # energy that the model may leave unexplained [1]
-MOST_GAIN = 0.01  # energy that a contact may add by the estimates [1]
-LEAST_DAMPING = -0.003  # of the peak force; a damping surely below this fits no contact
+MOST_GAIN = 0.01  # energy that a contact may seem to add beyond the model [1]
+MOST_LOSS = 0.014  # energy that a contact may lose beyond the model [1]
 USUAL_PRELOAD = 1.0  # 1/s; prior standard deviation of the preload, in addition to a specified one
 LARGEST_DELAY_SPREAD = 0.004  # s; with more the first order in the delay is not accurate
 MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from the specified one
@@ -74,7 +70,7 @@ class ImpulseLedger(Compensator):
     __slots__ = (
         "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
         "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass",
-        "_misfit", "_model", "_origin", "_outside", "_peak", "_period", "_readings", "_reference", "_side",
+        "_model", "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side",
         "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
     )  # fmt: skip
     _estimate: tuple[float, float]  # mean and variance of the delay after this contact
@@ -106,7 +102,9 @@ class ImpulseLedger(Compensator):
         self._correction_limit = gains["correction_limit"]
         self._delay_spread = gains["delay_spread"]
         self._stiffness = gains["prior_stiffness"]
+        self._preload = gains["prior_preload_spread"]
         self._spreads = [gains[name] for name in SPREADS]
+        self._spreads[-1] = sqrt(self._preload * self._preload + USUAL_PRELOAD * USUAL_PRELOAD)
         self._identification_delay = gains["identification_delay"]
         self._alignment = Alignment(gains["identification_delay"], period)
         self._detector = OnsetDetector(gains["force_noise"])
@@ -147,7 +145,11 @@ class ImpulseLedger(Compensator):
             self._in_contact = reach != 0.0
             self._side = 1.0 if reach > 0.0 else -1.0
         if self._in_contact and not self._speed > 0.0:
-            return self._pass_on(force_measured, position_desired, position)
+            # The run began in contact: pass the force on until model and hardware are outside.
+            self.status = UNSURE
+            inside = self._side * deflection(position_desired, self._clearance) > 0.0
+            self._in_contact = inside or self._side * deflection(position, self._clearance) > 0.0
+            return force_measured if inside else 0.0
         detector = self._detector
         if not self._in_contact:
             self.status = OUT_OF_CONTACT
@@ -177,18 +179,12 @@ class ImpulseLedger(Compensator):
         if not approaches:
             return
         self._origin = side * position - ONSET_PLACE * (self._period * speed)
-        lag = side * (position_desired - position) / speed
-        self._lag = 0.0 if lag < 0.0 else (LONGEST_LAG if lag > LONGEST_LAG else lag)
+        self._lag = min(max(side * (position_desired - position) / speed, 0.0), LONGEST_LAG)
         self._deepest = 0.0
-        self._misfit = 0.0
-        self._peak = 0.0
+        self._peak = LEAST_PEAK
         self._outside = 0.0
-        self._readings = 0
         self._estimate = 0.0, self._variance
-        spreads = list(self._spreads)
-        preload = spreads[-1]
-        spreads[-1] = sqrt(preload * preload + USUAL_PRELOAD * USUAL_PRELOAD)
-        self._model.restart(self._stiffness, spreads, self._variance)
+        self._model.restart(self._stiffness, self._spreads, self._variance)
         self._reference.begin((side * position - self._origin) / speed, self._model.theta)
 
     def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
@@ -198,116 +194,74 @@ class ImpulseLedger(Compensator):
         weight = self._mass * speed
         depth = (side * position - self._origin) / speed
         rate = side * velocity / speed
-        self._deepest = depth if depth > self._deepest else self._deepest
-        phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
         reading = side * force / weight
-        model_error = MISFIT * reading
+        self._deepest = max(self._deepest, depth)
+        phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
         noise = self._detector.variance / (weight * weight)
-        variance = noise + self._floor * self._floor + model_error * model_error * (MISFIT_TIME / period)
-        informs = rate > SLOWEST or dot(phi, model.mean) > 0.0 or reading * reading > OUTLYING * variance
-        ended = not depth > 0.0 and rate < 0.0
-        learns = informs and depth > period
-        if learns:
-            model.learn(phi, reading, variance)
-            self._readings += 1
-        if not depth > 0.0:
-            onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + self._floor
-            onset += sqrt(noise) if noise > 0.0 else 0.0
-            preload = self._spreads[-1]
-            spread = sqrt(preload * preload + (ONSET_SPREAD * onset) ** 2)
-            self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
-        if learns or ended:
-            model.conclude(self._estimate[0] if ended else 0.0)
+        self._learn(phi, depth, rate, reading, noise)
         reference.correct(model.theta)
         reference.advance(period, reading, phi)
-        residual = reading - dot(model.theta, phi)
-        self._misfit += period / (period + HOLD_TIME) * (residual - self._misfit)
-        push, ahead = reference.bridge(self._lag + 0.5 * period, self._misfit)
-        command = self._command(push, ahead, depth, rate, reading, phi, side * velocity_desired / speed)
+        push, ahead = reference.bridge(self._lag + 0.5 * period)
+
+        self._peak = max(self._peak, reading)
+        peak = self._peak
+        if rate > SLOWEST:
+            stiffness = dot(phi[:HINGES], model.mean[:HINGES]) / max(depth, SHALLOW)
+            stiffness -= sqrt(max(model.covariance[0][0], 0.0))
+            peak = max(peak, sqrt(max(stiffness, 0.0)))
+        wanted = self._gain * (side * velocity_desired / speed - 0.5 * period * push - ahead)
+        limit = self._correction_limit * peak
+        correction = min(max(wanted, -limit), peak + limit - push)
+        if self._in_contact:
+            self.status = self._evaluate(peak, noise, correction == wanted)
         self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
         if self._in_contact and reference.released and self._outside * period > RELEASE_TIME:
             self._end()
-        return side * weight * command
+        return side * weight * (push + correction)
 
-    def _command(
-        self,
-        push: float,
-        ahead: float,
-        depth: float,
-        rate: float,
-        reading: float,
-        phi: Vector,
-        desired: float,
-    ) -> float:
-        """Return the scaled command [1/s].
+    def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
+        """Update contact model and delay by a reading [1/s] with this variance of its noise [1/s^2]."""
+        model, period, floor = self._model, self._period, self._floor
+        model_error = MISFIT * reading
+        variance = noise + floor * floor + model_error * model_error * (MISFIT_TIME / period)
+        learns = depth > period and (rate > SLOWEST or dot(phi, model.mean) > 0.0)
+        if learns:
+            model.learn(phi, reading, variance)
+        if not depth > 0.0:
+            onset = ONSET_TICKS * period * slope(model.mean, self._deepest) + floor + sqrt(noise)
+            spread = sqrt(self._preload * self._preload + (ONSET_SPREAD * onset) ** 2)
+            self._estimate = model.estimate_delay(ONSET_MEAN * onset, spread)
+        ended = not depth > 0.0 and rate < 0.0
+        if learns or ended:
+            model.conclude(self._estimate[0] if ended else 0.0)
 
-        Args:
-            push: bridged force [1/s].
-            ahead: bridged speed [1].
-            depth: depth of the hardware [s].
-            rate: speed of the hardware [1].
-            reading: force reading [1/s].
-            phi: features of the reading.
-            desired: speed of the numerical model [1].
+    def _evaluate(self, peak: float, noise: float, free: bool) -> int:
+        """Return the status for a peak force [1/s] and the variance of the force's noise [1/s^2].
+
+        `free`: the correction is within its limits.
         """
-        mean = self._model.mean
-        secant = dot(phi[:HINGES], mean[:HINGES]) / (depth if depth > SHALLOW else SHALLOW)
-        variance = self._model.covariance[0][0]
-        secure = secant if secant > LEAST_STIFFNESS else LEAST_STIFFNESS
-        secure -= sqrt(variance) if variance > 0.0 else 0.0
-        predicted = sqrt(secure if secure > LEAST_STIFFNESS else LEAST_STIFFNESS)
-        self._peak = max(self._peak, reading, 1.0)
-        peak = predicted if rate > SLOWEST and predicted > self._peak else self._peak
-        push = push if push < HIGHEST * peak else HIGHEST * peak
-        wanted = self._gain * (desired - 0.5 * self._period * push - ahead)
-        least = -self._correction_limit * peak
-        most = (1.0 + self._correction_limit) * peak - push
-        correction = most if wanted > most else (least if wanted < least else wanted)
-        if self._in_contact:
-            self.status = self._evaluate(peak, correction == wanted)
-        return push + correction
-
-    def _evaluate(self, peak: float, free: bool) -> int:
-        """Return the status for a peak force [1/s]; `free`: the correction is within its limits."""
-        reference = self._reference
-        if self._readings < FEW_READINGS:
+        reference, model = self._reference, self._model
+        if model.count < FEW_READINGS:
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT
-        if reference.spread(self._model.covariance, 0.0) > UNCERTAIN:
+        # The readings before the onset lack an impulse of (DRIFT sigma)^2/(2 k); peak^2 is about k.
+        unseen = 0.5 * (DRIFT * DRIFT) * noise / (peak * peak)
+        if reference.spread(model.covariance, 0.0) + unseen > UNCERTAIN:
             return NOISY
-        spread = reference.spread(self._model.covariance, self._estimate[1])
         if reference.released:
-            imbalance = reference.imbalance()
-            # A force that is older than specified, or behind a lag, looks like a damper that drives.
-            drives = (
-                imbalance < -MOST_GAIN and self._model.largest_damping(self._deepest) < LEAST_DAMPING * peak
-            )
-            if spread > UNCERTAIN or abs(imbalance) > IMBALANCE + 3.0 * spread or drives:
+            # A force that is older than specified, or behind a lag, seems to add energy.
+            spread = reference.spread(model.covariance, self._estimate[1])
+            lost = reference.imbalance()
+            if spread > UNCERTAIN or lost < -MOST_GAIN or lost > MOST_LOSS + 3.0 * spread:
                 return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
 
-    def _pass_on(self, force: float, position_desired: float, position: float) -> float:
-        """Return the measured force [N] in a run that began in contact; 0 while the model is outside.
-
-        The contact ends once the model is outside and the hardware has been outside for `RELEASE_TIME`.
-        """
-        side = self._side
-        inside = side * deflection(position_desired, self._clearance) > 0.0
-        bent = side * deflection(position, self._clearance)
-        self._outside = 0.0 if bent > 0.0 else self._outside + 1.0
-        self.status = UNSURE
-        if not inside and self._outside * self._period > RELEASE_TIME:
-            self._end()
-            return 0.0
-        return force if inside and not bent < 0.0 else 0.0
-
     def _end(self) -> None:
         """End the contact and keep the estimate of the delay."""
-        if self._speed > 0.0:
-            limit = MOST_SPREADS * self._delay_spread
-            shift, self._variance = self._estimate
-            self._delay = min(max(self._delay + shift, -limit), limit)
+        limit = MOST_SPREADS * self._delay_spread
+        shift, self._variance = self._estimate
+        self._delay = min(max(self._delay + shift, -limit), limit)
         self._speed = 0.0
         self._in_contact = False
         self._detector.total = 0.0

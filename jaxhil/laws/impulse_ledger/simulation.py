@@ -1,10 +1,4 @@
-"""Impulse ledger in JAX: the batched compensator of `jaxhil.laws.impulse_ledger.rig`.
-
-A force reading is the force that should have acted on the numerical model D ago. The compensator fits a
-contact model to the readings, advances a reference trajectory at their time, bridges the D seconds to the
-present with the fitted model, and controls the numerical model's velocity towards the result. `rig.py` states
-the equations.
-"""
+"""Impulse ledger in JAX: the batched compensator of `rig.py` in this folder, which states the equations."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -92,9 +86,12 @@ class Contact(NamedTuple):
     origin: Float[Array, "*batch"]  # position of the surface, in the direction of `side` [m]
     lag: Float[Array, "*batch"]  # D [s]
     deepest: Float[Array, "*batch"]  # largest depth of the hardware [s]
-    misfit: Float[Array, "*batch"]  # low-pass of y - f(X, V) [1/s]
     peak: Float[Array, "*batch"]  # largest reading so far [1/s]
     outside: Float[Array, "*batch"]  # ticks since the hardware left the surface
+    estimate: Estimate  # of the contact model
+    reference: Reference
+    delay: Float[Array, "*batch"]  # mean of the delay after this contact [s]
+    variance: Float[Array, "*batch"]  # its variance [s^2]
 
 
 class LedgerState(NamedTuple):
@@ -105,8 +102,6 @@ class LedgerState(NamedTuple):
     flight: FreeFlight  # readings in free flight
     in_contact: Bool[Array, "*batch"]
     contact: Contact
-    estimate: Estimate  # of the contact model
-    reference: Reference
     delay: Float[Array, "*batch"]  # estimated delay of the force beyond the specified one [s]
     variance: Float[Array, "*batch"]  # of the delay [s^2]
 
@@ -118,14 +113,6 @@ class Prepared(NamedTuple):
     constants: KnownConstants
     delay: DelayInPeriods  # of the delay line
     share: Float[Array, "*batch"]  # weight of the previous sample, for the rest of the delay [1]
-
-
-class Reading(NamedTuple):
-    """Readings of one tick, as old as the force."""
-
-    force: Float[Array, "*batch"]  # [N]
-    position: Float[Array, "*batch"]  # [m]
-    velocity: Float[Array, "*batch"]  # [m/s]
 
 
 class ImpulseLedger(Compensator):
@@ -146,22 +133,21 @@ class ImpulseLedger(Compensator):
         period = constants.control_period
         full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
         delay = full["identification_delay"]
-        whole = delay > period
-        line = split_delay(jnp.where(whole, delay - period, 0), period)
-        return Prepared(full, constants, line, jnp.where(whole, 1, delay / period))
+        line = split_delay(jnp.where(delay > period, delay - period, 0), period)
+        return Prepared(full, constants, line, jnp.where(delay > period, 1, delay / period))
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        prior = contact_model.prior(zeros, tuple([zeros] * len(rig.SPREADS)), zeros)
-        estimate = contact_model.begin(*prior)
+        estimate = contact_model.begin(*contact_model.prior(zeros, [zeros] * len(rig.SPREADS), zeros))
+        reference = reference_trajectory.begin(zeros, estimate.theta)
         return LedgerState(
             line=empty_delay_line(ring, zeros),
             aligned=Aligned(zeros, zeros),
             flight=FreeFlight(*[zeros] * len(FreeFlight._fields)),
             in_contact=zeros > 0,
-            contact=Contact(*[zeros] * len(Contact._fields)),
-            estimate=estimate,
-            reference=reference_trajectory.begin(zeros, estimate.theta),
+            contact=Contact(
+                zeros, zeros, zeros, zeros, zeros, zeros, zeros, estimate, reference, zeros, zeros
+            ),
             delay=zeros,
             variance=zeros + gains["delay_spread"] ** 2,
         )
@@ -177,144 +163,133 @@ class ImpulseLedger(Compensator):
         gains, (period, clearance) = prepared.gains, prepared.constants
         newest, line = read_delayed(prepared.delay, state.line, signals, tick)
         position, velocity, aligned = align(state.aligned, newest, prepared.share, signals, period)
-        reading = Reading(signals.force_measured, position - state.delay * velocity, velocity)
+        position = position - state.delay * velocity
         begins = signals.age == 0
         reach = deflection(signals.position_desired, clearance)
-        contact = state.contact
-        contact = contact._replace(
-            side=jnp.where(begins, jnp.where(reach > 0, 1, -1), contact.side),
-            speed=jnp.where(begins, 0, contact.speed),
-            outside=jnp.where(begins, 0, contact.outside),
-        )
         in_contact = jnp.where(begins, reach != 0, state.in_contact)
-        passes = in_contact & ~(contact.speed > 0)
-
-        flight, contact, fresh = self._approach(prepared, state.flight, contact, signals, reading, in_contact)
-        usable = contact.speed > 0
-        scaled = contact._replace(speed=jnp.where(usable, contact.speed, 1))
-        spreads = [gains[name] for name in rig.SPREADS]
-        spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
-        before = contact_model.prior(gains["prior_stiffness"], tuple(spreads), state.variance)
-        depth = (scaled.side * reading.position - scaled.origin) / scaled.speed
-        estimate = _select(fresh, contact_model.begin(*before), state.estimate)
-        reference = _select(fresh, reference_trajectory.begin(depth, before[0]), state.reference)
-        acts = in_contact | (flight.total > LEVEL)
-        follows = ((in_contact & ~passes) | (flight.total > 0)) & usable
-        command, *later, delay = self._follow(
-            prepared, scaled, estimate, reference, signals, reading, flight, before
+        contact = state.contact._replace(
+            side=jnp.where(begins, jnp.where(reach > 0, 1, -1), state.contact.side),
+            speed=jnp.where(begins, 0, state.contact.speed),
         )
-        later, estimate, reference = _select(follows, tuple(later), (contact, estimate, reference))
-        over = acts & follows & reference.released & (later.outside * period > rig.RELEASE_TIME)
-        limit = rig.MOST_SPREADS * gains["delay_spread"]
-        shift = jnp.where(over & ~passes, delay[0], 0)
-        variance = jnp.where(over & ~passes, delay[1], state.variance)
+        passes = in_contact & ~(contact.speed > 0)  # a run that began in contact
+        inside = contact.side * reach > 0
+        holds = inside | (contact.side * deflection(position, clearance) > 0)
 
-        side = contact.side
-        inside = side * deflection(signals.position_desired, clearance) > 0
-        bent = side * deflection(reading.position, clearance)
-        passed_outside = jnp.where(bent > 0, 0, contact.outside + 1)
-        over = jnp.where(passes, ~inside & (passed_outside * period > rig.RELEASE_TIME), over)
-        passed = jnp.where(inside & ~(bent < 0), signals.force_measured, 0)
-        command = jnp.where(acts & ~over, jnp.where(passes, passed, jnp.where(follows, command, 0)), 0)
-        outside = jnp.where(passes, passed_outside, later.outside)
-        contact = later._replace(speed=jnp.where(over, 0, contact.speed), outside=outside)
-        flight = flight._replace(total=jnp.where(over, 0, flight.total))
-        return command, LedgerState(
+        flight, contact = self._approach(prepared, state, contact, signals, position, in_contact)
+        acts = in_contact | (flight.total > LEVEL)
+        follows = (in_contact | (flight.total > 0)) & ~passes
+        # Lanes of a tile touch at about the same time: most ticks of free flight need no contact.
+        command, contact = jax.lax.cond(
+            jnp.any(follows),
+            lambda old: _select(
+                follows,
+                self._follow(prepared, old, signals, position, velocity, flight, state.variance),
+                (jnp.zeros_like(position), old),
+            ),
+            lambda old: (jnp.zeros_like(position), old),
+            contact,
+        )
+        over = acts & follows & contact.reference.released & (contact.outside * period > rig.RELEASE_TIME)
+        limit = rig.MOST_SPREADS * gains["delay_spread"]
+        shifted = jnp.clip(state.delay + contact.delay, -limit, limit)
+        command = jnp.where(passes, jnp.where(inside, signals.force_measured, 0), command)
+        return jnp.where(acts & ~over, command, 0), LedgerState(
             line=line,
             aligned=aligned,
-            flight=flight,
-            in_contact=acts & ~over,
-            contact=contact,
-            estimate=estimate,
-            reference=reference,
-            delay=jnp.clip(state.delay + shift, -limit, limit),
-            variance=variance,
+            flight=flight._replace(total=jnp.where(over, 0, flight.total)),
+            in_contact=jnp.where(passes, holds, acts & ~over),
+            contact=contact._replace(speed=jnp.where(over, 0, contact.speed)),
+            delay=jnp.where(over, shifted, state.delay),
+            variance=jnp.where(over, contact.variance, state.variance),
         )
 
-    def _approach(self, prepared, flight, contact, signals, reading, in_contact):
-        """Test a reading of free flight for contact; where there is none, let contact begin after it.
+    def _prior(self, gains, variance):
+        """Return mean and variances of the contact model's prior for a variance of the delay [s^2]."""
+        spreads = [gains[name] for name in rig.SPREADS]
+        spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
+        return contact_model.prior(gains["prior_stiffness"], spreads, variance)
 
-        Returns:
-            Statistics of free flight, contact, and the lanes where contact begins after this reading.
-        """
-        gains, (period, clearance) = prepared.gains, prepared.constants
+    def _approach(self, prepared, state, contact, signals, position, in_contact):
+        """Return free flight and contact, which begins after every reading of free flight."""
+        gains, (period, clearance), flight = prepared.gains, prepared.constants, state.flight
         side = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = side * signals.velocity_desired
         approaches = gains["equivalent_mass"] * speed > rig.LEAST_MOMENTUM
         sigma = _sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
-        sigma = jnp.where(approaches, sigma, 1)
         # The bias is known only after a reading of free flight, at an approach speed towards this side.
         settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
         settled = settled & approaches & (contact.speed > 0) & (side == contact.side)
-        deviation = side * (reading.force - flight.bias) / sigma
+        deviation = side * (signals.force_measured - flight.bias) / jnp.where(approaches, sigma, 1)
         total = onset_detection.watch(flight, deviation, settled)
         flight = flight._replace(total=jnp.where(in_contact, flight.total, total))
         free = ~in_contact & ~(total > 0)
-        fresh = free & approaches
-        lag = side * (signals.position_desired - reading.position) / jnp.where(approaches, speed, 1)
-        lag = jnp.where(lag < 0, 0, jnp.where(lag > rig.LONGEST_LAG, rig.LONGEST_LAG, lag))
-        origin = side * reading.position - rig.ONSET_PLACE * (period * speed)
+        divisor = jnp.where(approaches, speed, 1)
+        origin = side * position - rig.ONSET_PLACE * (period * speed)
+        lag = jnp.clip(side * (signals.position_desired - position) / divisor, 0, rig.LONGEST_LAG)
         zeros = jnp.zeros_like(speed)
-        contact = _select(fresh, Contact(side, speed, origin, lag, zeros, zeros, zeros, zeros), contact)
+        prior = self._prior(gains, state.variance)
+        reference = reference_trajectory.begin((side * position - origin) / divisor, prior[0])
+        fresh = Contact(
+            side, speed, origin, lag, zeros, zeros + rig.LEAST_PEAK, zeros,
+            contact_model.begin(*prior), reference, zeros, state.variance,
+        )  # fmt: skip
+        contact = _select(free & approaches, fresh, contact)
         contact = contact._replace(
             side=jnp.where(free, side, contact.side), speed=jnp.where(free & ~approaches, 0, contact.speed)
         )
-        return onset_detection.learn(flight, reading.force, free), contact, fresh
+        return _select(free, onset_detection.learn(flight, signals.force_measured), flight), contact
 
-    def _follow(self, prepared, contact, estimate, reference, signals, reading, flight, before):
-        """Return command [N], contact, estimate, reference, and mean and variance of the delay.
-
-        They follow a reading; the delay is that of a contact that ends here. `before` is the prior of the
-        contact model.
-        """
+    def _follow(self, prepared, contact, signals, position, velocity, flight, delay_variance):
+        """Return command [N] and contact after one reading."""
         gains, period = prepared.gains, prepared.constants.control_period
-        side, speed = contact.side, contact.speed
+        side, speed = contact.side, jnp.where(contact.speed > 0, contact.speed, 1)
+        estimate = contact.estimate
+        prior_mean, prior_variances = self._prior(gains, delay_variance)
         weight = gains["equivalent_mass"] * speed
-        depth = (side * reading.position - contact.origin) / speed
-        rate = side * reading.velocity / speed
-        deepest = jnp.where(depth > contact.deepest, depth, contact.deepest)
+        depth = (side * position - contact.origin) / speed
+        rate = side * velocity / speed
+        deepest = jnp.maximum(contact.deepest, depth)
         phi = features(depth, rate, deepest, contact_model.slope(estimate.mean, depth) * (1 - rate))
-        force = side * (reading.force - flight.bias) / weight
-        model_error = rig.MISFIT * force
+        reading = side * (signals.force_measured - flight.bias) / weight
         noise = onset_detection.variance(flight, gains["force_noise"]) / (weight * weight)
-        variance = (
-            noise + gains["force_noise_floor"] ** 2 + model_error * model_error * (rig.MISFIT_TIME / period)
-        )
-        informs = (
-            (rate > rig.SLOWEST) | (dot(phi, estimate.mean) > 0) | (force * force > rig.OUTLYING * variance)
-        )
-        learns = informs & (depth > period)
-        estimate = contact_model.learn(estimate, phi, force, variance, learns)
+        model_error = rig.MISFIT**2 * (rig.MISFIT_TIME / period) * reading**2
+        variance = noise + gains["force_noise_floor"] ** 2 + model_error
+        learns = (depth > period) & ((rate > rig.SLOWEST) | (dot(phi, estimate.mean) > 0))
+        estimate = contact_model.learn(estimate, phi, reading, variance, learns)
 
-        stiffness = contact_model.slope(estimate.mean, deepest)
-        onset = rig.ONSET_TICKS * period * stiffness + gains["force_noise_floor"] + _sqrt(noise)
+        onset = rig.ONSET_TICKS * period * contact_model.slope(estimate.mean, deepest)
+        onset = onset + gains["force_noise_floor"] + _sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
-        delay = contact_model.estimate_delay(estimate, before[0], before[1], rig.ONSET_MEAN * onset, spread)
-        ended = ~(depth > 0) & (rate < 0)
-        theta = contact_model.conclude(estimate, before[1], jnp.where(ended, delay[0], 0))
+        left = ~(depth > 0)
+        delay = contact_model.estimate_delay(
+            estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread
+        )
+        mean, variance = _select(left, delay, (contact.delay, contact.variance))
+        ended = left & (rate < 0)
+        theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, mean, 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
-        reference = reference_trajectory.correct(reference, theta - estimate.theta)
-        reference = reference_trajectory.advance(reference, theta, period, force, phi)
-        residual = force - dot(theta, phi) - contact.misfit
-        misfit = contact.misfit + period / (period + rig.HOLD_TIME) * residual
-        push, ahead = reference_trajectory.bridge(reference, theta, contact.lag + 0.5 * period, misfit)
+        reference = reference_trajectory.correct(contact.reference, theta - estimate.theta)
+        reference = reference_trajectory.advance(reference, theta, period, reading, phi)
+        push, ahead = reference_trajectory.bridge(reference, theta, contact.lag + 0.5 * period)
 
-        mean = estimate.mean
-        secant = dot(phi[:HINGES], mean[:HINGES]) / jnp.where(depth > rig.SHALLOW, depth, rig.SHALLOW)
-        secure = jnp.maximum(secant, rig.LEAST_STIFFNESS) - _sqrt(estimate.covariance[0, 0])
-        predicted = jnp.sqrt(jnp.maximum(secure, rig.LEAST_STIFFNESS))
-        largest = jnp.maximum(jnp.maximum(force, contact.peak), 1)
-        peak = jnp.where((rate > rig.SLOWEST) & (predicted > largest), predicted, largest)
-        push = jnp.minimum(push, rig.HIGHEST * peak)
+        secure = dot(phi[:HINGES], estimate.mean[:HINGES]) / jnp.maximum(depth, rig.SHALLOW)
+        predicted = _sqrt(secure - _sqrt(estimate.covariance[0, 0]))
+        largest = jnp.maximum(contact.peak, reading)
+        peak = jnp.maximum(largest, jnp.where(rate > rig.SLOWEST, predicted, 0))
         desired = side * signals.velocity_desired / speed
         wanted = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)
-        least = -gains["correction_limit"] * peak
-        most = (1 + gains["correction_limit"]) * peak - push
-        correction = jnp.where(wanted > most, most, jnp.where(wanted < least, least, wanted))
-        outside = jnp.where(depth > 0, 0, contact.outside + 1)
-        contact = contact._replace(deepest=deepest, misfit=misfit, peak=largest, outside=outside)
-        return side * weight * (push + correction), contact, estimate._replace(theta=theta), reference, delay
+        limit = gains["correction_limit"] * peak
+        correction = jnp.minimum(jnp.maximum(wanted, -limit), peak + limit - push)
+        return side * weight * (push + correction), contact._replace(
+            deepest=deepest,
+            peak=largest,
+            outside=jnp.where(left, contact.outside + 1, 0),
+            estimate=estimate._replace(theta=theta),
+            reference=reference,
+            delay=mean,
+            variance=variance,
+        )
 
 
 def _select(condition: Bool[Array, "*batch"], new: Any, old: Any) -> Any:

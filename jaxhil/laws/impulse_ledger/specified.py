@@ -6,26 +6,25 @@ from jaxhil.laws.impulse_ledger.rig import LARGEST_DELAY_SPREAD
 from jaxhil.laws.shared.nominal_values import typical_stiffness
 from jaxhil.mechanism.structs import Mechanism, value_at
 
+DELAY = "rig.force_sensor.delay"
+
 
 def delay_spread(mechanism: Mechanism) -> float:
     """Return the standard deviation [s] of the force delay in the file, at most 4 ms; 0 if it has none."""
-    uncertainty = mechanism.uncertainty.get("rig.force_sensor.delay")
-    if uncertainty is None:
-        return 0.0
-    spread = uncertainty.std
-    if spread is None:
-        spread = (_spread(mechanism, "rig.force_sensor.delay") or 0.0) / math.sqrt(3)
-    return min(spread, LARGEST_DELAY_SPREAD)
+    uncertainty = mechanism.uncertainty.get(DELAY)
+    is_range = uncertainty is not None and uncertainty.std is None
+    spread = _spread(mechanism, DELAY)
+    return min(spread / math.sqrt(3) if is_range else spread, LARGEST_DELAY_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:
     """Return the largest dry friction over mass and approach speed [1/s]; 0 if there is none."""
-    return _size(mechanism, "contact.friction") / (mechanism.bodies.mass * mechanism.approach.velocity)
+    return _scaled(mechanism, "contact.friction")
 
 
 def preload(mechanism: Mechanism) -> float:
     """Return the largest preload over mass and approach speed [1/s]; 0 if there is none."""
-    return _size(mechanism, "contact.preload") / (mechanism.bodies.mass * mechanism.approach.velocity)
+    return _scaled(mechanism, "contact.preload")
 
 
 def unloading(mechanism: Mechanism) -> float:
@@ -33,28 +32,23 @@ def unloading(mechanism: Mechanism) -> float:
     ratio = mechanism.contact.unloading_ratio
     if ratio is None:
         return 0.0
-    spread = _spread(mechanism, "contact.unloading_ratio") or 0.0
-    return (ratio + spread - 1) * typical_stiffness(mechanism) / mechanism.bodies.mass
+    excess = ratio + _spread(mechanism, "contact.unloading_ratio") - 1
+    return excess * typical_stiffness(mechanism) / mechanism.bodies.mass
 
 
-def _size(mechanism: Mechanism, path: str) -> float:
-    """Return the largest size of a number: its nominal size plus its spread."""
-    return abs(value_at(mechanism, path)) + (_spread(mechanism, path) or 0.0)
+def _scaled(mechanism: Mechanism, path: str) -> float:
+    size = abs(value_at(mechanism, path)) + _spread(mechanism, path)
+    return size / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
-def _spread(mechanism: Mechanism, path: str, deviations: float = 1.0) -> float | None:
-    """Return the largest difference of a number from its nominal value; None if the file states none.
-
-    It is that of the farther end of the number's range, or so many standard `deviations`.
-    """
+def _spread(mechanism: Mechanism, path: str) -> float:
+    """Return the standard deviation of a number, or half-width of its range; 0 if the file has neither."""
     uncertainty = mechanism.uncertainty.get(path)
     if uncertainty is None:
-        return None
+        return 0.0
     if uncertainty.std is not None:
-        return deviations * uncertainty.std
+        return uncertainty.std
     nominal = value_at(mechanism, path)
-    if uncertainty.factor is not None:
-        ends = [factor * nominal for factor in uncertainty.factor]
-    else:
-        ends = [end for end in (uncertainty.low, uncertainty.high) if end is not None]
+    factors = [factor * nominal for factor in uncertainty.factor or ()]
+    ends = factors or [end for end in (uncertainty.low, uncertainty.high) if end is not None]
     return max(abs(end - nominal) for end in ends)

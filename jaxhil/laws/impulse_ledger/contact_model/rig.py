@@ -21,30 +21,29 @@ model by the density at zero, Dickey, "The weighted likelihood ratio" (1971).
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from math import exp, log, pi, sqrt
 from typing import Annotated
 
 from jaxhil.rig.types import Count, Positive
 
-# Depths [s] at which the slope may change.
-KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.14, 0.2)
+KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; the slope changes there
 HINGES = len(KNOTS)
 PARAMETERS = HINGES + 6
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
 DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # parameters that are zero or positive
+CONCLUDED = (*DISSIPATIVE, DELAY)  # parameters that are conditioned during contact
+DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # parameters in the estimate of the delay
 WANDER = 0.03  # s; over this depth the slope changes by one prior standard deviation
-BROAD = 0.12  # s; beyond this depth the slope does not change
 REACH = 0.03  # s; depth at which depth_damping counts like damping
 SLOW = 0.03  # speed at which friction changes its sign
+# Prior variance of each parameter but the delay: index of its standard deviation in `Spreads`, and factor.
+SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
+FACTORS = (1.0, *[(deeper - depth) / WANDER for depth, deeper in pairwise(KNOTS)], *[1.0] * 5)
 ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
-CONCLUDED = (DELAY, *DISSIPATIVE)  # in `conclude`
-DELAY_PARAMETERS = (0, PRELOAD, *DISSIPATIVE, DELAY)  # in `estimate_delay`
 ELASTIC_ODDS = 19.0  # prior odds of contact without dissipation
-WIDE_STIFFNESS = (
-    200.0,
-    300.0,
-)  # 1/s^2; prior mean and spread of the first slope in `estimate_delay`
+WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and spread of the first slope in `estimate_delay`
 SURPLUS = 1.4  # factor of the readings' variance, because the misfits of one contact are correlated
 EXACT = 1e18  # precision of a parameter that is known
 LEAST_VARIANCE = 1e-12  # of a dissipative parameter; with less it counts as known
@@ -67,7 +66,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
-    """Return the force [1/s] of the parameters `theta` at depth [s], speed [1] and largest depth [s]."""
+    """Return the force [1/s] of the parameters `theta`, which is phi.theta without a delay."""
     if not depth > 0.0:
         return 0.0
     total = theta[PRELOAD]
@@ -99,9 +98,10 @@ class ContactModel:
         mean: posterior mean, dissipative parameters of either sign.
         covariance: posterior covariance.
         theta: posterior mean, dissipative parameters zero or positive.
+        count: number of readings.
     """
 
-    __slots__ = ("_count", "_prior_mean", "_squares", "_variances", "covariance", "mean", "theta")
+    __slots__ = ("_prior_mean", "_squares", "_variances", "count", "covariance", "mean", "theta")
     covariance: Matrix
     mean: Vector
     theta: Vector
@@ -113,15 +113,10 @@ class ContactModel:
         of that slope [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
         unloading [1/s^2], friction [1/s] and preload [1/s]; `delay_variance` is in s^2.
         """
-        common, wander = spreads[0], spreads[1]
         variances = [0.0] * PARAMETERS
-        variances[0] = common * common
-        for j in range(1, HINGES):
-            width = min(KNOTS[j], BROAD) - min(KNOTS[j - 1], BROAD)
-            variances[j] = wander * wander * (width / WANDER)
-        for j in range(DAMPING, DELAY):
-            spread = spreads[j - DAMPING + 2]
-            variances[j] = spread * spread
+        for j in range(DELAY):
+            spread = spreads[SPREAD_INDICES[j]]
+            variances[j] = spread * spread * FACTORS[j]
         variances[DELAY] = delay_variance
         prior = [0.0] * PARAMETERS
         prior[0] = stiffness
@@ -133,7 +128,7 @@ class ContactModel:
         for j, variance in enumerate(variances):
             self.covariance[j][j] = variance
         self._squares = 0.0  # sum of squared innovations over their variances
-        self._count = 0.0  # number of readings
+        self.count = 0.0
 
     def learn(self, phi: Vector, force: float, variance: float) -> None:
         """Update the estimate with one reading of the force [1/s] whose noise has this variance [1/s^2]."""
@@ -149,25 +144,17 @@ class ContactModel:
             scaled = share * entry
             row[:] = [old - scaled * factor for old, factor in zip(row, column, strict=True)]
         self._squares += share * (error * error)
-        self._count += 1.0
+        self.count += 1.0
 
     def conclude(self, delay: float) -> None:
         """Compute `theta` for a known delay [s]."""
         theta = list(self.mean)
         rows = [list(self.covariance[j]) for j in CONCLUDED]
-        observe(theta, rows, 0, DELAY, EXACT * delay, EXACT)
-        self._dissipate(theta, rows, 1, DAMPING, True)
+        observe(theta, rows, len(DISSIPATIVE), DELAY, EXACT * delay, EXACT)
+        self._dissipate(theta, rows, DAMPING, True)
         for j in range(DAMPING, PRELOAD):
             theta[j] = theta[j] if theta[j] > 0.0 else 0.0
         self.theta = theta
-
-    def largest_damping(self, depth: float) -> float:
-        """Return the damping [1/s] at a depth [s], six standard deviations above its mean."""
-        share = depth / REACH
-        low, high = self.covariance[DAMPING], self.covariance[DEPTH_DAMPING]
-        variance = low[DAMPING] + 2.0 * share * low[DEPTH_DAMPING] + share * share * high[DEPTH_DAMPING]
-        damping = self.mean[DAMPING] + share * self.mean[DEPTH_DAMPING]
-        return damping + 6.0 * sqrt(variance) if variance > 0.0 else damping
 
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Return mean [s] and variance [s^2] of the delay after a contact.
@@ -176,30 +163,30 @@ class ContactModel:
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
+        last = len(DISSIPATIVE)  # index of the delay
         # The prior for control reduces the slope of a stiff contact, which would look like a damper.
-        for index in range(2):
+        for index in range(last + 1, last + 3):
             j = DELAY_PARAMETERS[index]
-            value = WIDE_STIFFNESS[0] if index == 0 else preload
-            spread = WIDE_STIFFNESS[1] if index == 0 else preload_spread
+            value = WIDE_STIFFNESS[0] if j == 0 else preload
+            spread = WIDE_STIFFNESS[1] if j == 0 else preload_spread
             old, new = 1.0 / max(self._variances[j], LEAST_VARIANCE), 1.0 / (spread * spread)
-            information = new * value - old * self._prior_mean[j]
-            observe(mean, rows, index, index, information, new - old)
-        excess = SURPLUS * max(self._squares / max(self._count, 1.0), 1.0)
+            observe(mean, rows, index, index, new * value - old * self._prior_mean[j], new - old)
+        excess = SURPLUS * max(self._squares / max(self.count, 1.0), 1.0)
         lossy = list(mean)
         lossy_rows = [list(row) for row in rows]
-        self._dissipate(lossy, lossy_rows, 2, 2, False)
+        self._dissipate(lossy, lossy_rows, 0, False)
         evidence = 0.0
-        for index in range(2, 2 + len(DISSIPATIVE)):
+        for index in range(last):
             variance = max(rows[index][index], LEAST_VARIANCE)
-            ratio = max(self._variances[DELAY_PARAMETERS[index]], LEAST_VARIANCE) / variance
+            ratio = max(self._variances[DAMPING + index], LEAST_VARIANCE) / variance
             evidence += 0.5 * (log(ratio) - mean[index] * mean[index] / (variance * excess))
             observe(mean, rows, index, index, 0.0, EXACT)
         odds = exp(min(max(evidence, -50.0), 50.0))  # of elastic contact by the readings alone
         share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
-        difference = mean[-1] - lossy[-1]
-        delay = lossy[-1] + share * difference
+        difference = mean[last] - lossy[last]
+        delay = lossy[last] + share * difference
         share = odds / (1.0 + odds)  # the variance does not rely on the prior odds
-        variance = lossy_rows[-1][-1] + share * (rows[-1][-1] - lossy_rows[-1][-1])
+        variance = lossy_rows[last][last] + share * (rows[last][last] - lossy_rows[last][last])
         variance += share * (1.0 - share) * (difference * difference)
         prior_variance = self._variances[DELAY]
         if not 0.0 < variance < prior_variance:
@@ -207,45 +194,36 @@ class ContactModel:
         weakened = 1.0 / (1.0 / prior_variance + (1.0 / variance - 1.0 / prior_variance) / (excess * excess))
         return weakened * delay / variance / (excess * excess), weakened
 
-    def _dissipate(
-        self, mean: list[float], rows: list[list[float]], first_row: Count, first: Count, certain: bool
-    ) -> None:
+    def _dissipate(self, mean: list[float], rows: list[list[float]], first: Count, certain: bool) -> None:
         """Make dissipative parameters zero or positive, in place, in mean and rows of the covariance.
 
-        The dissipative parameters begin at row `first_row` and index `first`. If `certain`, they count as
-        known afterwards.
+        They have the first rows, and the indices from `first` on. If `certain`, they are known afterwards.
         """
-        for j in range(len(DISSIPATIVE)):
-            row_index, index = first_row + j, first + j
-            variance = max(rows[row_index][index], LEAST_VARIANCE)
-            expected, left = zero_or_positive(mean[index], variance, self._variances[DAMPING + j])
+        for row in range(len(DISSIPATIVE)):
+            index = first + row
+            variance = max(rows[row][index], LEAST_VARIANCE)
+            expected, left = zero_or_positive(mean[index], variance, self._variances[DAMPING + row])
             old, new = 1.0 / variance, EXACT if certain else 1.0 / max(left, 1.0 / EXACT)
-            information = new * expected - old * mean[index]
-            observe(mean, rows, row_index, index, information, new - old)
+            observe(mean, rows, row, index, new * expected - old * mean[index], new - old)
 
 
 def observe(
-    mean: list[float],
-    rows: list[list[float]],
-    row_index: Count,
-    index: Count,
-    information: float,
-    precision: float,
+    mean: list[float], rows: list[list[float]], row: Count, index: Count, information: float, precision: float
 ) -> None:
     """Update mean and rows of the covariance, in place, by an observation of one parameter.
 
-    The parameter has the row `row_index` and the index `index` in mean and rows. An observed value with a
-    variance has the precision 1/variance and the information value/variance; negative ones remove a prior.
+    The parameter has a `row` and an `index` in mean and rows. An observed value with a variance has the
+    precision 1/variance and the information value/variance; negative ones remove a prior.
     """
-    row = list(rows[row_index])
-    total = 1.0 + precision * row[index]
+    observed = list(rows[row])
+    total = 1.0 + precision * observed[index]
     if not total > 0.0:
         return
     gain = (information - precision * mean[index]) / total
-    mean[:] = [value + entry * gain for value, entry in zip(mean, row, strict=True)]
+    mean[:] = [value + entry * gain for value, entry in zip(mean, observed, strict=True)]
     for target in rows:
         weight = precision / total * target[index]
-        target[:] = [value - weight * entry for value, entry in zip(target, row, strict=True)]
+        target[:] = [value - weight * entry for value, entry in zip(target, observed, strict=True)]
 
 
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:

@@ -14,7 +14,7 @@ DRIFT = 2.0  # standard deviations; a reading increases S if it exceeds the bias
 LEVEL = 8.0  # sum at which contact is detected
 SETTLING = 0.004  # s; until then after the start of a run, readings only serve the bias
 LONGEST_MEAN = 2000.0  # readings; longest time scale of the mean of the bias
-FEW = 8.0  # differences of readings; with more, they show the noise
+FEW = 9.0  # readings; with more, their differences show the noise
 
 
 class OnsetDetector:
@@ -25,18 +25,15 @@ class OnsetDetector:
         total: the cumulative sum S; 0 in free flight.
     """
 
-    __slots__ = ("_before", "_count", "_differences", "_known", "_square", "bias", "total")
+    __slots__ = ("_before", "_count", "_known", "_square", "bias", "total")
 
     def __init__(self, noise: float) -> None:
         self._known = noise * noise
-        self._square = 0.0
-        self.bias = 0.0
         self.restart()
 
     def restart(self) -> None:
         """Begin a run: forget the readings of bias and noise; keep the specified noise."""
         self._count = 0.0
-        self._differences = 0.0
         self._square = 0.0
         self._before = 0.0
         self.bias = 0.0
@@ -45,8 +42,7 @@ class OnsetDetector:
     @property
     def variance(self) -> float:
         """Return the variance of a force reading [N^2]: as specified, or larger as seen in free flight."""
-        variance = max(self._known, self._square) if self._differences > FEW else self._known
-        return variance if variance > 0.0 else 0.0
+        return max(self._known, self._square) if self._count > FEW else self._known
 
     def watch(self, force: float, side: float, floor: float, settled: bool) -> None:
         """Add one reading of the force [N] to the cumulative sum, or set it to 0 unless `settled`.
@@ -62,9 +58,8 @@ class OnsetDetector:
     def learn(self, force: float) -> None:
         """Update bias and noise with one reading [N] of free flight."""
         if self._count > 0.0:
-            self._differences += 1.0
             step = force - self._before
-            self._square += (0.5 * (step * step) - self._square) / self._differences
+            self._square += (0.5 * (step * step) - self._square) / self._count
         self._before = force
         self._count += 1.0
-        self.bias += (force - self.bias) / (self._count if self._count < LONGEST_MEAN else LONGEST_MEAN)
+        self.bias += (force - self.bias) / min(self._count, LONGEST_MEAN)

@@ -20,10 +20,9 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
     DAMPING,
     DELAY,
     DEPTH_DAMPING,
-    FRICTION,
     PARAMETERS,
+    PRELOAD,
     REACH,
-    UNLOADING,
     Matrix,
     Vector,
     dot,
@@ -32,19 +31,18 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
     slope,
 )
 
-LOSSES = (DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION)
 STEPS = 12  # of the integration from the last reading to the present
 FASTEST = 2.0  # largest speed [1]; contact returns no more energy than it took
 FARTHEST = 10.0  # s; largest depth, three times that of a contact of 0.05 Hz
 
 
 class ReferenceTrajectory:
-    """State of the reference trajectory.
+    """State of the reference trajectory at the time of the last reading.
 
     Attributes:
-        depth: depth at the time of the last reading [s].
-        speed: speed at that time [1].
-        force: force at that time [1/s].
+        depth: depth [s].
+        speed: speed [1].
+        force: force [1/s].
         deepest: largest depth so far [s].
         released: whether the trajectory has left the surface.
     """
@@ -64,7 +62,7 @@ class ReferenceTrajectory:
         self._theta = theta
         self._depths = [0.0] * PARAMETERS  # s
         self._speeds = [0.0] * PARAMETERS  # s'
-        self._losses = [0.0] * len(LOSSES)  # mechanical work of each feature of `LOSSES`
+        self._losses = [0.0] * (PRELOAD - DAMPING)  # mechanical work of each feature that dissipates
 
     def correct(self, theta: Vector) -> None:
         """Correct the trajectory for new parameters `theta`."""
@@ -87,8 +85,9 @@ class ReferenceTrajectory:
         push = 0.0 if self.released else (push if push > least else least)
         if push != 0.0:
             self._advance_sensitivities(period, depth, undelayed, measured)
+            losses = undelayed[DAMPING:PRELOAD]
             self._losses = [
-                loss + period * speed * undelayed[j] for loss, j in zip(self._losses, LOSSES, strict=True)
+                loss + period * speed * rate for loss, rate in zip(self._losses, losses, strict=True)
             ]
         self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
         self.depth = depth
@@ -105,13 +104,11 @@ class ReferenceTrajectory:
 
     def imbalance(self) -> float:
         """Return the energy lost by the trajectory that the model's dissipation does not explain [1]."""
-        dissipated = 0.0
-        for j, loss in zip(LOSSES, self._losses, strict=True):
-            dissipated += self._theta[j] * loss
+        dissipated = dot(self._losses, self._theta[DAMPING:PRELOAD])
         return 0.5 * (1.0 - self.speed * self.speed) - dissipated
 
-    def bridge(self, duration: float, misfit: float) -> tuple[float, float]:
-        """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
+    def bridge(self, duration: float) -> tuple[float, float]:
+        """Return force [1/s] and speed after a `duration` [s] under the contact model."""
         theta = self._theta
         step = duration / STEPS
         depth, speed, push = self.depth, self.speed, self.force
@@ -120,7 +117,7 @@ class ReferenceTrajectory:
             depth += step * speed - 0.5 * (step * step) * push
             ahead = speed - step * push
             deepest = depth if depth > deepest else deepest
-            later = force(theta, depth, ahead, deepest) + misfit
+            later = force(theta, depth, ahead, deepest)
             released = released or (ahead < 0.0 and (depth <= 0.0 or later <= 0.0))
             later = 0.0 if released or later < 0.0 else later
             speed -= 0.5 * step * (push + later)
@@ -130,14 +127,11 @@ class ReferenceTrajectory:
     def _advance_sensitivities(
         self, period: float, depth: float, undelayed: Vector, measured: Vector
     ) -> None:
-        theta = self._theta
-        inside = depth > 0.0
-        stiffness = slope(theta, depth)
-        damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if inside else 0.0
+        theta, depths, speeds = self._theta, self._depths, self._speeds
+        damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if depth > 0.0 else 0.0
         # The integration is stable only up to these values.
-        stiffness = min(stiffness, 1.0 / (period * period))
+        stiffness = min(slope(theta, depth), 1.0 / (period * period))
         damping = min(damping, 1.0 / period)
-        depths, speeds = self._depths, self._speeds
         for j in range(PARAMETERS):
             ahead = depths[j] + period * speeds[j]
             rate = undelayed[j] - measured[j] + stiffness * ahead + damping * speeds[j]
@@ -147,4 +141,4 @@ class ReferenceTrajectory:
 
 def within(value: float, limit: float) -> float:
     """Return the value, limited to -limit to limit."""
-    return limit if value > limit else (-limit if value < -limit else value)
+    return max(min(value, limit), -limit)

@@ -35,8 +35,8 @@ def begin(depth: Array, like: Array) -> Reference:
 def correct(old: Reference, changes: Array) -> Reference:
     """Return the trajectory corrected for these `changes` of the parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
-    speed = _within(old.speed + dot(old.speeds, changes), FASTEST)
-    return old._replace(depth=_within(old.depth + moved, FARTHEST), speed=speed)
+    speed = jnp.clip(old.speed + dot(old.speeds, changes), -FASTEST, FASTEST)
+    return old._replace(depth=jnp.clip(old.depth + moved, -FARTHEST, FARTHEST), speed=speed)
 
 
 def advance(old: Reference, theta: Array, period: Array, reading: Array, measured: Array) -> Reference:
@@ -58,12 +58,12 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     rates = undelayed - measured + stiffness[None] * ahead + damping[None] * old.speeds
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
-    speed = _within(old.speed - 0.5 * period * (old.force + push), FASTEST)
+    speed = jnp.clip(old.speed - 0.5 * period * (old.force + push), -FASTEST, FASTEST)
     return Reference(depth, speed, push, deepest, released, depths, speeds)
 
 
-def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tuple[Array, Array]:
-    """Return force [1/s] and speed after a `duration` [s] under the model and a constant misfit [1/s]."""
+def bridge(now: Reference, theta: Array, duration: Array) -> tuple[Array, Array]:
+    """Return force [1/s] and speed after a `duration` [s] under the contact model."""
     step = duration / STEPS
 
     def advanced(_, old):
@@ -71,7 +71,7 @@ def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tupl
         depth = depth + (step * speed - 0.5 * (step * step) * push)
         ahead = speed - step * push
         deepest = jnp.where(depth > deepest, depth, deepest)
-        later = force(theta, depth, ahead, deepest) + misfit
+        later = force(theta, depth, ahead, deepest)
         released = released | ((ahead < 0) & ((depth <= 0) | (later <= 0)))
         later = jnp.where(released | (later < 0), 0, later)
         return depth, speed - 0.5 * step * (push + later), later, deepest, released
@@ -79,8 +79,3 @@ def bridge(now: Reference, theta: Array, duration: Array, misfit: Array) -> tupl
     # A loop is compiled only once.
     _, speed, push, _, _ = lax.fori_loop(0, STEPS, advanced, now[:5])
     return push, speed
-
-
-def _within(value: Array, limit: float) -> Array:
-    """Return the value, limited to -limit to limit."""
-    return jnp.where(value > limit, limit, jnp.where(value < -limit, -limit, value))
