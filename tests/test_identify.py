@@ -136,6 +136,7 @@ def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     dead = identify(campaign, options=IdentificationOptions(law=law))["rig.force_sensor.dead_zone"]
     assert dead.low < 4.0 < dead.high and dead.high - dead.low > 5.0
+    assert str(dead.low) == "0.0"
 
 
 @pytest.mark.slow

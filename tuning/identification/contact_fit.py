@@ -18,6 +18,7 @@ from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior, compute_posterior
+from tuning.identification.deep_contact import summarized
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse
@@ -215,14 +216,14 @@ def _fit_laws(
     fits = [(_fit_law(motion, readings, law, plane, near, hidden, seed), law) for law in laws]
     (problem, posterior, lag, evidence), law = max(reversed(fits), key=lambda fit: fit[0][3])
     if lag is not None:
-        problem = ContactProblem(motion, readings, law, plane, lag.value)
-        posterior = lag.posterior
+        problem, posterior = problem.changed(law, lag.value), lag.posterior
 
     def without_damping(law: Law) -> tuple[Posterior, float]:
         _, alone, lagging, evidence = _fit_law(motion, readings, law, plane, near, hidden, seed)
         return alone if lagging is None else lagging.posterior, evidence
 
-    return problem, damping_average.average_over_damping(problem, posterior, evidence, without_damping)
+    posterior = damping_average.average_over_damping(problem, posterior, evidence, without_damping)
+    return ContactProblem(motion, readings, law, plane, problem.time_constant), posterior
 
 
 def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> ForceReadings:
@@ -262,7 +263,7 @@ def _fit_law(
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
     """Fit one law, with a sensor lag unless a dead zone hides the onset; return the log evidence last."""
-    problem = ContactProblem(motion, readings, law, plane)
+    problem = summarized(ContactProblem(motion, readings, law, plane), near)
     posterior = compute_posterior(problem, seed, near)
     lag = None if hidden else estimate_sensor_lag(problem, posterior, seed)
     return (
@@ -357,6 +358,7 @@ def refit_without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFi
     taught = ContactProblem(problem.motion, taught, fit.law, problem.plane, problem.time_constant)
     freedom = len(taught.kept) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
+    taught = summarized(taught, (delay, plane))
     if taught.time_constant:
         best = search_coarsely(taught, (delay, plane, inner.misfit), 2)
         posterior = compute_posterior_at_lag(taught, best, fit.posterior, seed)

@@ -6,7 +6,8 @@ is linear in its coefficients: stiffness, damping and the sensor's bias.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,8 +16,10 @@ from scipy import special
 from scipy.signal import lfilter
 
 from tuning.identification.contact_laws import Law
+from tuning.identification.contact_regression import Inner, Pseudo, Solution, dot, force_of, solve, sums
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
+from tuning.identification.packed_rows import Packed, packed
 from tuning.identification.sensor_filter import (
     compute_lag_weights,
     compute_onset_shares,
@@ -27,21 +30,8 @@ MAX_FORCE_DELAY = 0.02  # s, longest force delay in a search
 COARSE_DELAY_STEP = 0.0005  # s, between the delays of a first search
 MAX_NEWTON_STEPS = 6  # Newton steps for the plane
 MIN_LIKELIHOOD_GAIN = 2.0  # gain of log likelihood below which no further Newton step is taken
+STEP = 1e-7  # m, step of differences by the plane
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding
-
-
-@dataclass(frozen=True)
-class CoefficientFit:
-    """Linear fit of the coefficients at one delay and surface."""
-
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    misfit: float  # chi-squared: sum of squares over the variance of the noise
-    evidence: float  # log posterior density of delay and plane, up to a constant
-    slope: float = 0.0  # derivative of misfit / 2 by the plane [1/m]
-    curvature: float = 0.0  # second derivative by the plane, coefficients fitted [1/m^2]
-    plane: float = 0.0  # m, plane of the fit
-    by_plane: np.ndarray | None = None  # derivative of the coefficients by the plane, if that is fitted
 
 
 class _NearbyRows(NamedTuple):
@@ -85,6 +75,9 @@ class ContactProblem:
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
         self.plain = len(readings.whitening) == 1 and time_constant == 0.0
         self.kept = np.flatnonzero(readings.counts)
+        # Place of each row among those that are used, or -1; the last one is that of no row.
+        self.places = np.full(readings.counts.size + 1, -1)
+        self.places[self.kept] = np.arange(len(self.kept))
         # Filters also need the rows that are not used.
         self.where = self.kept if self.plain else np.arange(readings.counts.size)
         self.target = self.whiten(readings.force).ravel()[self.kept] / readings.std
@@ -93,7 +86,7 @@ class ContactProblem:
         self.local = bool(readings.threshold)
         # Whitened reading out of contact for a bias of 1 N.
         self.bias_alone = 0.0 if self.local else float(np.sum(readings.whitening)) / readings.std
-        self.sums = _sum_and_squares(self.target)
+        self.sums = sums(self.target)
         self.memory = len(readings.whitening) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
         )
@@ -111,35 +104,35 @@ class ContactProblem:
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Return values of shape (..., rows, lanes) with white noise, filtered along the rows."""
-        filtered = values.copy() if len(self.readings.whitening) > 1 else values
-        for lag, weight in enumerate(self.readings.whitening[1:], 1):
-            filtered[..., lag:, :] += weight * values[..., :-lag, :]
-        return filtered
+        return _whitened(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
-    def at(self, delay: float, plane: float) -> CoefficientFit:
-        """Fit the coefficients at one delay [s] and plane [m].
+    def changed(self, law: Law, time_constant: float) -> ContactProblem:
+        """Return the same problem with another law and another lag of the sensor [s]."""
+        return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
+
+    def at(self, delay: float, plane: float, pseudo: Pseudo | None = None) -> Inner:
+        """Fit the coefficients at one delay [s] and plane [m], to the readings and to pseudo-rows.
 
         Rows at which the law would pull are treated as out of contact.
         """
-        near, flags, fit = self._fit_until_consistent(delay, np.array([plane]))
+        near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)
         if self.plane is not None:
             return replace(inner, plane=plane)
         by_plane = self._by_plane(delay, plane, inner.coefficients, near, flags[0])
-        residual, design = fit[3][0], fit[4][0]
-        along = _sum_products(design, by_plane)
+        if pseudo is not None:
+            by_plane = np.concatenate([by_plane, inner.coefficients @ pseudo.by_plane[0]])
+        residual, design = fit.residual[0], fit.design[0]
+        along = dot(design, by_plane)
         change = -inner.covariance @ along
-        slope, curvature = (
-            _sum_products(residual, by_plane),
-            _sum_products(by_plane, by_plane) + along @ change,
-        )
+        slope, curvature = dot(residual, by_plane), dot(by_plane, by_plane) + along @ change
         return replace(inner, slope=float(slope), curvature=float(curvature), plane=plane, by_plane=change)
 
-    def fit_surfaces(self, delay: float, planes: np.ndarray) -> list[CoefficientFit]:
+    def fit_surfaces(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None = None) -> list[Inner]:
         """Fit the coefficients at several planes at once, without derivatives by the plane."""
-        return self._make_fits(self._fit_until_consistent(delay, planes)[2])
+        return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
-    def _fit_until_consistent(self, delay: float, planes: np.ndarray):
+    def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None):
         """Fit at each plane, with the rows in contact updated until they agree with the fit.
 
         Returns the rows near contact, the flags of rows in contact, and the linear fit.
@@ -148,33 +141,35 @@ class ContactProblem:
         near = [self._near(*motion, self.where, planes) for motion in moved]
         flags = [self._touching(rows, self._guess) for rows in near]
         onsets = self._onsets(near[0], [x for x, _ in moved], planes)
-        fit = self._solve(near, flags, onsets)
+        fit = self._solve(near, flags, onsets, pseudo)
         for _ in range(2):
-            again = [self._touching(rows, fit[0]) for rows in near]
+            again = [self._touching(rows, fit.coefficients) for rows in near]
             if all(np.array_equal(new, old) for new, old in zip(again, flags, strict=True)):
                 break
             flags = again
-            fit = self._solve(near, flags, onsets)
-        self._guess = fit[0][len(planes) // 2]
+            fit = self._solve(near, flags, onsets, pseudo)
+        self._guess = fit.coefficients[len(planes) // 2]
         return near, flags, fit
 
-    def _make_fits(self, fit) -> list[CoefficientFit]:
+    def _make_fits(self, fit: Solution) -> list[Inner]:
         """Return the fits of all planes as records, with the log posterior of each."""
-        coefficients, covariance, misfit = fit[:3]
+        coefficients, covariance, misfit = fit.coefficients, fit.covariance, fit.misfit
         allowed = sum(
             special.log_ndtr(coefficients[:, i] / np.sqrt(covariance[:, i, i])) for i in self.damping_indices
         )
         evidence = -0.5 * misfit + 0.5 * np.linalg.slogdet(covariance)[1] + allowed
-        return [
-            CoefficientFit(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)
-        ]
+        return [Inner(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)]
 
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return position and rate at the rows of `where`, for each time in `before`."""
         if self._at is None or self._at[0] != delay:
-            moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
+            moved = self.motion_at(delay)
             self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
         return self._at[1]
+
+    def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return position and rate at all rows, for each time in `before`."""
+        return [self.motion.at(delay + part * self.motion.period) for part in self.before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
         """Return the sorted planes between `low` and `high` at which a row enters the contact."""
@@ -183,7 +178,8 @@ class ContactProblem:
 
     def _near(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
         """Return the rows that are in contact for at least one of the planes."""
-        rows = np.flatnonzero(position > planes.min())
+        # Differences by the plane need the rows that enter next.
+        rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
         depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
         return _NearbyRows(rows, depth, rate, self._columns(depth, rate, where[rows]))
 
@@ -204,7 +200,7 @@ class ContactProblem:
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
-        pushing = inside & (_compute_force(coefficients, near.columns) > 0.0)
+        pushing = inside & (force_of(coefficients, near.columns) > 0.0)
         # With the wrong sign of the force the law pulls in most rows; keep them, so that the fit shows it.
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
@@ -222,46 +218,57 @@ class ContactProblem:
         rate = self.motion.period / self.time_constant
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
-    def _window(self, near: list[_NearbyRows]) -> slice:
-        """Return the range of rows at which the filters respond to the rows near contact."""
-        length, lanes = self.readings.force.shape
-        flat = np.concatenate([part.rows for part in near])
-        if not len(flat):
-            return slice(0, 0)
-        return slice(int(flat.min()) // lanes, min(int(flat.max()) // lanes + 1 + self.memory, length))
+    def _packed(self, near: list[_NearbyRows]) -> Packed:
+        """Return the rows at which the filters respond to the rows near contact."""
+        return packed([part.rows for part in near], self.readings.force.shape, self.memory)
 
-    def _filtered(
-        self, near: list[_NearbyRows], tables: list[np.ndarray], onsets, first, window: slice
-    ) -> np.ndarray:
-        """Return columns as the sensor with its lag reads them, at the rows of a window.
+    def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: Packed, whitening):
+        """Return columns as the sensor with its lag reads them, whitened, at packed rows.
 
         `tables` holds the columns for each time in `before`; `first` those just after the onsets, (columns,
         onsets).
         """
-        lanes, full = self.readings.force.shape[1], []
-        shape, before = (window.stop - window.start, lanes), window.start * lanes
-        for columns, part in zip(tables, near, strict=True):
-            table = np.zeros((*columns.shape[:2], shape[0] * lanes))
-            table[:, :, part.rows - before] = columns
-            full.append(table.reshape(*columns.shape[:2], *shape))
-        if onsets is None:
-            return full[0]
+        full, places = [], [where.places(part.rows) for part in near]
+        for columns, place in zip(tables, places, strict=True):
+            table = np.zeros((*columns.shape[:2], len(where.rows)))
+            table[:, :, place] = columns
+            full.append(table)
+        if onsets is None or not len(where.rows):
+            return _whitened(full[0], whitening)
         pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
         drive = now * full[0] + half * full[1]
         drive[:, :, 1:] += last * full[0][:, :, :-1]
-        flat = drive.reshape(*drive.shape[:2], -1)
         then = tables[0][onsets.plane, :, onsets.row].T
-        flat[onsets.plane, :, near[0].rows[onsets.row] - before] = (
-            onsets.after * first + onsets.end * then
-        ).T
-        lagged: Any = lfilter([1.0], [1.0, -pole], drive, axis=-2)
+        drive[onsets.plane, :, places[0][onsets.row]] = (onsets.after * first + onsets.end * then).T
+        lagged: Any = lfilter(whitening, [1.0, -pole], drive)
         return lagged
 
-    def _solve(self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None):
-        """Return coefficients, covariance, misfit, residuals and design for each plane.
+    def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
+        """Return the design at the used rows, (planes, coefficients, rows), if all rows are in contact."""
+        tables, shape = [], self.readings.force.shape
+        rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
+        for position, rate in self.motion_at(delay):
+            depth = position.T.ravel() - planes[:, None]
+            columns = self._columns(depth, rate.T.ravel(), rows) / self.readings.std
+            tables.append(columns.reshape(*columns.shape[:2], shape[1], shape[0]))
+        drive = tables[0]
+        if self.time_constant:
+            pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
+            drive = now * tables[0] + half * tables[1]
+            drive[..., 1:] += last * tables[0][..., :-1]
+            drive = np.asarray(lfilter(self.readings.whitening, [1.0, -pole], drive))
+        else:
+            drive = _whitened(drive, self.readings.whitening)
+        used = drive.swapaxes(2, 3).reshape(*drive.shape[:2], -1)[:, :, self.kept]
+        bias = np.full(
+            (len(planes), 1, used.shape[2]), float(np.sum(self.readings.whitening)) / self.readings.std
+        )
+        return np.concatenate([used, bias], axis=1)
 
-        Design and residuals are divided by the noise's standard deviation.
-        """
+    def _design(
+        self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the design near contact, (planes, coefficients, rows), and the readings, over the noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column is the bias: with a dead zone only in the rows in contact, else in all rows.
@@ -273,90 +280,69 @@ class ContactProblem:
             ones = np.ones((1, len(onsets.row)))
             first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
         if self.plain:
-            design, target = tables[0], self.target[near[0].rows]
-        else:
-            window = self._window(near)
-            design = self._values_at_used_rows(self._filtered(near, tables, onsets, first, window), window)
-            target = self.target[self._used_rows_in(window)]
-            if not self.local:
-                design[:, -1] = self.bias_alone
-        normal, right = design @ design.swapaxes(1, 2), _sum_products(design, target)
-        # Number and sums of the rows that depend on the bias alone.
-        rest_count, total, square = (
-            full - part for full, part in zip(self.sums, _sum_and_squares(target), strict=True)
-        )
-        normal[:, -1, -1] += rest_count * self.bias_alone**2
-        right[:, -1] += total * self.bias_alone
-        if self.readings.bias is not None:
-            bias_prior, error = self.readings.bias
-            normal[:, -1, -1] += error**-2
-            right[:, -1] += bias_prior * error**-2
-        size = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-60))
-        scale = size[:, :, None] * size[:, None]
-        covariance = np.linalg.inv(normal / scale + 1e-13 * np.eye(size.shape[1])) / scale
-        coefficients = np.einsum("pij,pj->pi", covariance, right)
-        residual = (coefficients[:, None] @ design)[:, 0] - target
-        misfit = np.einsum("pm,pm->p", residual, residual)
-        bias = coefficients[:, -1] * self.bias_alone
-        misfit += square + bias * (rest_count * bias - 2.0 * total)
-        if self.readings.bias is not None:
-            bias_prior, error = self.readings.bias
-            misfit = misfit + ((coefficients[:, -1] - bias_prior) / error) ** 2
-        return coefficients, covariance, misfit, residual, design
+            return tables[0], self.target[near[0].rows]
+        where = self._packed(near)
+        used = self.places[where.rows]
+        design = self._filtered(near, tables, onsets, first, where, self.readings.whitening)[:, :, used >= 0]
+        if not self.local:
+            design[:, -1] = self.bias_alone
+        return design, self.target[used[used >= 0]]
 
-    def _used_rows_in(self, window: slice) -> slice:
-        """Return the range of a window's rows among the rows that are used."""
-        lanes = self.readings.force.shape[1]
-        return slice(*np.searchsorted(self.kept, (window.start * lanes, window.stop * lanes)))
-
-    def _values_at_used_rows(self, values: np.ndarray, window: slice) -> np.ndarray:
-        """Return whitened values (planes, columns, rows, lanes) of a window at the rows that are used."""
-        rows = self.kept[self._used_rows_in(window)] - window.start * self.readings.force.shape[1]
-        return self.whiten(values).reshape(*values.shape[:2], -1)[:, :, rows]
+    def _solve(self, near, flags, onsets, pseudo: Pseudo | None) -> Solution:
+        """Fit the coefficients at each plane to the rows in contact by `flags`, and to pseudo-rows."""
+        design, target = self._design(near, flags, onsets)
+        # The rows that depend on the bias alone.
+        count, total, square = (full - part for full, part in zip(self.sums, sums(target), strict=True))
+        if pseudo is not None:
+            design = np.concatenate([design, pseudo.design], axis=2)
+            target = np.concatenate([target, pseudo.target])
+        return solve(design, target, (count, total, square), self.bias_alone, self.readings.bias)
 
     def _by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
         """Return the predicted readings' derivative by the plane, over the noise, at the design's rows."""
-        step, window = 1e-7, self._window(near)
+        scale = 2.0 * STEP * self.readings.std
         if self.time_constant:
-            planes = plane + step * np.array([1.0, -1.0])
-            shifted = self._all_rows_near_contact(self._motion_at(delay), planes, coefficients)
-            wide = self._window([*near, *shifted[0]])
-            high, low = self._predicted(*shifted, coefficients, wide)
-            change = (high - low)[window.start - wide.start : window.stop - wide.start]
-            return self._values_at_used_rows(change[None, None] / (2.0 * step * self.readings.std), window)[
-                0, 0
-            ]
+            shifted = self._all_rows_near_contact(
+                self._motion_at(delay), plane + STEP * np.array([1.0, -1.0]), coefficients
+            )
+            where = self._packed(near)
+            high, low = self._predicted(*shifted, coefficients, where, self.readings.whitening)
+            return (high - low)[self.places[where.rows] >= 0] / scale
         now = near[0]
         rows = self.where[now.rows]
         up, down = (
-            _compute_force(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
-            for d in (step, -step)
+            force_of(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
+            for d in (STEP, -STEP)
         )
-        table = ((down - up) * flag / (2.0 * step * self.readings.std))[:, None]
-        if not self.plain:
-            table = self._values_at_used_rows(self._filtered(near, [table], None, None, window), window)
-        return table[0, 0]
+        table = ((down - up) * flag / scale)[:, None]
+        if self.plain:
+            return table[0, 0]
+        where = self._packed(near)
+        table = self._filtered(near, [table], None, None, where, self.readings.whitening)
+        return table[0, 0, self.places[where.rows] >= 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return the predicted readings [N], bias included, (rows, lanes)."""
-        moved = [self.motion.at(delay + part * self.motion.period) for part in self.before]
-        moved = [(position.ravel(), rate.ravel()) for position, rate in moved]
+        moved = [(position.ravel(), rate.ravel()) for position, rate in self.motion_at(delay)]
         near, flags, onsets = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
-        force = self._predicted(near, flags, onsets, coefficients, slice(0, len(self.readings.force)))[0]
+        where = self._packed(near)
+        force, real = np.zeros(self.readings.force.shape), where.rows >= 0
+        values = self._predicted(near, flags, onsets, coefficients, where, (1.0,))[0]
+        force.ravel()[where.rows[real]] = values[real]
         return force if self.local else force + coefficients[-1]
 
-    def _predicted(self, near, flags, onsets, coefficients: np.ndarray, window: slice) -> np.ndarray:
-        """Return the readings in a window [N], without a bias that all rows share, (planes, rows, lanes)."""
+    def _predicted(self, near, flags, onsets, coefficients, where: Packed, whitening) -> np.ndarray:
+        """Return the whitened readings at packed rows [N], without a bias of all rows, (planes, rows)."""
         offset, first = self.local * coefficients[-1], None
         tables = [
-            ((_compute_force(coefficients, part.columns) + offset) * flag)[:, None]
+            ((force_of(coefficients, part.columns) + offset) * flag)[:, None]
             for part, flag in zip(near, flags, strict=True)
         ]
         if onsets is not None:
             first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filtered(near, tables, onsets, first, window)[:, 0]
+        return self._filtered(near, tables, onsets, first, where, whitening)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return whether each row is in contact according to the model, (rows, lanes)."""
@@ -379,7 +365,7 @@ class ContactProblem:
         onsets = self._onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
         return near, flags, onsets
 
-    def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
+    def find_best_surface(self, delay: float, plane: float) -> tuple[float, Inner, float]:
         """Return the plane of least misfit at a delay, a fit nearby, and the gain of log likelihood.
 
         The gain is from the fit to the returned plane: that of the last Newton step, along a parabola.
@@ -397,19 +383,9 @@ class ContactProblem:
         return plane, inner, 0.0
 
 
-def _compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the force of the law without the bias, (planes, rows)."""
-    return (coefficients[..., None, :-1] @ columns)[:, 0]
-
-
-def _sum_products(table: np.ndarray, values: np.ndarray) -> Any:
-    """Return the sums of products along the rows.
-
-    BLAS would split the sum by its number of threads, which changes the last bits.
-    """
-    return np.einsum("...m,m->...", table, values)
-
-
-def _sum_and_squares(values: np.ndarray) -> tuple[int, float, float]:
-    """Return the number of values, their sum and that of their squares."""
-    return len(values), float(values.sum()), float(_sum_products(values, values))
+def _whitened(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+    """Return values filtered along the last axis."""
+    filtered = values.copy() if len(whitening) > 1 else values
+    for lag, weight in enumerate(whitening[1:], 1):
+        filtered[..., lag:] += weight * values[..., :-lag]
+    return filtered

@@ -16,12 +16,8 @@ from scipy import special
 from scipy.ndimage import uniform_filter1d
 
 from tuning.identification import press_bias
-from tuning.identification.contact_problem import (
-    COARSE_DELAY_STEP,
-    MAX_FORCE_DELAY,
-    CoefficientFit,
-    ContactProblem,
-)
+from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
+from tuning.identification.contact_regression import Inner
 from tuning.identification.normal_draws import factorise_covariance
 
 FINE_DELAY_STEP = 2e-5  # s, between the delays of the second grid
@@ -45,7 +41,7 @@ class Posterior:
     draws: np.ndarray  # (draws, names)
     delays: np.ndarray  # s, the final grid
     log_posterior: np.ndarray  # of the delay at the final grid, minus its maximum
-    best: tuple[float, float, CoefficientFit]  # delay, plane and fit of greatest posterior density
+    best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
     evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
 
     @property
@@ -152,7 +148,7 @@ def _find_likely_delays(
 
 def _fit_grid(
     problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
-) -> tuple[np.ndarray, list[CoefficientFit]]:
+) -> tuple[np.ndarray, list[Inner]]:
     """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
 
     Damped contacts begin with a jump, so a row on the wrong side of the onset raises the misfit. The
@@ -200,7 +196,7 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
 
 
 def _marginalise_over_surface(
-    places: np.ndarray, cells: list[CoefficientFit], count: int
+    places: np.ndarray, cells: list[Inner], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marginal log posterior of each delay, and the plane's mean and standard deviation there."""
     heights, planes = (
@@ -217,13 +213,13 @@ def _marginalise_over_surface(
     return total, mean, np.maximum(spread, width / 2.0)
 
 
-def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) -> np.ndarray:
+def _compute_cell_posteriors(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
     """Return the log posterior of each cell of a grid."""
     return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
 
 
 def _draw_from_grid(
-    problem: ContactProblem, places: np.ndarray, cells: list[CoefficientFit], delays: np.ndarray, seed: int
+    problem: ContactProblem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
 ) -> Posterior:
     """Return draws from the grid: a cell by its weight, a point in it, and normal coefficients."""
     heights = _compute_cell_posteriors(places, cells)
@@ -261,7 +257,7 @@ def _draw_from_grid(
     )
 
 
-def _draw_coefficients(cell: CoefficientFit, positive: list[int], count: int, rng) -> np.ndarray:
+def _draw_coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
     """Return normal draws of the coefficients; those with a negative damping are drawn again."""
     root = factorise_covariance(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T

@@ -60,7 +60,7 @@ def average_over_damping(
         MAX_DAMPING_OVER_STIFFNESS * max(float(best.coefficients[0]), 1e-300)
     )
     simpler = drop_damping_term(law)
-    alone = ContactProblem(problem.motion, problem.readings, simpler, problem.plane, problem.time_constant)
+    alone = problem.changed(simpler, problem.time_constant)
     closest = search_coarsely(alone, (delay, plane, best.misfit))
     if 0.5 * (best.misfit - closest[2]) + MAX_OCCAM_GAIN < np.log(MIN_UNDAMPED_PROBABILITY):
         return posterior

@@ -52,9 +52,9 @@ class ForceReadings:
         entries = tuple(int(number) for number in np.unique(entry[counts])) or (0,)
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
 
-    def select_lanes(self, lanes: np.ndarray) -> ForceReadings:
-        """Return the readings of the given lanes, each as often as it occurs."""
-        force, counts, entry = (array[:, lanes] for array in (self.force, self.counts, self.entry))
+    def select_lanes(self, lanes: np.ndarray, begin: int = 0) -> ForceReadings:
+        """Return the readings of the given lanes, each as often as it occurs, from row `begin` on."""
+        force, counts, entry = (array[begin:, lanes] for array in (self.force, self.counts, self.entry))
         return replace(self, force=force, counts=counts, entry=entry)
 
 

@@ -25,6 +25,7 @@ from jaxhil.contact.regression import RegressionFamily
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import estimate_surface_from_onset
+from tuning.identification.deep_contact import representative
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 
@@ -53,8 +54,16 @@ class EvaluatedLaw:
 def choose_contact_law(
     motion: MotionResponse, readings: ForceReadings, plane: float | None, names=None
 ) -> list[EvaluatedLaw]:
-    """Fit and evaluate all laws, or those named; return them with the chosen one first."""
+    """Fit and evaluate all laws, or those named; return them with the chosen one first.
+
+    The parts of a long press are alike, so a few stand for all.
+    """
     judged = []
+    lanes, alike = np.unique(
+        representative(ContactProblem(motion, readings, kelvin_voigt(), plane)), return_inverse=True
+    )
+    rows = readings.counts.sum()
+    motion, readings = motion.of(lanes), readings.select_lanes(lanes)
     _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
     judging = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
@@ -62,7 +71,9 @@ def choose_contact_law(
         law, result = _fit_shape(
             family, lambda candidate: _fit_coarsely(motion, readings, candidate, plane, guess)
         )
-        judged.append((law, result, _cross_validate(motion, readings, judging, law, plane, result)))
+        result = _for_all(ContactProblem(motion, readings, law, plane), result, np.bincount(alike))
+        likelihood = _cross_validate(motion, readings, judging, law, plane, result)
+        judged.append((law, result, likelihood[alike] if len(likelihood) == len(lanes) else likelihood))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
     results = []
@@ -70,8 +81,7 @@ def choose_contact_law(
         behind = best - likelihood
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(EvaluatedLaw(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
-    rows = np.log(max(readings.counts.sum(), 2))
-    preferred = min(results, key=lambda fit: fit.misfit + rows * fit.law.complexity)
+    preferred = min(results, key=lambda fit: fit.misfit + np.log(max(rows, 2)) * fit.law.complexity)
     # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
     damped = [fit for fit in results if "damping" in fit.law.names] or results
     # The delay also absorbs damping at the onset if the law's damping starts at zero depth with zero.
@@ -96,6 +106,16 @@ def choose_contact_law(
         taken,
         *(fit for fit in sorted(results, key=lambda fit: fit.likelihood_deficit[0]) if fit is not taken),
     ]
+
+
+def _for_all(problem: ContactProblem, result: CoarseFit, lanes: np.ndarray) -> CoarseFit:
+    """Return the fit with the misfit of all `lanes` that each lane of the problem stands for."""
+    delay, plane, misfit = result
+    if np.all(lanes == 1):
+        return result
+    coefficients = problem.at(delay, plane).coefficients
+    by_lane = compute_contact_misfits(problem, problem.readings, delay, plane, coefficients)
+    return delay, plane, misfit + float(np.sum(by_lane * (lanes - 1)))
 
 
 def has_onset_damping(law: Law) -> bool:

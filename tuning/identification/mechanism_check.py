@@ -14,8 +14,9 @@ from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import clock_drift, free_motion, mechanism_models, validation
 from tuning.identification import contact_fit as contacts
 from tuning.identification.contact_fit import ContactFit
-from tuning.identification.contact_problem import MAX_FORCE_DELAY, CoefficientFit, ContactProblem
+from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior
+from tuning.identification.contact_regression import Inner
 from tuning.identification.edge_check import check_contact_edges
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
@@ -158,7 +159,7 @@ def _make_contact_fit(
         predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
         readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))
     problem = ContactProblem(motion, readings, law, plane, lag)
-    inner = CoefficientFit(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
+    inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _draw_delay_and_surface(mechanism)
     # The motion is only computed up to this delay.
     delays = np.clip(delays, problem.min_delay, max(MAX_FORCE_DELAY, delay))

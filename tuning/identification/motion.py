@@ -101,9 +101,10 @@ class MotionResponse:
         rows.late = None
         return rows
 
-    def of(self, lanes: np.ndarray) -> MotionResponse:
-        """Return the motion of the given lanes, each as often as it occurs."""
+    def of(self, lanes: np.ndarray, begin: int = 0) -> MotionResponse:
+        """Return the motion of the given lanes, each as often as it occurs, from row `begin` on."""
         result = copy(self)
+        result.offset, result.rows = self.offset + begin, self.rows - begin
         result.start, result.end = self.start[:, lanes], self.end[:, lanes]
         result.states = self.states[:, :, lanes]
         result.late = None if self.late is None else self.late[lanes]

@@ -88,7 +88,8 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     if "damping" in draws_by_name:
         result["contact.damping.0"] = draws_by_name["damping"]
     if contact.dead_zone:
-        result["rig.force_sensor.dead_zone"] = -draws_by_name["bias"]
+        # Adding 0.0 turns -0.0, which would be printed as such, to 0.0.
+        result["rig.force_sensor.dead_zone"] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
     return result
 
 

@@ -39,6 +39,9 @@ EXCLUSION_LIKELIHOOD_DROP = (
     8.0  # drop of the log likelihood below its maximum, beyond which a lag is excluded
 )
 
+# Function that returns the problem with a lag [s] and its best delay, surface and misfit.
+FitAt = Callable[[float], tuple[ContactProblem, CoarseFit]]
+
 
 @dataclass(frozen=True)
 class SensorLag:
@@ -52,24 +55,28 @@ class SensorLag:
 def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> SensorLag | None:
     """Estimate the time constant if the readings require a lag; return None if they exclude one."""
     delay, plane, inner = posterior.best
-    fits: dict[float, CoarseFit] = {}
+    fits: dict[float, tuple[ContactProblem, CoarseFit]] = {}
 
-    def fit(value: float) -> CoarseFit:
+    def at(value: float) -> tuple[ContactProblem, CoarseFit]:
         if value not in fits:
             start = (max(delay - value, problem.min_delay), plane, inner.misfit)
-            fits[value] = search_coarsely(_add_lag(problem, value), start, 2)
+            lagging = problem.changed(problem.law, value)
+            fits[value] = lagging, search_coarsely(lagging, start, 2)
         return fits[value]
+
+    def fit(value: float) -> CoarseFit:
+        return at(value)[1]
 
     needed = MIN_CRITERION_GAIN + np.log(len(problem.kept))
     if inner.misfit - min(fit(value)[2] for value in TRIAL_TIME_CONSTANTS) < 0.5 * needed:
-        return _average_over_lag(problem, posterior, fit, seed)
+        return _average_over_lag(problem, posterior, at, seed)
     period = problem.motion.period
     optimum: Any = optimize.minimize_scalar(
         lambda value: fit(value)[2], bounds=(0.1 * period, MAX_TIME_CONSTANT), method="bounded",
         options={"xatol": 0.1 * period},
     )  # fmt: skip
     if inner.misfit - float(optimum.fun) < needed:
-        return _average_over_lag(problem, posterior, fit, seed)
+        return _average_over_lag(problem, posterior, at, seed)
     value, step = float(optimum.x), 0.1 * float(optimum.x)
     for _ in range(2):
         rise = np.mean([fit(value + side * step)[2] for side in (-1.0, 1.0)]) - optimum.fun
@@ -77,7 +84,7 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
         step = min(2.0 * std, 0.5 * value)
     nodes = value + std * np.linspace(-LAG_HALF_WIDTH_SIGMAS, LAG_HALF_WIDTH_SIGMAS, LAG_GRID_SIZE)
     nodes = nodes[nodes > 0.1 * period]
-    posteriors = _compute_posteriors(problem, posterior, fit, nodes, DELAY_GRID_SIZE, seed)
+    posteriors = _compute_posteriors(posterior, at, nodes, DELAY_GRID_SIZE, seed)
     draws, picked = _draw_between_lags(nodes, posteriors, seed)
     best = int(np.argmax([node.evidence for node in posteriors]))
     names = [*posteriors[best].names, "time_constant"]
@@ -86,20 +93,22 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
 
 
 def _average_over_lag(
-    problem: ContactProblem, posterior: Posterior, fit: Callable[[float], CoarseFit], seed: int
+    problem: ContactProblem, posterior: Posterior, at: FitAt, seed: int
 ) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
     The lag has a uniform prior up to `MAX_TIME_CONSTANT` and is added to the delay.
     """
-    heights = np.array([posterior.best[2].misfit, *(fit(value)[2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
+    heights = (
+        np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
+    )
     inside = np.flatnonzero(heights[1:] > heights.max() - EXCLUSION_LIKELIHOOD_DROP)
     if not len(inside):
         return None
     highest = (*TRIAL_TIME_CONSTANTS, MAX_TIME_CONSTANT)[inside[-1] + 1]
     step = highest / SMALL_LAG_GRID_SIZE
     nodes = step * (np.arange(SMALL_LAG_GRID_SIZE) + 0.5)
-    posteriors = _compute_posteriors(problem, posterior, fit, nodes, SMALL_DELAY_GRID_SIZE, seed)
+    posteriors = _compute_posteriors(posterior, at, nodes, SMALL_DELAY_GRID_SIZE, seed)
     share, evidence = _weigh_lag(posterior, posteriors, step)
     draws, picked = _draw_between_lags(nodes, posteriors, seed)
     draws[:, 0] += picked
@@ -119,17 +128,10 @@ def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -
 
 
 def _compute_posteriors(
-    problem: ContactProblem,
-    posterior: Posterior,
-    fit: Callable[[float], CoarseFit],
-    nodes: np.ndarray,
-    count: int,
-    seed: int,
+    posterior: Posterior, at: FitAt, nodes: np.ndarray, count: int, seed: int
 ) -> list[Posterior]:
     """Return the posterior at each lag, over `count` delays."""
-    return [
-        compute_posterior_at_lag(_add_lag(problem, lag), fit(lag), posterior, seed, count) for lag in nodes
-    ]
+    return [compute_posterior_at_lag(*at(lag), posterior, seed, count) for lag in nodes]
 
 
 def compute_posterior_at_lag(
@@ -168,7 +170,3 @@ def _draw_between_lags(
     )
     order = rng.permutation(POSTERIOR_DRAWS)
     return draws[order], (nodes[picked] + shift)[order]
-
-
-def _add_lag(problem: ContactProblem, value: float) -> ContactProblem:
-    return ContactProblem(problem.motion, problem.readings, problem.law, problem.plane, value)
