@@ -46,7 +46,7 @@ def ideal_sensor(delay, **changes):
     mounting = Pose(zeros(delay), identity(delay))
     sensor = Sensor(
         delay, 0 * delay, errors, none, mounting, no_tool(delay), zeros(delay), no_tool(delay), zeros(delay),
-        none, 0 * delay,
+        none, 0 * delay, none, none,
     )  # fmt: skip
     return sensor._replace(**changes)
 

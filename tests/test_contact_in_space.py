@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from six_axes import springs
 
-from jaxhil.contact.laws import CONTACT_LAWS, ContactParameters
+from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.sixdof.bodies import (
     angular_momentum,
     build_body,
@@ -123,11 +124,8 @@ def group(law="regularised"):
     same = {
         key: np.tile(gathered(key), (2, 1)) for key in ("exponent", "damping", "friction", "slip", "radius")
     }
-    zero = jnp.zeros((2, len(LANES)))
-    parameters = ContactParameters(
-        jnp.asarray(gathered("stiffness")), *(jnp.asarray(same[key]) for key in ("damping", "exponent")),
-        zero[:1], zero > 1, zero, zero, zero, zero,
-    )  # fmt: skip
+    numbers = gathered("stiffness"), same["damping"], same["exponent"]
+    parameters = springs(*map(jnp.asarray, numbers))
     points = vector(jnp.zeros((3, 2, len(LANES))))
     coefficient, slip = (jnp.asarray(same[key]) for key in ("friction", "slip"))
     tangential = [jnp.asarray(np.tile(gathered("bristle", index), (2, 1))) for index in range(2)]

@@ -16,7 +16,7 @@ from jaxhil.sixdof.axes import actuate, build_axes, enter, sampled
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.kinematics import TaskSpace, moving
 from jaxhil.sixdof.latch import Latch, init_latch, latch_wrench
-from jaxhil.sixdof.loop import build_loop, command_of, run
+from jaxhil.sixdof.loop import build_loop, model_motion, run
 from jaxhil.sixdof.relative import Pair, Pose, Wrench, advance, mass_matrix
 from jaxhil.sixdof.rotations import identity
 from jaxhil.sixdof.scenario import Scenario
@@ -88,7 +88,7 @@ def test_response_error_with_true_stiffness_removes_the_rig():
     one, period = latch(), lanes(PERIOD, BATCH)
     simulator = second_order(lanes([14.0, 13.0, 12.0, 11.0, 10.0, 9.0], BATCH), 0.8, lanes(UNEQUAL, BATCH))
     axes = build_axes(simulator, 0 * period, 0 * period, period, "linear")
-    at, rates = command_of(bodies, start)
+    at, rates, _ = model_motion(bodies, start)
     hardware = enter(axes, at, rates * PERIOD, period, "linear", 0, 64)
     still = init_latch(one, pose)
 
@@ -100,20 +100,20 @@ def test_response_error_with_true_stiffness_removes_the_rig():
             motion = sampled(axes, hardware, now).motion
             here = moving(motion)
             real, _ = latch_wrench(one, still, here.pose, here.twist)
-            wanted, _ = command_of(bodies, states)
+            wanted, *_ = model_motion(bodies, states)
             missing = jnp.einsum("ij,jb->ib", jnp.asarray(STIFFNESS), wanted - motion.position)
             wrench = Wrench(
                 real.force - share * vector(missing[:3]), real.moment - share * vector(missing[3:])
             )
             states = advance(bodies, states, wrench, period, SHARES["zoh"])
-            sent, _ = command_of(bodies, states)
+            sent, *_ = model_motion(bodies, states)
             return (states, actuate(axes, hardware, now, sent, "linear", 0)), wanted
 
         return jax.lax.scan(tick, (start, hardware), jnp.arange(TICKS // 2, dtype=jnp.int32))[1]
 
     def alone(states, _):
         """Simulate the numerical model on its own spring."""
-        wanted, _ = command_of(bodies, states)
+        wanted, *_ = model_motion(bodies, states)
         pull = -jnp.einsum("ij,jb->ib", jnp.asarray(STIFFNESS), wanted)
         wrench = Wrench(vector(pull[:3]), vector(pull[3:]))
         return advance(bodies, states, wrench, period, SHARES["zoh"]), wanted

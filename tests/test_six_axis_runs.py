@@ -198,7 +198,8 @@ def test_simulate_runs_a_six_axis_builtin(jaxhil, tmp_path, name):
     assert film.read_bytes().startswith(b"GIF8")
     lead = json.loads(ran.out)
     assert lead["episodes"][0]["energy_error"] < episode["energy_error"]
-    assert set(lead["gains"]) == {"phase_lead", "lead_filter"}
+    leads = {f"lag_lead_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")}
+    assert set(lead["gains"]) == {"phase_lead", "lead_filter", *leads}
 
 
 def check_table(ticks, mechanism, final):
@@ -312,7 +313,7 @@ def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
             ["simulate", "petals", "--animate", "x.avi"],
             "--animate: found 'x.avi', expected a name that ends in .gif",
         ),
-        (["simulate", "petals", "--compensator", "response_error"], "phase_lead_per_axis: in six axes"),
+        (["simulate", "petals", "--compensator", "passivity"], "response_error: in six axes"),
         (["simulate", "petals", "--reference", "--plot", "x.png"], "expected none beside --reference"),
         (
             ["simulate", "rig-300kg", "--reference"],

@@ -26,9 +26,9 @@ def test_every_channel_has_its_own_lead():
     mechanism = load_any("petals").mechanism
     law = SIX_AXIS_COMPENSATORS["phase_lead_per_axis"]
     gains = literature_gains(mechanism, law.name)
-    assert len(gains) == 7 and set(gains.values()) == {0.0037, 0.001}
+    assert len(gains) == 13 and set(gains.values()) == {0.0037, 0.001, 0.0}
     gains["phase_lead_rx"] = 0.02
-    leads = [law.channel(gains, channel)["phase_lead"] for channel in range(6)]
+    leads = [law.channel(gains, name)["phase_lead"] for name in ("x", "y", "z", "rx", "ry", "rz")]
     assert leads == [0.0037] * 3 + [0.02] + [0.0037] * 2
 
 
@@ -38,8 +38,9 @@ def test_public_interface_accepts_six_axes():
         mechanism.target.mass == 2000.0 and mechanism == load_any("petals", {"target.mass": 2000.0}).mechanism
     )
     for call, reason in (
-        (lambda: package.simulate(mechanism, "passivity"), "found 'passivity', expected none, phase_lead"),
-        (lambda: tuning.tune(mechanism), "found 'response_error', expected none, phase_lead"),
+        (lambda: package.simulate(mechanism, "passivity"), "found 'passivity', expected none, "
+                                                           "impulse_ledger"),
+        (lambda: tuning.tune(mechanism, "passivity"), "found 'passivity', expected none, impulse_ledger"),
         (lambda: tuning.tune(mechanism, "phase_lead", chatter_weight=1.0), "chatter_weight: found 1.0"),
         (lambda: tuning.tune("rig-300kg", "phase_lead_per_axis"), "'phase_lead_per_axis', expected none"),
         (lambda: tuning.compare(mechanism), "six axes are known to init, mechanisms, simulate"),
@@ -54,8 +55,8 @@ def test_unsupported_six_axis_features_are_refused_in_one_line(jaxhil, tmp_path)
     path = tmp_path / "gains.json"
     for given, reason in (
         (
-            ["tune", "petals", "-o", tmp_path],
-            "--compensator: found 'response_error', expected none, phase_lead",
+            ["tune", "petals", "--compensator", "passivity", "-o", tmp_path],
+            "--compensator: found 'passivity', expected none, impulse_ledger",
         ),
         (
             ["tune", "petals", "--compensator", "phase_lead", "--pareto", 4, "-o", tmp_path],

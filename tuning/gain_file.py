@@ -19,6 +19,7 @@ import numpy as np
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.errors import InputError, format_value
 from jaxhil.files import report_write_errors, write_atomically
+from jaxhil.laws.compensators import axes_of
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism, to_plain_data
 from jaxhil.mechanism.six_axes import SixAxisMechanism
@@ -49,7 +50,7 @@ def build_document(
     not finite or not within its bounds.
     """
     source = "gains"
-    law = find_compensator(compensator, source).gains
+    law = find_compensator(compensator, source, axes_of(mechanism)).gains
     check_gain_names(gains, law, source)
     document = {
         "schema": SCHEMA,

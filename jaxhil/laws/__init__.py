@@ -1,16 +1,17 @@
 """Compensators, one folder each: `simulation.py` is the JAX version, `rig.py` the class that the rig runs.
 
-A compensator is found by its folder; no list names it. `simulation.py` binds the compensator to
-`COMPENSATOR`, and `rig.py` registers its class with `@register(NAME)`. `AXES` in `__init__.py` lists the
-numbers of axes of motion that the compensator serves, 1 or 6; the default is (1,). `shared` contains common
-parts. Importing this package, or any `rig.py`, does not import JAX.
+A compensator for six axes of motion has `simulation_six_axes.py`, beside the files for one axis or alone: a
+name stands for one idea, whose versions for one axis and for six share parts where they can. A compensator is
+found by these files; no list names it. Each of the JAX files binds the compensator to `COMPENSATOR`, and
+`rig.py` registers its class with `@register(NAME)`. `shared` contains common parts. Importing this package,
+or any `rig.py`, does not import JAX.
 """
 
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent
+_FILES = {1: "simulation", 6: "simulation_six_axes"}  # by the number of axes
 
 
 @cache
@@ -23,8 +24,12 @@ def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
     Example:
         >>> from jaxhil.laws import built_in_compensators
         >>> built_in_compensators(6)
-        ('none', 'phase_lead', 'phase_lead_per_axis')
+        ('none', 'impulse_ledger', 'phase_lead', 'phase_lead_per_axis', 'response_error')
     """
-    folders = sorted(path.parent.name for path in _FOLDER.glob("*/simulation.py"))
-    chosen = [name for name in folders if axes in getattr(import_module(f"{__name__}.{name}"), "AXES", (1,))]
-    return tuple(sorted(chosen, key=lambda name: name != "none"))
+    folders = sorted(path.parent.name for path in _FOLDER.glob(f"*/{_FILES[axes]}.py"))
+    return tuple(sorted(folders, key=lambda name: name != "none"))
+
+
+def module_name(name: str, axes: int = 1) -> str:
+    """Return the full name of the module with a compensator's JAX version."""
+    return f"{__name__}.{name}.{_FILES[axes]}"

@@ -7,26 +7,32 @@ package's folders, and those that `jaxhil.register` adds.
 from importlib import import_module
 from typing import Any
 
-from jaxhil.laws import built_in_compensators
+from jaxhil.laws import built_in_compensators, module_name
 from jaxhil.laws.simulation_base import Compensator
+from jaxhil.laws.six_axis_base import SixAxisCompensator
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 
 
-def _load_compensators(axes: int) -> dict[str, Compensator]:
-    return {
-        name: import_module(f"jaxhil.laws.{name}.simulation").COMPENSATOR
-        for name in built_in_compensators(axes)
-    }
+def _load_compensators(axes: int) -> dict[str, Any]:
+    return {name: import_module(module_name(name, axes)).COMPENSATOR for name in built_in_compensators(axes)}
 
 
-COMPENSATORS = _load_compensators(1)
-SIX_AXIS_COMPENSATORS = _load_compensators(6)  # each treats the channels of the wrench separately
+COMPENSATORS: dict[str, Compensator] = _load_compensators(1)
+SIX_AXIS_COMPENSATORS: dict[str, SixAxisCompensator] = _load_compensators(6)
 
 
-def get_compensator(name: str) -> Compensator:
-    """Return the compensator with this name, for one axis or for six. Raise KeyError if there is none."""
-    return COMPENSATORS[name] if name in COMPENSATORS else SIX_AXIS_COMPENSATORS[name]
+def get_compensator(name: str, axes: int = 1) -> Compensator | SixAxisCompensator:
+    """Return the compensator with this name for a number of axes. Raise KeyError if there is none.
+
+    With one axis, the result may be a compensator for six axes only.
+    """
+    return SIX_AXIS_COMPENSATORS[name] if axes == 6 or name not in COMPENSATORS else COMPENSATORS[name]
+
+
+def axes_of(mechanism: Mechanism | SixAxisMechanism) -> int:
+    """Return a mechanism's number of axes, 1 or 6."""
+    return 6 if isinstance(mechanism, SixAxisMechanism) else 1
 
 
 def literature_gains(
@@ -42,10 +48,9 @@ def literature_gains(
     Raises:
         KeyError: if there is no such compensator or setting.
     """
-    law = get_compensator(compensator)
+    law = get_compensator(compensator, axes_of(mechanism))
     chosen = law.settings[setting] if setting is not None else {}
-    # For six axes the rules read only the force sensor and the control period, which both classes have.
-    source: Any = mechanism
+    source: Any = mechanism  # of the class that the compensator's rules read
     gains = {}
     for gain in law.gains:
         value = float(gain.nominal(source))

@@ -61,6 +61,7 @@ Second = Annotated[float, key_metadata("time of one axis", "s", ge=0.0, le=1.0)]
 Share = Annotated[float, key_metadata("share of one coordinate", "1", ge=0.0, le=1.0)]
 Load = Annotated[float, key_metadata("load of one channel", "N, N m")]
 LoadMagnitude = Annotated[float, key_metadata("load of one channel", "N, N m", ge=0.0)]
+Error = Annotated[float, key_metadata("error of one coordinate", "m, rad", ge=0.0)]
 LoadLimit = Annotated[float, key_metadata("limit of one channel", "N, N m", gt=0.0, infinite=True)]
 
 
@@ -207,9 +208,15 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sensor of the hardware's pose, with which the reading of a moving force sensor is rotated back."""
+    """Sensor of the hardware's pose, which compensators and the correction of a moving force sensor use."""
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    noise_std: Annotated[list[Error], six_axis_metadata("standard deviation of white noise")] = field(
+        default_factory=zeros(6)
+    )
+    quantum: Annotated[list[Error], six_axis_metadata("step to whose multiples a reading is rounded")] = (
+        field(default_factory=zeros(6))
+    )
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -222,7 +222,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_sensor(rig: Rig) -> None:
-    """Check crosstalk, tool and position sensor against the force sensor's side. Raise `KeyProblem`."""
+    """Check crosstalk and tool against the force sensor's side. Raise `KeyProblem`."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     mixed = np.eye(6) + np.asarray(sensor.crosstalk)
     if not np.linalg.cond(mixed) < 100:
@@ -234,11 +234,6 @@ def _check_sensor(rig: Rig) -> None:
                 value = "a table" if key == "tool" else format_value(sensor.gravity)
                 allowed = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
                 raise KeyProblem((*path, key), value, allowed)
-        if rig.position_sensor.delay:
-            allowed = '0 (a fixed force sensor is not turned back by the pose), or side = "moving"'
-            raise KeyProblem(
-                ("rig", "position_sensor", "delay"), format_value(rig.position_sensor.delay), allowed
-            )
         return
     if sensor.tool is None:
         raise KeyProblem((*path, "tool"), "nothing", 'a table with mass and com (side = "moving" needs it)')

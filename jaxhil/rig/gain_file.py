@@ -100,7 +100,8 @@ def check_gain_document(
     Args:
         document: content of a gain file.
         source: name of the document in error messages.
-        others: gains of the compensators that can only be simulated, by compensator.
+        others: gains of the compensators that can only be simulated, by compensator; a controller's gains of
+            that name do not count.
         axes: numbers of axes that the gains may be for.
 
     Raises:
@@ -115,7 +116,7 @@ def check_gain_document(
     if name in RETIRED_COMPENSATORS:
         message = f"compensator: found {format_value(name)}, expected 'impulse_ledger', which replaces it"
         raise GainFileError(printable(f"{source}: {message}"))
-    specifications = {**others, **{law: compensator.gains for law, compensator in COMPENSATORS.items()}}
+    specifications = {**{law: compensator.gains for law, compensator in COMPENSATORS.items()}, **others}
     if not isinstance(name, str) or name not in specifications:
         raise make_gain_file_error(
             source, "compensator", format_value(name), f"one of {', '.join(specifications)}"

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.laws.compensators import literature_gains
+from jaxhil.laws.compensators import axes_of, literature_gains
 from jaxhil.laws.simulation_base import Compensator
+from jaxhil.laws.six_axis_base import SixAxisCompensator
 from jaxhil.mechanism.conversion import suggest_names
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
@@ -25,7 +26,7 @@ def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) ->
     Raise `InputError` for an unknown compensator, setting or gain, for a value outside its bounds, and for a
     gain file that is invalid or does not fit the compensator, the control period or the bounds.
     """
-    law = find_compensator(compensator, "")
+    law = find_compensator(compensator, "", axes_of(mechanism))
     if gains is None:
         return law.name, literature_gains(mechanism, law.name)
     if isinstance(gains, Mapping):
@@ -50,7 +51,7 @@ def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
         raise InputError(
             f"{label}: control_period: found {tuned:g} s, expected {period:g} s of the mechanism"
         )
-    for gain in find_compensator(loaded.compensator, label).gains:
+    for gain in find_compensator(loaded.compensator, label, axes_of(mechanism)).gains:
         value = loaded.gains[gain.name]
         lower, upper, margin = resolve_gain_bounds(gain, mechanism)
         if not lower - margin <= value <= upper + margin:
@@ -70,7 +71,9 @@ def _is_path(text: str) -> bool:
         return True
 
 
-def _complete_gains(mechanism: AnyMechanism, law: Compensator, choice: Mapping[Any, Any]) -> dict[str, float]:
+def _complete_gains(
+    mechanism: AnyMechanism, law: Compensator | SixAxisCompensator, choice: Mapping[Any, Any]
+) -> dict[str, float]:
     """Return the gains of a dict, completed with those from the literature."""
     gains = literature_gains(mechanism, law.name)
     specifications = {gain.name: gain for gain in law.gains}
@@ -100,7 +103,7 @@ def _to_float(value: Any) -> float:
 
 
 def _read_gains(
-    mechanism: AnyMechanism, law: Compensator, path: str | os.PathLike[str]
+    mechanism: AnyMechanism, law: Compensator | SixAxisCompensator, path: str | os.PathLike[str]
 ) -> tuple[str, dict[str, float]]:
     """Return the compensator and the gains of a file; raise `InputError` if they do not fit."""
     label = to_one_line(os.fsdecode(path)) or "''"

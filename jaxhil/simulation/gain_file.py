@@ -11,8 +11,9 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, get_compensator
+from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator, Gain
+from jaxhil.laws.six_axis_base import SixAxisCompensator
 from jaxhil.mechanism.conversion import suggest_names
 from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, from_plain_data
 from jaxhil.rig import GainFileError
@@ -52,9 +53,10 @@ def check_document(
 
     Raise `InputError`, which calls the document `source`.
     """
+    axes = 6 if document.get("axes") == 6 else 1
     try:
         on_the_rig = check_gain_document(
-            document, source, _gains_without_runtime(), (1, 6) if any_axes else (1,)
+            document, source, _gains_without_runtime(axes), (1, 6) if any_axes else (1,)
         )
     except GainFileError as error:
         raise InputError(str(error)) from None
@@ -63,22 +65,26 @@ def check_document(
             raise _make_error(source, key, "nothing", "this key is required")
         if not fits(document[key]):
             raise _make_error(source, key, format_value(document[key]), allowed)
-    read = any_from_plain_data if document.get("axes") == 6 else from_plain_data
+    read = any_from_plain_data if axes == 6 else from_plain_data
     mechanism = read(document["mechanism"], f"{source}: mechanism")
-    law = find_compensator(on_the_rig.compensator, source).gains
+    law = find_compensator(on_the_rig.compensator, source, axes).gains
     check_gain_names(on_the_rig.gains, law, f"{source}: gains")
     for gain in law:
         _check_entry(gain, document["gains"][gain.name], mechanism, source)
     return LoadedGains(document, on_the_rig.compensator, dict(on_the_rig.gains), mechanism)
 
 
-def find_compensator(compensator: object, source: str) -> Compensator:
-    """Return the compensator with that name, or raise `InputError` that begins with `source`."""
-    if not isinstance(compensator, str) or compensator not in {**COMPENSATORS, **SIX_AXIS_COMPENSATORS}:
-        hint = suggest_names(compensator, COMPENSATORS) if isinstance(compensator, str) else ""
-        allowed = f"one of {', '.join(COMPENSATORS)}{hint}"
+def find_compensator(compensator: object, source: str, axes: int = 1) -> Compensator | SixAxisCompensator:
+    """Return the compensator with that name for a number of axes.
+
+    Raise `InputError` that begins with `source` if there is none.
+    """
+    table = SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS
+    if not isinstance(compensator, str) or compensator not in table:
+        hint = suggest_names(compensator, table) if isinstance(compensator, str) else ""
+        allowed = f"one of {', '.join(table)}{hint}"
         raise _make_error(source, "compensator", format_value(compensator), allowed)
-    return get_compensator(compensator)
+    return table[compensator]
 
 
 def check_gain_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
@@ -96,12 +102,12 @@ def resolve_gain_bounds(gain: Gain, mechanism: Any) -> tuple[float, float, float
     return lower, upper, BOUND_TOLERANCE * max(abs(lower), abs(upper))
 
 
-def _gains_without_runtime() -> dict[str, dict[str, GainSpecification]]:
-    """Return the gains of compensators without a runtime class or for six axes alone, by compensator."""
+def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]:
+    """Return the gains of compensators without a runtime class for so many axes, by compensator."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
-        for name, law in {**COMPENSATORS, **SIX_AXIS_COMPENSATORS}.items()
-        if name not in RUNTIME_COMPENSATORS
+        for name, law in (SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS).items()
+        if axes == 6 or name not in RUNTIME_COMPENSATORS
     }
 
 

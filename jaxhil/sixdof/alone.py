@@ -13,9 +13,12 @@ from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, s
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.metrics import Metrics, judge
 from jaxhil.sixdof.plausibility import check_scenario
+from jaxhil.sixdof.reference import follow_contact, past_at
 from jaxhil.sixdof.rollout import REBOUNDED, Episode
 from jaxhil.sixdof.run import Final, check_followed, final_in_space
 from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.space import Space
+from jaxhil.sixdof.watch import quiet_time
 
 
 class EpisodeInSpace(NamedTuple):
@@ -66,24 +69,28 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
 
 def _ideal_metrics(scenario: Scenario) -> Metrics:
     """Return the metrics of the ideal contact; those of a rig's episode in them are meaningless."""
-    start = jax.tree.map(lambda leaf: leaf[None], scenario.start)
-    zero = jnp.zeros_like(scenario.duration)[None]
-    none = zero.astype(jnp.int32)
-    return judge(
-        scenario,
-        Episode(
-            entry=start,
-            end=start,
-            entry_time=zero,
-            end_time=zero,
-            touches=none,
-            duration=zero,
-            peak_force=zero,
-            peak_moment=zero,
-            penetration=zero,
-            status=none + REBOUNDED,
-        ),
+    period = scenario.control_period
+    space = Space(scenario.bodies, scenario.groups, scenario.latches)
+    until = jnp.round(scenario.duration / period) * period
+    quiet = quiet_time(scenario.sensor, period)
+    reference = follow_contact(space, scenario.start, quiet, until, period)
+    first = reference.gaps.begin.time[0]
+    lasted = jnp.minimum(first + quiet, until)
+    zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)
+    episode = Episode(
+        start=scenario.start,
+        end=scenario.start,
+        lasted=lasted,
+        meeting=reference.meeting,
+        past=past_at(reference, lasted, lasted < until),
+        touches=none,
+        duration=zero,
+        peak_force=zero,
+        peak_moment=zero,
+        penetration=zero,
+        status=none + REBOUNDED,
     )
+    return judge(scenario.bodies, jax.tree.map(lambda leaf: leaf[None], episode))
 
 
 @cache

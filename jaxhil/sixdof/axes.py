@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -67,19 +68,30 @@ def build_axes(
     control_period: Float[Array, "*batch"],
     hold: str,
     weighed: bool = False,
+    measured: bool = False,
 ) -> Axes:
     """Return axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s].
 
-    `weighed` adds accelerations and measured positions, for the weight of a tool.
+    `weighed` adds accelerations, for the weight of a tool, and `measured` the positions that the position
+    sensor reads.
     """
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
     )
-    measured = position.fraction if weighed else None
-    exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, measured, hold)
+    instant = position.fraction if measured else None
+    exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, instant, hold)
     acceleration = rate_row(exact.velocity, simulator.denominator, period) if weighed else None
     return Axes(exact, acceleration, force, position)
+
+
+def lags(simulator: MotionSimulatorBatch) -> np.ndarray:
+    """Return the lag -G'(0) [s] of each axis, (axes, *batch), without its transport delay."""
+    numerator, denominator = (np.asarray(part) for part in (simulator.numerator, simulator.denominator))
+    if len(denominator) == 1:
+        return np.zeros(simulator.delay.shape)
+    lead = numerator[-2] / numerator[-1] if len(numerator) > 1 else 0.0
+    return denominator[-2] / denominator[-1] - lead
 
 
 def enter(
@@ -143,6 +155,8 @@ def actuate(
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
-    """Return the samples, without those that only a weighed tool needs."""
-    weighed = axes.acceleration is not None
-    return Samples(Motion(position, rate, acceleration if weighed else None), measured if weighed else None)
+    """Return the samples that are used."""
+    return Samples(
+        Motion(position, rate, acceleration if axes.acceleration is not None else None),
+        measured if axes.propagation.measured_position is not None else None,
+    )

@@ -70,14 +70,18 @@ def build_scenarios(
 
 def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
     """Return the static loop of a mechanism's scenarios."""
-    rig = mechanism.rig
+    rig, sensor = mechanism.rig, scenario.sensor
     return build_loop(
         scenario,
         integrator=rig.integrator,
         hold=rig.command_hold,
         latency=rig.command_latency,
         side=rig.force_sensor.side,
-        has_noise=any(rig.force_sensor.noise_std),
+        has_noise=bool(np.any(np.asarray(sensor.noise_std) > 0)),
+        has_pose_errors=any(
+            bool(np.any(np.asarray(values) > 0))
+            for values in (sensor.position_noise_std, sensor.position_quantum)
+        ),
         compensator=compensator,
         episodes=mechanism.approach.episodes if mechanism.approach else 1,
         whole=mechanism.start is not None and mechanism.start.duration is not None,
@@ -204,6 +208,8 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
         assumed_gravity=gravity,
         assumed_bias=nothing,
         position_delay=numbers("rig.position_sensor.delay"),
+        position_noise_std=numbers("rig.position_sensor.noise_std"),
+        position_quantum=numbers("rig.position_sensor.quantum"),
     )
 
 

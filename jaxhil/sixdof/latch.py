@@ -47,12 +47,12 @@ def init_latch(latch: Latch, pose: Pose) -> Held:
     """Return the state at the start of a run, at a pose."""
     zero = jnp.zeros_like(latch.depth)
     attitude: Quaternion = jax.tree.map(lambda part: part[None] + zero, pose.attitude)
-    return Held(latch.from_start, _point(latch, pose), attitude)
+    return Held(latch.from_start, latch_points(latch, pose), attitude)
 
 
 def latch_wrench(latch: Latch, held: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
     """Return the latches' wrench [N, N m] on the chaser, about T's origin, and their next state."""
-    point = _point(latch, pose)
+    point = latch_points(latch, pose)
     (position, attitude), (linear, angular) = jax.tree.map(lambda part: part[None], (pose, twist))
     velocity = linear + cross(angular, point - position)
     tilt = 2 * jnp.arctan2(_sine(attitude), jnp.abs(attitude.w))
@@ -73,7 +73,7 @@ def latch_wrench(latch: Latch, held: Held, pose: Pose, twist: Twist) -> tuple[Wr
     return total, held
 
 
-def _point(latch: Latch, pose: Pose) -> Vector:
+def latch_points(latch: Latch, pose: Pose) -> Vector:
     """Return the latches' points in T axes."""
     position, attitude = jax.tree.map(lambda part: part[None], (pose.position, pose.attitude))
     return position + rotate(attitude, latch.point)

@@ -1,11 +1,11 @@
 """Loop of the rig in six degrees of freedom, tick by tick.
 
-A tick reads the delayed wrench of the real contact, compensates it, moves the two bodies of the numerical
-model by it, and sends their relative pose to the motion simulator, which carries the contact. The wrench is
-computed at the hardware's pose, in T axes about T's origin, and acts at the model's T.
+A tick reads the delayed wrench of the real contact and the pose of the hardware, compensates the wrench,
+moves the two bodies of the numerical model by it, and sends their relative pose to the motion simulator,
+which carries the contact. The wrench is computed at the hardware's pose, in T axes about T's origin, and acts
+at the model's T.
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,11 +16,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
-from jaxhil.laws.phase_lead_per_axis.simulation import PhaseLeadPerAxis
-from jaxhil.laws.simulation_base import Gains, KnownConstants, Signals
-from jaxhil.simulation.sensors import apply_lag, white_noise
-from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, sampled
+from jaxhil.laws.simulation_base import Gains
+from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
+from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
+from jaxhil.sixdof.approach import begin as place
+from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, lags, sampled
 from jaxhil.sixdof.bodies import SHARES
+from jaxhil.sixdof.equations import product, solve
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
 from jaxhil.sixdof.kinematics import Kinematics, Moving, moving
 from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
@@ -32,9 +34,10 @@ from jaxhil.sixdof.relative import (
     Wrench,
     advance,
     coordinates,
+    mass_matrix,
     relative,
 )
-from jaxhil.sixdof.rotations import exponential
+from jaxhil.sixdof.rotations import exponential, identity
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import (
     Sensor,
@@ -42,6 +45,7 @@ from jaxhil.sixdof.sensor import (
     read_moving,
     sample,
     tool_load,
+    tool_mass,
     undo_fixed,
     undo_moving,
     weight,
@@ -63,12 +67,15 @@ class Loop(eqx.Module):
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
     has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
     has_sample_effects: bool = eqx.field(static=True, default=True)  # quantum, dead zone or range
+    has_pose_errors: bool = eqx.field(static=True, default=False)  # noise or quantum of the measured pose
+    controller_ring: int = eqx.field(
+        static=True, default=1
+    )  # length of a compensator's delay line, as `ring`
     compensator: str = eqx.field(
         static=True, default="none"
     )  # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
     episodes: int = eqx.field(static=True, default=1)  # number of evaluated episodes
     whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
-    pushed: bool = eqx.field(static=True, default=False)  # whether readings without a contact are not 0
 
 
 class Rig(NamedTuple):
@@ -81,16 +88,18 @@ class Rig(NamedTuple):
     latches: tuple[Latch, ...]
     sensor: Sensor
     period: Float[Array, "*batch"]  # T [s]
-    key: UInt32[Array, "2 *batch"]  # key of the sensor's noise
-    gains: Gains  # gains of the compensator, (6, *batch)
+    key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
+    gains: Gains  # gains of the compensator, (*batch)
+    constants: SixAxisConstants  # what the compensator knows
+    prepared: Any  # result of the compensator's `prepare`
 
 
-class Channels(NamedTuple):
-    """State of the force sensor's channels and of their compensators."""
+class Controller(NamedTuple):
+    """State of the force sensor's lag and of the compensator."""
 
     # last reading before the lag and behind it; None without a lag
     lag: tuple[Wrench, Wrench] | None
-    controller: tuple[Any, ...]  # state of the compensator of each channel
+    law: Any  # state of the compensator
 
 
 class RunState(NamedTuple):
@@ -98,10 +107,11 @@ class RunState(NamedTuple):
 
     states: States  # bodies of the numerical model
     near: Float[Array, "6 *batch"]  # coordinates of C against T in these states
+    twist: Float[Array, "6 *batch"]  # twist of C against T in these states
     hardware: Hardware
     memories: tuple[Memory, ...]  # states of the contact's laws
     held: tuple[Held, ...]  # states of the latches
-    channels: Channels
+    controller: Controller
     tick: Int[Array, ""]
 
 
@@ -123,8 +133,12 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
     intervals = int(np.max(slowest / period[None])) + 2
+    law = SIX_AXIS_COMPENSATORS[static.get("compensator", "none")]
+    # A compensator may estimate the delay of the whole loop, with an error of its own size.
+    whole = int(np.max((slowest + lags(scenario.simulator)) / period[None]))
     loop = Loop(
         ring=1 << intervals.bit_length(),
+        controller_ring=1 << (2 * whole + 4).bit_length() if law.reads_pose else 1,
         has_lag=bool(np.any(np.asarray(sensor.time_constant) > 0)),
         has_sample_effects=bool(
             np.any(np.asarray(errors.quantum) > 0)
@@ -133,15 +147,24 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
         ),
         **static,
     )
-    biased = bool(np.any(np.asarray(errors.bias) != np.asarray(sensor.assumed_bias)))
-    return replace(loop, pushed=loop.side == "moving" or loop.has_noise or biased)
+    return loop
 
 
 def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
-    """Discretise the axes; `gains` are scalars, or of the batch shape, or (6, *batch)."""
-    sensor, period = scenario.sensor, scenario.control_period
+    """Discretise the axes and prepare the compensator; `gains` are scalars or of the batch shape."""
+    sensor, period, law = scenario.sensor, scenario.control_period, SIX_AXIS_COMPENSATORS[loop.compensator]
     weighed = loop.side == "moving"
-    axes = build_axes(scenario.simulator, sensor.delay, sensor.position_delay, period, loop.hold, weighed)
+    axes = build_axes(
+        scenario.simulator,
+        sensor.delay,
+        sensor.position_delay,
+        period,
+        loop.hold,
+        weighed,
+        weighed or law.reads_pose,
+    )
+    full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
+    constants = controller_constants(scenario, weighed)
     return Rig(
         bodies=scenario.bodies,
         axes=axes,
@@ -151,7 +174,9 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
         sensor=sensor,
         period=period,
         key=scenario.key,
-        gains={name: _six(jnp.asarray(value), period) for name, value in gains.items()},
+        gains=full,
+        constants=constants,
+        prepared=law.prepare(full, constants),
     )
 
 
@@ -160,11 +185,11 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
     Before it the command was in uniform motion, at the states' relative pose and rates.
     """
-    pose, twist = relative(rig.bodies, states)
-    at, rates = (jnp.stack(jax.tree.leaves(part)) for part in coordinates(pose, twist))
+    law = SIX_AXIS_COMPENSATORS[loop.compensator]
+    at, rates, twist = model_motion(rig.bodies, states)
     stride = rates * rig.period[None]
     history = 0 if rig.kinematics.is_linear else HISTORY
-    first = at - history * stride
+    first = law.pose_command(rig.gains, at, rates) - history * stride
     legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
     hardware = enter(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
@@ -175,16 +200,26 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
     zero = vector(jnp.zeros_like(at[:3]))
     nothing = Wrench(zero, zero)
-    law, constants = SIX_AXIS_COMPENSATORS[loop.compensator], _constants(rig)
-    controllers = tuple(law.init(_gains(loop, rig, channel), constants, 1) for channel in range(6))
+    pose, _ = relative(rig.bodies, states)
+    start = SixAxisSignals(
+        wrench=tuple(jax.tree.leaves(nothing)),
+        pose_desired=at,
+        twist_desired=twist,
+        pose_measured=None,
+        age=jnp.zeros(rig.period.shape, jnp.int32),
+    )
     return RunState(
-        states,
-        at,
-        hardware,
-        tuple(group.init() for group in rig.groups),
-        tuple(init_latch(latch, pose) for latch in rig.latches),
-        Channels((nothing, nothing) if loop.has_lag else None, controllers),
-        jnp.array(history, jnp.int32),
+        states=states,
+        near=at,
+        twist=twist,
+        hardware=hardware,
+        memories=tuple(group.init() for group in rig.groups),
+        held=tuple(init_latch(latch, pose) for latch in rig.latches),
+        controller=Controller(
+            (nothing, nothing) if loop.has_lag else None,
+            law.init(rig.prepared, rig.constants, start, loop.controller_ring),
+        ),
+        tick=jnp.array(history, jnp.int32),
     )
 
 
@@ -206,47 +241,94 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
         caught, now = latch_wrench(latch, before, pose, twist)
         contact = jax.tree.map(jnp.add, contact, caught)
         latched.append(now)
-    measured = None
-    if samples.measured is not None:
-        still = Motion(samples.measured, jnp.zeros_like(samples.measured), None)
-        at = rig.kinematics.coordinates(still, state.near).position
-        measured = Pose(vector(at[:3]), exponential(vector(at[3:])))
-    command, channels = _sense(loop, rig, state, contact, motion, measured)
+    measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
+    command, controller = _control(loop, rig, state, contact, motion, measured)
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
-    position, _ = command_of(rig.bodies, states)
-    sent = rig.kinematics.command(position)
+    position, rates, model_twist = model_motion(rig.bodies, states)
+    sent = rig.kinematics.command(
+        SIX_AXIS_COMPENSATORS[loop.compensator].pose_command(rig.gains, position, rates)
+    )
     hardware = actuate(rig.axes, state.hardware, state.tick, sent, loop.hold, loop.latency)
     seen = Tick(state.states, pose, twist, contact, forces, tuple(latched), command)
-    return RunState(states, position, hardware, memories, tuple(latched), channels, state.tick + 1), seen
+    after = RunState(
+        states=states,
+        near=position,
+        twist=model_twist,
+        hardware=hardware,
+        memories=memories,
+        held=tuple(latched),
+        controller=controller,
+        tick=state.tick + 1,
+    )
+    return after, seen
 
 
-def command_of(bodies: Pair, states: States) -> tuple[Array, Array]:
-    """Return the coordinates (6, *batch) of C against T in the numerical model, and their rates."""
-    at, rates = coordinates(*relative(bodies, states))
-    return assembled(at), assembled(rates)
+def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
+    """Return coordinates, their rates, and twist of C against T in the numerical model, (6, *batch)."""
+    pose, twist = relative(bodies, states)
+    at, rates = coordinates(pose, twist)
+    return assembled(at), assembled(rates), assembled(twist)
 
 
-def _sense(
-    loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Pose | None
-) -> tuple[Wrench, Channels]:
-    """Return the wrench on the numerical model, from sensor and controller, and the channels' next state."""
-    sensor, channels = rig.sensor, state.channels
+def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
+    """Return what the compensator knows of the rig; `weighed`: the force sensor carries a tool."""
+    bodies, period = scenario.bodies, scenario.control_period
+    zero = jnp.zeros_like(period)
+    still = vector(jnp.zeros((3, *period.shape), period.dtype))
+    docked = place(bodies, Pose(still, identity(zero)), Twist(still, still), zero)
+    mass = mass_matrix(bodies, docked)
+    unit = jnp.broadcast_to(jnp.eye(6, dtype=period.dtype).reshape(6, 6, *[1] * period.ndim), mass.shape)
+    inverse = solve(mass, unit)
+    correction = unit
+    if weighed:
+        correction = solve(unit - product(tool_mass(scenario.sensor.assumed_tool), inverse), unit)
+    return SixAxisConstants(period, mass, inverse, correction)
+
+
+def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Array:
+    """Return the coordinates (6, *batch) that the position sensor reads, from those of the axes."""
+    still = Motion(measured, jnp.zeros_like(measured), None)
+    at = rig.kinematics.coordinates(still, state.near).position
+    if not loop.has_pose_errors:
+        return at
+    noisy = at + rig.sensor.position_noise_std * _noise(rig, state.tick, 1)
+    return quantise(noisy, rig.sensor.position_quantum)
+
+
+def _control(
+    loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Array | None
+) -> tuple[Wrench, Controller]:
+    """Return the wrench on the numerical model, from sensor and compensator, and their next state."""
+    sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
     else:
         load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
         raw = read_moving(contact, load, motion.pose)
-    lagged = raw if channels.lag is None else _behind_lag(rig, state.tick, raw, *channels.lag)
-    noise = _noise(rig, state.tick) if loop.has_noise else None
+    lagged = raw if last.lag is None else _behind_lag(rig, state.tick, raw, *last.lag)
+    noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
     reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
-    if measured is None:
+    if motion.acceleration is None:
         contact = undo_fixed(unbiased, sensor.mounting)
     else:
-        load = weight(sensor.assumed_tool, measured.attitude, sensor.assumed_gravity)
-        contact = undo_moving(unbiased, load, measured)
-    command, controller = _compensate(loop, rig, contact, channels.controller, state.tick)
-    return command, Channels(None if channels.lag is None else (raw, lagged), controller)
+        assert measured is not None
+        pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
+        load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
+        contact = undo_moving(unbiased, load, pose)
+    forces, structure = jax.tree.flatten(contact)
+    law = SIX_AXIS_COMPENSATORS[loop.compensator]
+    first = 0 if rig.kinematics.is_linear else HISTORY
+    signals = SixAxisSignals(
+        wrench=tuple(forces),
+        pose_desired=state.near,
+        twist_desired=state.twist,
+        pose_measured=measured if law.reads_pose else None,
+        age=jnp.zeros(rig.period.shape, jnp.int32) + (state.tick - first),
+    )
+    commands, law_state = law.step(rig.prepared, last.law, signals, state.tick)
+    command = structure.unflatten(commands)
+    return command, Controller(None if last.lag is None else (raw, lagged), law_state)
 
 
 def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
@@ -262,48 +344,14 @@ def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench)
     return reading
 
 
-def _compensate(loop: Loop, rig: Rig, contact: Wrench, states: tuple, now: Array) -> tuple[Wrench, tuple]:
-    """Apply the compensator to each channel separately."""
-    law, constants = SIX_AXIS_COMPENSATORS[loop.compensator], _constants(rig)
-    forces, structure = jax.tree.flatten(contact)
-    zero, age = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32) + now
-    commands, next_states = [], []
-    for channel, (force, state) in enumerate(zip(forces, states, strict=True)):
-        prepared = law.prepare(_gains(loop, rig, channel), constants)
-        signals = Signals(force, zero, zero, zero, age)
-        command, state = law.step(prepared, state, signals, now)
-        commands.append(command)
-        next_states.append(state)
-    return structure.unflatten(commands), tuple(next_states)
-
-
 def _wrench(channels: Array) -> Wrench:
     """Return six channels, (6, *batch), as a wrench."""
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
-def _gains(loop: Loop, rig: Rig, channel: int) -> Gains:
-    """Return the gains of a channel."""
-    law = SIX_AXIS_COMPENSATORS[loop.compensator]
-    gains = {name: value[channel] for name, value in rig.gains.items()}
-    return law.channel(gains, channel) if isinstance(law, PhaseLeadPerAxis) else gains
-
-
-def _constants(rig: Rig) -> KnownConstants:
-    """Return the rig data that the controller knows."""
-    return KnownConstants(rig.period, jnp.full_like(rig.period, jnp.inf))
-
-
-def _noise(rig: Rig, now: Array) -> Array:
-    """Return the noise of six channels [N, N m] at a tick."""
+def _noise(rig: Rig, now: Array, sensor: int) -> Array:
+    """Return standard normal noise of six channels at a tick; `sensor` is 0 for force and 1 for pose."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
-    episode = jnp.zeros(rig.period.shape, jnp.int32)
-    return rig.sensor.noise_std * white_noise(rig.key, episode, count, rig.period.dtype)
-
-
-def _six(value: Array, like: Array) -> Array:
-    """Return the value for each of six channels, (6, *batch)."""
-    if value.ndim <= like.ndim:
-        value = jnp.broadcast_to(value, like.shape)[None]
-    return jnp.broadcast_to(value, (6, *like.shape))
+    stream = jnp.full(rig.period.shape, sensor, jnp.int32)
+    return white_noise(rig.key, stream, count, rig.period.dtype)

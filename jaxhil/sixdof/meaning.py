@@ -3,8 +3,8 @@
 import math
 from typing import NamedTuple
 
+from jaxhil.laws.shared.nominal_values import axis_lags
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
 from jaxhil.sixdof.units import unit_warnings
 
 FASTEST = 0.1  # greatest plausible contact frequency, over the control rate
@@ -44,7 +44,7 @@ def meaning(
 ) -> Meaning:
     """Return the summary of a mechanism whose first ideal contact has these metrics, in SI units."""
     rig = mechanism.rig
-    delay = rig.force_sensor.delay + rig.force_sensor.time_constant + _lateness(rig.simulator)
+    delay = rig.force_sensor.delay + rig.force_sensor.time_constant + max(axis_lags(mechanism))
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
     warnings = list(unit_warnings(mechanism))
     rate = 1 / rig.control_period
@@ -67,36 +67,3 @@ def meaning(
                 f"expected more than {slip:.2g} m/s: below it the delayed friction chatters"
             )
     return Meaning(effective_mass, frequency, peak_force, restitution, delay, limit, tuple(warnings))
-
-
-def _lateness(simulator: Simulator) -> float:
-    """Return the slowest axis's delay in uniform motion [s]; with two robots, weighted by their shares."""
-    chaser_lags, robot = _lags(simulator, simulator), simulator.target_robot
-    if robot is None:
-        return max(chaser_lags)
-    target_lags = _lags(simulator, robot)
-    return max(
-        (1 - share) * chaser + share * target
-        for share, chaser, target in zip(robot.share, chaser_lags, target_lags, strict=True)
-    )
-
-
-def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
-    """Return the delay [s] of each axis of a robot in uniform motion: transport delay plus -G'(0)."""
-
-    def of(key: str) -> list[float]:
-        return getattr(robot, key) or getattr(simulator, key)
-
-    lag = [0.0] * 6
-    if simulator.model == "first_order":
-        lag = of("time_constant")
-    elif simulator.model == "second_order":
-        pairs = zip(of("damping_ratio"), of("natural_frequency"), strict=True)
-        lag = [damping / (math.pi * frequency) for damping, frequency in pairs]
-    elif simulator.model == "third_order" and simulator.coefficients:
-        lag = [simulator.coefficients[0]] * 6
-    elif simulator.model == "transfer_function":
-        *_, slope, value = simulator.denominator or []
-        *_, lead, gain = 0.0, *(simulator.numerator or [])
-        lag = [slope / value - lead / gain] * 6
-    return [axis_lag + delay for axis_lag, delay in zip(lag, of("delay"), strict=True)]

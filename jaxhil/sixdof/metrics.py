@@ -1,10 +1,10 @@
 """Metrics of episodes: the rig's contact compared with the ideal contact with the same initial states.
 
-Both are compared at the same time, when both are over. The relative mass matrix M at that pose relates metres
-and radians: twists are compared in its norm.
+Both are compared at the end of the rig's episode, when both are free. The relative mass matrix M relates
+metres and radians: twists are compared in its norm.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,29 +14,22 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.equations import square_root
+from jaxhil.sixdof.first_touch import Meeting, meeting_mass
 from jaxhil.sixdof.loop import Loop
-from jaxhil.sixdof.reference import (
-    Meeting,
-    Passage,
-    glide,
-    meet,
-    meeting_mass,
-    over_time,
-    pass_through,
-)
+from jaxhil.sixdof.reference import LONGEST, states_at
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relative
-from jaxhil.sixdof.rollout import CAPTURED, MISS, REBOUNDED, Episode, quiet_time, rollout
+from jaxhil.sixdof.rollout import CAPTURED, MISS, Episode, rollout
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, cross, dot, root
 
-LONGEST = 2.0  # control periods; longest step of the ideal contact's integration
+LEAST_SHARE = 0.05  # least energy of a first touch to which errors are related, over that of the approach
 
 
 class Metrics(NamedTuple):
     """Metrics of episodes, (episodes, *batch); NaN for values that they do not have."""
 
-    energy_error: Float[Array, "..."]  # error of the change of kinetic energy, over m_n v_n^2/2 [1]
+    energy_error: Float[Array, "..."]  # error of the change of kinetic energy, over that of the approach [1]
     twist_error: Float[Array, "..."]  # |V - V*| over |V* - V_0|, in the norm of M [1]
     normal_part: Float[Array, "..."]  # part of the twist error along the ideal impulse [1]
     lateral_part: Float[Array, "..."]  # translational part of the rest [1]
@@ -82,7 +75,7 @@ class Result(NamedTuple):
 def evaluate(loop: Loop, gains: Gains, scenario: Scenario) -> Result:
     """Run and evaluate a batch of scenarios; `gains` are those of `jaxhil.sixdof.loop.build_rig`."""
     outcome = rollout(loop, gains, scenario)
-    return Result(judge(scenario, outcome.episodes), outcome.final, outcome.final_time)
+    return Result(judge(scenario.bodies, outcome.episodes), outcome.final, outcome.final_time)
 
 
 def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
@@ -93,57 +86,28 @@ def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
     return fly(space, flight, time, longest, scale(space, scenario.start)).states
 
 
-def judge(scenario: Scenario, episodes: Episode) -> Metrics:
-    """Return the metrics of episodes."""
-    slots = episodes.status.shape[0]
-
-    def repeated(tree: Any) -> Any:
-        """Add an axis of episodes before the batch."""
-        lanes = scenario.control_period.ndim
-        return jax.tree.map(
-            lambda leaf: jnp.broadcast_to(
-                jnp.expand_dims(leaf, leaf.ndim - lanes),
-                (*leaf.shape[: leaf.ndim - lanes], slots, *leaf.shape[leaf.ndim - lanes :]),
-            ),
-            tree,
-        )
-
-    space = Space(*repeated((scenario.bodies, scenario.groups, scenario.latches)))
-    period, duration, sensor = repeated((scenario.control_period, scenario.duration, scenario.sensor))
-    lasted = jnp.where(
-        episodes.status == REBOUNDED, duration - episodes.entry_time, episodes.end_time - episodes.entry_time
+def judge(bodies: Pair, episodes: Episode) -> Metrics:
+    """Return the metrics of episodes, (episodes, *batch), of bodies (*batch)."""
+    bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
+    past, meeting = episodes.past, episodes.meeting
+    expected_states = states_at(bodies, past, episodes.lasted)
+    start, end, expected, before = _moments(
+        bodies, [episodes.start, episodes.end, expected_states, meeting.states]
     )
-    quiet = quiet_time(sensor, period)
-    passage = pass_through(space, episodes.entry, quiet, jnp.where(lasted > 0, lasted, 0), LONGEST * period)
-    return _compare(space, episodes, passage, quiet)
-
-
-def _compare(space: Space, episodes: Episode, passage: Passage, quiet: Array) -> Metrics:
-    """Return the metrics of episodes and of the ideal contacts."""
-    bodies, meeting = space.bodies, meet(space, passage)
-    ended = episodes.end_time - episodes.entry_time
-    both = jnp.maximum(ended, over_time(passage, quiet))
-    flown = [
-        (episodes.entry, 0 * both),
-        (episodes.end, both - ended),
-        (passage.flight.states, both - passage.flight.time),
-    ]
-    start, end, expected = _later(bodies, flown)
-    mass, (pose, before) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
-    speed = _closing(pose, meeting, before)
+    mass, (pose, _) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
+    speed = _closing(pose, meeting, before.twist)
+    least = LEAST_SHARE * _square(before.mass, _stacked(before.twist)) / 2
+    approach = jnp.maximum(mass * speed**2 / 2, least)
     change, changed = end.energy - start.energy, expected.energy - start.energy
-    parts = _twist_parts(expected.mass, end.twist, expected.twist, before)
-    touched = (episodes.status != MISS) & (passage.touches > 0)
-    once, only = touched & (episodes.touches == 1), touched & (passage.touches == 1)
+    parts = _twist_parts(expected.mass, end.twist, expected.twist, before.twist)
+    touched = (episodes.status != MISS) & (past.touches > 0)
+    once, only = touched & (episodes.touches == 1), touched & (past.touches == 1)
 
     def of(is_valid: Array, value: Array) -> Array:
         return jnp.where(is_valid, value, jnp.nan)
 
-    captured = jnp.zeros_like(touched)
-    for latch in passage.flight.memories.held:
-        captured = captured | jnp.any(latch.caught, axis=0)
     return Metrics(
-        of(touched, (change - changed) / (mass * speed**2 / 2)),
+        of(touched, (change - changed) / approach),
         *(of(touched, part) for part in parts),
         restitution=of(once & only, -_closing(pose, meeting, end.twist) / speed),
         reference_restitution=of(only, -_closing(pose, meeting, expected.twist) / speed),
@@ -154,16 +118,16 @@ def _compare(space: Space, episodes: Episode, passage: Passage, quiet: Array) ->
         energy_change=change,
         reference_energy_change=changed,
         peak_force=episodes.peak_force,
-        reference_peak_force=passage.force.largest,
+        reference_peak_force=past.peak_force,
         peak_moment=episodes.peak_moment,
-        reference_peak_moment=passage.moment.largest,
+        reference_peak_moment=past.peak_moment,
         duration=episodes.duration,
-        reference_duration=of(jnp.isfinite(passage.flight.time), passage.touched),
+        reference_duration=of(jnp.isfinite(past.time), past.touched),
         touches=episodes.touches,
-        reference_touches=passage.touches,
+        reference_touches=past.touches,
         penetration=episodes.penetration,
         captured=episodes.status == CAPTURED,
-        reference_captured=captured,
+        reference_captured=past.captured,
         status=episodes.status,
     )
 
@@ -174,37 +138,38 @@ def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
     return -dot(meeting.normal, velocity)
 
 
-def _later(bodies: Pair, flown: list[tuple[States, Array]]) -> list[Moment]:
-    """Return both bodies after free flights, given as (states, duration [s])."""
-    # The loops are not unrolled: the compiler would fuse and repeat the computations.
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *flown)
-    _, states = lax.scan(lambda _, flight: (None, glide(bodies, *flight)), None, stacked)
+def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
+    """Return twist, energy and mass matrix for each of the states."""
 
+    # The loop is not unrolled: the compiler would fuse and repeat the computations.
     def moment(_, states: States) -> tuple[None, Moment]:
         _, twist = relative(bodies, states)
         energies = [kinetic_energy(*item) for item in zip(bodies, states, strict=True)]
         return None, Moment(twist, energies[0] + energies[1], mass_matrix(bodies, states))
 
-    _, moments = lax.scan(moment, None, states)
-    return [jax.tree.map(lambda leaf, at=at: leaf[at], moments) for at in range(len(flown))]
+    _, moments = lax.scan(moment, None, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    return [jax.tree.map(lambda leaf, at=at: leaf[at], moments) for at in range(len(states))]
 
 
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
     """Return the error of a twist in the norm of M, and its normal, lateral and rotational parts."""
-    error, impulse = (
-        jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, a, b)))
-        for a, b in ((after, expected), (expected, before))
-    )
-
-    def square(vector: Array) -> Array:
-        return jnp.sum(vector[:, None] * matrix * vector[None], axis=(0, 1))
-
-    size = root(square(impulse))
+    error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
+    size = root(_square(matrix, impulse))
     scale_ = 1 / jnp.where(size > 0, size, jnp.nan)
     half = square_root(matrix)
     weighed, along = (jnp.sum(half * vector[None], axis=1) for vector in (error, scale_[None] * impulse))
     normal = jnp.sum(weighed * along, axis=0)
     rest = weighed - normal[None] * along
     lateral, rotational = (root(jnp.sum(part**2, axis=0)) for part in (rest[:3], rest[3:]))
-    total = root(square(error))
+    total = root(_square(matrix, error))
     return total * scale_, normal * scale_, lateral * scale_, rotational * scale_
+
+
+def _stacked(twist: Twist) -> Float[Array, "6 *batch"]:
+    """Return the components of a twist along a leading axis."""
+    return jnp.stack(jax.tree.leaves(twist))
+
+
+def _square(matrix: Float[Array, "6 6 *batch"], vector: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
+    """Return vector . matrix vector."""
+    return jnp.sum(vector[:, None] * matrix * vector[None], axis=(0, 1))

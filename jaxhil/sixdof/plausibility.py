@@ -18,7 +18,7 @@ from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.candidates import motion_at
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.latch import init_latch, latch_wrench
-from jaxhil.sixdof.loop import command_of
+from jaxhil.sixdof.loop import model_motion
 from jaxhil.sixdof.relative import relative
 from jaxhil.sixdof.rollout import STRETCH
 from jaxhil.sixdof.scenario import Scenario
@@ -124,7 +124,7 @@ def _compiled() -> Callable[[Scenario], Beginning]:
 def _beginning(scenario: Scenario) -> Beginning:
     """Return the start of the runs."""
     pose, twist = relative(scenario.bodies, scenario.start)
-    at, _ = command_of(scenario.bodies, scenario.start)
+    at, *_ = model_motion(scenario.bodies, scenario.start)
     caught = tuple(
         latch_wrench(latch, init_latch(latch, pose), pose, twist)[1].caught for latch in scenario.latches
     )

@@ -1,157 +1,209 @@
-"""Episode of the ideal contact: two bodies that touch without a rig."""
+"""Ideal contact as reference of a run: two bodies that touch without a rig.
 
-from typing import NamedTuple
+It is integrated once, over the whole duration of the run. An episode of the rig ends where both the rig and
+the ideal contact are free: therefore the times in which nothing touches are recorded, with the motion at the
+start of each.
+"""
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.sixdof.bodies import Load, kick_drift
-from jaxhil.sixdof.candidates import Touch, motion_at
+from jaxhil.sixdof.first_touch import Meeting, meet
 from jaxhil.sixdof.peaks import Peak, higher, no_peak
-from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
-from jaxhil.sixdof.space import Flight, Instant, Space, advance_flight, choose, scale, start_flight
-from jaxhil.sixdof.vectors import Vector, norm
+from jaxhil.sixdof.relative import Pair, States, Twist, mass_matrix, relative
+from jaxhil.sixdof.space import (
+    Flight,
+    Instant,
+    Space,
+    advance_flight,
+    choose,
+    fly,
+    scale,
+    start_flight,
+)
+from jaxhil.sixdof.vectors import norm
 
 FIRST = 1e-4  # s; first step
-TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
+LONGEST = 2.0  # control periods; longest step of the integration near a touch
+GAPS = 4  # number of recorded gaps between touches
+LEAST_CHANGE = 0.05  # least change of the twist by a contact that may end an episode, over the twist before
 
 
-class Meeting(NamedTuple):
-    """First touch of an episode, in T axes."""
+class Past(NamedTuple):
+    """Ideal contact up to a time."""
 
+    time: Float[Array, "*batch"]  # time since its start [s]
     states: States  # states of the bodies
-    point: Vector  # point of the touch [m]
-    normal: Vector  # normal of the target's surface
+    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
+    touched: Float[Array, "*batch"]  # time in touch [s]
+    peak_force: Float[Array, "*batch"]  # [N]
+    peak_moment: Float[Array, "*batch"]  # about T's origin [N m]
+    captured: Bool[Array, "*batch"]  # whether a latch holds
+
+
+class Gaps(NamedTuple):
+    """Times without a touch, after a contact that changed the twist noticeably, (GAPS, *batch).
+
+    The last one replaces those for which there is no room. An unused one begins at infinity.
+    """
+
+    begin: Past  # ideal contact up to the begin of the gap
+    end: Float[Array, "gaps *batch"]  # time of the next touch [s]; infinite if there is none
+
+
+class Reference(NamedTuple):
+    """Ideal contact over the whole duration of a run."""
+
+    meeting: Meeting
+    gaps: Gaps
+    last: Past  # at the end of the run; its time is infinite if the contact was too stiff to be integrated
 
 
 class Passage(NamedTuple):
-    """State of an episode's integration."""
+    """State of the integration."""
 
     flight: Flight
     touching: tuple[Bool[Array, "candidates *batch"], ...]
     touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
     touched: Float[Array, "*batch"]  # time in touch [s]
-    left: Float[Array, "*batch"]  # time of the last touch [s]
     before: States  # last states before the first touch
     depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the first step in touch [m]
     force: Peak  # peak force [N]
     moment: Peak  # peak moment about T's origin [N m]
+    gaps: Gaps
+    slot: Int[Array, "*batch"]  # index of the current or next gap
     active: Bool[Array, "*batch"]
 
 
-def pass_through(
-    space: Space, states: States, quiet: Array, until: Float[Array, "*batch"], longest: Array
-) -> Passage:
-    """Integrate the episode of free bodies until it is over, or until a time [s].
+class Approach(NamedTuple):
+    """Relative motion at the start, to which changes are related."""
 
-    It is over when nothing has touched for a time `quiet` [s] after the first touch. No step is longer than
-    `longest` [s], which must be shorter than any touch.
+    twist: Twist
+    mass: Float[Array, "6 6 *batch"]  # relative mass matrix
+    speed: Float[Array, "*batch"]  # of the bodies, as in `space.scale` [m/s]
+    quiet: Float[Array, "*batch"]  # least duration of a gap [s]
+
+
+def follow_contact(space: Space, states: States, quiet: Array, until: Array, period: Array) -> Reference:
+    """Return the ideal contact of free bodies over a time.
+
+    Args:
+        space: constants of the contact.
+        states: states of the free bodies at the start.
+        quiet: least duration of a gap between touches that is recorded [s].
+        until: duration [s].
+        period: control period [s]; steps near a touch are limited to two periods.
     """
-    flight = start_flight(space, states, jnp.minimum(FIRST, until))
-    speed = scale(space, states)
-    zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)
+    _, twist = relative(space.bodies, states)
+    approach = Approach(twist, mass_matrix(space.bodies, states), scale(space, states), quiet)
+    longest = LONGEST * period
+
+    def body(passage: Passage) -> Passage:
+        left = until - passage.flight.time
+        after, step = advance_flight(space, passage.flight, left, longest, approach.speed)
+        # A rejected step changes only the length of the next one.
+        going = choose(step.accepted, _updated(passage, approach, after, step.now), passage)
+        going = going._replace(flight=after)
+        done = (until - after.time <= 1e-13 * until) | ~jnp.isfinite(after.time)
+        return choose(passage.active, going._replace(active=~done), passage)
+
+    start = _start(space, states, jnp.minimum(FIRST, until))._replace(active=until > 0)
+    passage = lax.while_loop(lambda passage: jnp.any(passage.active), body, start)
+    return Reference(meet(space, passage.before, passage.depths), passage.gaps, _past(passage))
+
+
+def is_quiet(reference: Reference, time: Array, quiet: Array) -> Bool[Array, "*batch"]:
+    """Return whether the ideal contact has touched nothing for `quiet` [s] at a time [s]."""
+    begin, end = reference.gaps.begin.time, reference.gaps.end
+    return jnp.any((begin + quiet[None] <= time[None]) & (time[None] < end), axis=0)
+
+
+def past_at(reference: Reference, time: Array, common: Bool[Array, "*batch"]) -> Past:
+    """Return the ideal contact up to the gap in which a time [s] lies; if not `common`, up to its end."""
+    past = reference.last
+    for slot in range(GAPS):
+        begin = jax.tree.map(lambda leaf, slot=slot: leaf[slot], reference.gaps.begin)
+        past = choose(common & (begin.time <= time) & (time < reference.gaps.end[slot]), begin, past)
+    return past
+
+
+def states_at(bodies: Pair, past: Past, time: Float[Array, "*batch"]) -> States:
+    """Return the states after the free flight that follows, at a time [s]."""
+    free = Space(bodies, (), ())
+    left = jnp.where(time > past.time, time - past.time, 0)
+    flight = start_flight(free, past.states, left)
+    return fly(free, flight, left, left, scale(free, past.states)).states
+
+
+def _start(space: Space, states: States, first: Float[Array, "*batch"]) -> Passage:
+    """Return the state before the first step, which has a length `first` [s]."""
+    zero, none = jnp.zeros_like(first), jnp.zeros(first.shape, jnp.int32)
     depths = tuple(jnp.zeros_like(group.parameters.damping) for group in space.groups)
     touching = tuple(depth > 0 for depth in depths)
-    start = Passage(
-        flight=flight,
+    passage = Passage(
+        flight=start_flight(space, states, first),
         touching=touching,
         touches=none,
         touched=zero,
-        left=zero,
         before=states,
         depths=depths,
         force=no_peak(zero),
         moment=no_peak(zero),
-        active=until > 0,
+        gaps=Gaps(None, zero),  # type: ignore[arg-type]
+        slot=none,
+        active=none == 0,
+    )
+    past: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (GAPS, *leaf.shape)), _past(passage))
+    never = jnp.full((GAPS, *first.shape), jnp.inf, first.dtype)
+    return passage._replace(gaps=Gaps(past._replace(time=never), never))
+
+
+def _past(passage: Passage) -> Past:
+    """Return the contact so far."""
+    captured = passage.touches < 0
+    for latch in passage.flight.memories.held:
+        captured = captured | jnp.any(latch.caught, axis=0)
+    return Past(
+        time=passage.flight.time,
+        states=passage.flight.states,
+        touches=passage.touches,
+        touched=passage.touched,
+        peak_force=passage.force.largest,
+        peak_moment=passage.moment.largest,
+        captured=captured,
     )
 
-    def body(passage: Passage) -> Passage:
-        left = until - passage.flight.time
-        after, step = advance_flight(space, passage.flight, jnp.minimum(longest, left), speed)
-        updated = _updated(passage, after, step.now)
-        # A rejected step changes only the length of the next one.
-        going = choose(step.accepted, updated, passage)._replace(flight=after)
-        free = (going.touches > 0) & (going.flight.time - going.left >= quiet) & ~_touches(going)
-        done = free | (until - going.flight.time <= 1e-13 * until) | ~jnp.isfinite(going.flight.time)
-        return choose(passage.active, going._replace(active=~done), passage)
 
-    return lax.while_loop(lambda passage: jnp.any(passage.active), body, start)
-
-
-def over_time(passage: Passage, quiet: Array) -> Float[Array, "*batch"]:
-    """Return the time [s] at which the episode was over.
-
-    If nothing touches at its end, this is `quiet` [s] after the last touch.
-    """
-    free = (passage.touches > 0) & ~_touches(passage)
-    return jnp.minimum(passage.flight.time, jnp.where(free, passage.left + quiet, jnp.inf))
-
-
-def meet(space: Space, passage: Passage) -> Meeting:
-    """Return the first touch, found on the free flight before it."""
-    if not space.groups:
-        apart = jnp.full_like(passage.left, jnp.nan)
-        nowhere = Vector(apart, apart, apart)
-        return Meeting(passage.before, nowhere, nowhere)
-
-    def touch_of(states: States) -> tuple[Touch, Array]:
-        """Return a candidate's touch and the rate of its penetration.
-
-        The candidate is the one with the largest penetration at the end of the step.
-        """
-        pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
-        touches = [group.candidates.touch(pose) for group in space.groups]
-        rates = [motion_at(touch, pose, twist)[0] for touch in touches]
-        return _deepest(list(zip(touches, rates, strict=True)), passage.depths)
-
-    # The loop is not unrolled: the compiler would fuse and repeat the computations.
-    def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
-        time, states, _ = carry
-        touch, rate = touch_of(states)
-        time = time - touch.depth / jnp.where(rate > 0, rate, jnp.inf)
-        ahead = glide(space.bodies, passage.before, time)
-        return time, ahead, Meeting(states, touch.point, touch.normal)
-
-    zero = jnp.zeros_like(passage.left)
-    nothing = Vector(zero, zero, zero)
-    start = zero, passage.before, Meeting(passage.before, nothing, nothing)
-    *_, meeting = lax.fori_loop(0, TOUCH_STEPS, newton, start)
-    return meeting
+def _recorded(passage: Passage, approach: Approach, ahead: Passage, now: Instant) -> Passage:
+    """Return the passage `ahead` with the gap that begins or ends in the step from `passage`."""
+    was, touches = _touches(passage), _touches(ahead)
+    slot = jnp.arange(GAPS, dtype=jnp.int32).reshape(-1, *[1] * was.ndim) == passage.slot[None]
+    change = jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, now.twist, approach.twist)))
+    twist = jnp.stack(jax.tree.leaves(approach.twist))
+    is_noticeable = _square(approach.mass, change) >= LEAST_CHANGE**2 * _square(approach.mass, twist)
+    begins = slot & (was & ~touches & is_noticeable)[None]
+    past = jax.tree.map(lambda new, old: jnp.where(begins, new[None], old), _past(ahead), ahead.gaps.begin)
+    # A gap ends at the last time without a touch.
+    start = jnp.min(jnp.where(slot, ahead.gaps.begin.time, jnp.inf), axis=0)
+    ends = ~was & touches & jnp.isfinite(start)
+    end = jnp.where(begins, jnp.inf, ahead.gaps.end)
+    end = jnp.where(slot & ends[None], passage.flight.time[None], end)
+    is_long = ends & (passage.flight.time - start >= approach.quiet)
+    past = past._replace(time=jnp.where(slot & (ends & ~is_long)[None], jnp.inf, past.time))
+    next_slot = jnp.minimum(passage.slot + is_long.astype(jnp.int32), GAPS - 1)
+    return ahead._replace(gaps=Gaps(past, end), slot=next_slot)
 
 
-def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
-    """Return the candidate with the largest of the penetrations `depths`."""
-    best: tuple[tuple[Touch, Array], Array] | None = None
-    for candidate, depth in zip(candidates, depths, strict=True):
-        index = jnp.argmax(depth, axis=0)[None]
-
-        def pick(leaf: Array, index: Array = index, like: Array = depth) -> Array:
-            return jnp.take_along_axis(jnp.broadcast_to(leaf, like.shape), index, axis=0)[0]
-
-        deepest = jax.tree.map(pick, candidate), pick(depth)
-        best = deepest if best is None else choose(deepest[1] > best[1], deepest, best)
-    assert best is not None
-    return best[0]
+def _square(matrix: Array, vector: Array) -> Array:
+    """Return vector . matrix vector."""
+    return jnp.sum(vector[:, None] * matrix * vector[None], axis=(0, 1))
 
 
-def meeting_mass(bodies: Pair, meeting: Meeting) -> Float[Array, "*batch"]:
-    """Return the effective mass [kg] of the first touch along its normal."""
-    return effective_mass(bodies, meeting.states, meeting.point, meeting.normal)
-
-
-def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
-    """Return the states after a short free flight [s], in one step."""
-    zero = jnp.zeros_like(time)
-    nothing = Vector(zero, zero, zero)
-    return States(*(
-        kick_drift(body, state, Load(nothing, nothing), time, 1.0)
-        for body, state in zip(bodies, states, strict=True)
-    ))  # fmt: skip
-
-
-def _updated(passage: Passage, after: Flight, now: Instant) -> Passage:
+def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) -> Passage:
     """Return the episode after a step that ends `now`."""
     depths = tuple(forces.touch.depth for forces in now.forces)
     touching = tuple(depth > 0 for depth in depths)
@@ -166,19 +218,19 @@ def _updated(passage: Passage, after: Flight, now: Instant) -> Passage:
     for now_touching, before in zip(touching, passage.touching, strict=True):
         bends = bends | jnp.any(now_touching != before, axis=0)
     touched = passage.touched + jnp.where(_touches(passage), step, 0)
-    return ahead._replace(
+    ahead = ahead._replace(
         touched=touched,
-        left=jnp.where(_touches(ahead), after.time, passage.left),
         before=choose(touches == 0, now.states, passage.before),
         depths=choose(first, depths, passage.depths),
         force=higher(passage.force, norm(now.wrench.force), step, bends),
         moment=higher(passage.moment, norm(now.wrench.moment), step, bends),
     )
+    return _recorded(passage, approach, ahead, now)
 
 
 def _touches(passage: Passage) -> Array:
     """Return whether something touches or a latch holds."""
-    result = jnp.zeros(passage.left.shape, bool)
+    result = jnp.zeros(passage.touched.shape, bool)
     for flags in (*passage.touching, *(latch.caught for latch in passage.flight.memories.held)):
         result = result | jnp.any(flags, axis=0)
     return result

@@ -9,12 +9,13 @@ loop models delay and lag.
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxhil.simulation.sensors import sample_force
 from jaxhil.sixdof.relative import Pose, Twist, Wrench
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
-from jaxhil.sixdof.vectors import Matrix, Vector, cross
+from jaxhil.sixdof.vectors import Matrix, Vector, components, cross
 
 
 class Tool(NamedTuple):
@@ -50,6 +51,9 @@ class Sensor(NamedTuple):
     assumed_gravity: Vector  # likewise [m/s^2]
     assumed_bias: Float[Array, "6 *batch"]  # likewise [N, N m]
     position_delay: Float[Array, "*batch"]  # delay of the measured pose [s]
+    # standard deviation of white noise of the pose's coordinates, and step to which they are rounded [m, rad]
+    position_noise_std: Float[Array, "6 *batch"]
+    position_quantum: Float[Array, "6 *batch"]
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
@@ -70,6 +74,20 @@ def weight(tool: Tool, attitude: Quaternion, gravity: Vector) -> Wrench:
     """Return the weight of the tool alone, as `tool_load` does."""
     force = tool.mass * gravity
     return Wrench(force, cross(rotate(attitude, tool.centre), force))
+
+
+def tool_mass(tool: Tool) -> Float[Array, "6 6 *batch"]:
+    """Return the tool's mass matrix about C's origin, for C aligned with T."""
+    mass, centre = tool.mass, components(tool.centre)
+    unit = jnp.eye(3, dtype=mass.dtype).reshape(3, 3, *[1] * mass.ndim)
+    zero = jnp.zeros_like(mass)
+    x, y, z = centre
+    across = jnp.stack([jnp.stack(row) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
+    inertia = jnp.stack([components(row) for row in (tool.inertia.x, tool.inertia.y, tool.inertia.z)])
+    square = jnp.sum(centre**2, axis=0)[None, None] * unit - centre[:, None] * centre[None]
+    mass = mass[None, None]
+    top = jnp.concatenate([mass * unit, -mass * across], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([mass * across, inertia + mass * square], axis=1)])
 
 
 def read_moving(wrench: Wrench, load: Wrench, pose: Pose) -> Wrench:

@@ -81,9 +81,10 @@ class SixAxes(RigModel):
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return the scenarios with a noise-free force sensor."""
+        """Return the scenarios with noise-free sensors of force and pose."""
         sensor = scenarios.sensor
-        return scenarios._replace(sensor=sensor._replace(noise_std=np.zeros_like(sensor.noise_std)))
+        quiet = {name: np.zeros_like(getattr(sensor, name)) for name in ("noise_std", "position_noise_std")}
+        return scenarios._replace(sensor=sensor._replace(**quiet))
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
         """Return the loop with another compensator."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.contact.dormand_prince import take_looped_step
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
-from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
+from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_points, latch_wrench
 from jaxhil.sixdof.relative import (
     Pair,
     Pose,
@@ -36,6 +36,8 @@ EVENT = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a la
 REMEMBERING = 1e-4  # s; longest step of laws with memory
 MOST_STEPS = 200_000  # limit on the steps of a motion, unless they are long
 SMALLEST, LARGEST = 0.1, 4.0  # limits of the change of the step length
+REACH = 1.0  # m; distance by which the nearest points of two shapes may move on them
+TINY = 1e-30  # m/s; avoids a division by zero
 
 
 class Space(NamedTuple):
@@ -72,6 +74,7 @@ class Flight(NamedTuple):
     memories: Memories
     states: States  # states of the bodies
     tries: Int[Array, "*batch"]  # number of tried steps so far
+    apart: Float[Array, "*batch"]  # time in which nothing can touch [s]; 0 in touch
 
 
 class Step(NamedTuple):
@@ -89,7 +92,15 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
         pose, _ = relative(space.bodies, states)
         memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
     touching = tuple(jnp.zeros_like(group.parameters.damping, bool) for group in space.groups)
-    return Flight(0 * length, length, touching, memories, states, jnp.zeros(length.shape, jnp.int32))
+    return Flight(
+        time=0 * length,
+        length=length,
+        touching=touching,
+        memories=memories,
+        states=states,
+        tries=jnp.zeros(length.shape, jnp.int32),
+        apart=0 * length,
+    )
 
 
 def instant(
@@ -107,16 +118,27 @@ def instant(
 
 
 def advance_flight(
-    space: Space, flight: Flight, longest: Float[Array, "*batch"], speed: Float[Array, "*batch"]
+    space: Space,
+    flight: Flight,
+    left: Float[Array, "*batch"],
+    longest: Float[Array, "*batch"],
+    speed: Float[Array, "*batch"],
 ) -> tuple[Flight, Step]:
-    """Try a step no longer than `longest` [s]; the relative speed [m/s] scales its error.
+    """Try a step; return the motion at its end or, if rejected, at its start with a shorter next step.
 
-    Return the motion at its end or, if the step was rejected, at its start with a shorter next step. If a
-    number is not finite or there are too many steps, the motion's time becomes infinite.
+    If a number is not finite or there are too many steps, the motion's time becomes infinite.
+
+    Args:
+        space: constants of the motion.
+        flight: motion at the start of the step.
+        left: upper bound of the step [s].
+        longest: upper bound of the step where something touches or may touch soon [s].
+        speed: relative speed that scales the step's error [m/s].
     """
     if _remembers(space):
         longest = jnp.minimum(longest, REMEMBERING)
-    length = lax.stop_gradient(jnp.minimum(flight.length, longest))
+    length = jnp.minimum(jnp.minimum(flight.length, left), jnp.maximum(longest, flight.apart))
+    length = lax.stop_gradient(length)
     now, memories, error = _try(space, flight, length, speed)
     touching = tuple(forces.touch.depth > 0 for forces in now.forces)
     before = (*flight.touching, *(latch.caught for latch in flight.memories.held))
@@ -134,7 +156,8 @@ def advance_flight(
     ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
     tries = flight.tries + 1
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
-    moved = Flight(time, ahead, touching, memories, now.states, tries)
+    apart = lax.stop_gradient(_time_apart(space, now))
+    moved = Flight(time, ahead, touching, memories, now.states, tries, apart)
     after: Flight = choose(accepted, moved, flight._replace(length=ahead, tries=tries))
     # The integration stops after many steps with a mean below a thousandth of the longest step.
     endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
@@ -193,7 +216,7 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
 
     def body(flight):
         left = until - flight.time
-        moved, _ = advance_flight(space, flight, jnp.minimum(longest, left), speed)
+        moved, _ = advance_flight(space, flight, left, longest, speed)
         return choose(left > _nothing(until), moved, flight)
 
     def ahead(flight):
@@ -228,6 +251,24 @@ def choose(condition: Array, one: Any, other: Any) -> Any:
 def _nothing(until: Array) -> Array:
     """Return the rest of a time [s] that counts as rounding."""
     return 1e-14 + 1e-13 * until
+
+
+def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
+    """Return half the time [s] that the nearest pair needs to touch at the largest possible speed.
+
+    A latch counts as near if its point is, whatever its angle and speed.
+    """
+    linear, angular = norm(now.twist.linear), norm(now.twist.angular)
+    time = jnp.full_like(linear, jnp.inf)
+    for forces in now.forces:
+        arm = jax.tree.map(lambda point, origin: point - origin[None], forces.touch.point, now.pose.position)
+        closing = linear[None] + angular[None] * (REACH + norm(arm))
+        time = jnp.minimum(time, jnp.min(-forces.touch.depth / (2 * closing + TINY), axis=0))
+    for latch in space.latches:
+        height = latch_points(latch, now.pose).z + latch.depth
+        closing = linear[None] + angular[None] * (REACH + norm(latch.point))
+        time = jnp.minimum(time, jnp.min(height / (2 * closing + TINY), axis=0))
+    return jnp.maximum(time, 0)
 
 
 def _remembers(space: Space) -> bool:

@@ -88,12 +88,13 @@ def tune_each(
     The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
     stored there.
     """
+    from jaxhil.laws.compensators import axes_of
     from tuning.caches.checkpoints import NO_CHECKPOINTS
     from tuning.gains.search_progress import SearchProgress
     from tuning.gains.tune_all import tune_all
 
-    settings, earlier = options.settings(), options.known()
     mechanisms = [entry.mechanism for entry in loaded]
+    settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.known()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
     checkpoints = pieces or NO_CHECKPOINTS

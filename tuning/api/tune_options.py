@@ -151,8 +151,8 @@ class TuneOptions:
         if callable(self.objective):
             arguments.check_one_axis_arguments(mechanism, objective=self.objective)
 
-    def settings(self) -> "TuneSettings":
-        """Return the settings of the tuning. Raise `InputError`. This imports jax."""
+    def settings(self, axes: int = 1) -> "TuneSettings":
+        """Return the settings of the tuning for a number of axes. Raise `InputError`. This imports jax."""
         from tuning.gains.settings import TuneSettings
 
         arguments.check_setting_name(self.compensator, self.setting)
@@ -162,7 +162,7 @@ class TuneOptions:
             self.steps,
             self.validation,
             self.seed,
-            self._objective(),
+            self._objective(axes),
             global_search=self.global_search,
             setting=self.setting,
             quiet=self.wants_quiet,
@@ -176,7 +176,7 @@ class TuneOptions:
         is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
         return is_default and 0 < self.limit < math.inf
 
-    def _objective(self) -> "Objective":
+    def _objective(self, axes: int) -> "Objective":
         """Return the objective, with the compensator's default weights where none are given."""
         from tuning.gains.objective import WEIGHT_FIELDS, Objective
         from tuning.transparency.probes import choose_default_weights
@@ -186,7 +186,7 @@ class TuneOptions:
         options = {name: getattr(self, name) for name in WEIGHT_FIELDS}
         user_weights = {name: weight for name, weight in options.items() if weight is not None}
         if not callable(self.objective):
-            weights = {**choose_default_weights(self.compensator), **user_weights}
+            weights = {**choose_default_weights(self.compensator, axes), **user_weights}
             return Objective(self.objective, **weights, limit=limit)
         from tuning.gains.metrics_function import MetricsFunction
 

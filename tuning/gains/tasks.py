@@ -76,7 +76,9 @@ class TuneTask:
     def tuned(self) -> tuple[Gain, ...]:
         """Return the gains that are tuned for this mechanism."""
         mechanism: Any = self.mechanism
-        return tuple(gain for gain in get_compensator(self.compensator).gains if gain.tuned(mechanism))
+        return tuple(
+            gain for gain in get_compensator(self.compensator, self.model.axes).gains if gain.tuned(mechanism)
+        )
 
 
 def build_task(
@@ -123,9 +125,8 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
     """Return whether the force or position sensor has noise in any scenario."""
     rig = mechanism.rig
     paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
-    # The six-axis position sensor has no noise.
-    position = getattr(rig.position_sensor, "noise_std", 0.0)
-    noisy = bool(max(np.max(rig.force_sensor.noise_std), position) > 0)
+    deviations = rig.force_sensor.noise_std, rig.position_sensor.noise_std
+    noisy = any(bool(np.max(deviation) > 0) for deviation in deviations)
     return noisy or any(path in mechanism.uncertainty for path in paths)
 
 
@@ -156,12 +157,16 @@ def _list_delay_line_fields(loop: Any) -> list[str]:
 def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
     """Return the names of all gains that are tuned for at least one of the tasks."""
     tuned = {gain.name for task in tasks for gain in task.tuned}
-    return tuple(gain.name for gain in get_compensator(tasks[0].compensator).gains if gain.name in tuned)
+    return tuple(
+        gain.name
+        for gain in get_compensator(tasks[0].compensator, tasks[0].model.axes).gains
+        if gain.name in tuned
+    )
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
     """Return the bounds (gains,) of a task; both are the literature's value for a gain that is not tuned."""
-    gains = {gain.name: gain for gain in get_compensator(task.compensator).gains}
+    gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 
     def bounds(name: str) -> tuple[float, float, float]:

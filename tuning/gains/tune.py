@@ -223,7 +223,8 @@ def _search_gains(
 def _evaluate_baselines(validation: Validation) -> dict[str, list]:
     """Evaluate no compensation and the literature's gains, which needs no search."""
     literature = [task.literature for task in validation.tasks]
-    plain = [remove_compensation(validation.tasks[0].compensator, gains) for gains in literature]
+    task = validation.tasks[0]
+    plain = [remove_compensation(task.compensator, gains, task.model.axes) for gains in literature]
     return {
         "before": validation.judge([gains for _, gains in plain], plain[0][0]),
         "literature": validation.judge(literature),
@@ -304,20 +305,25 @@ def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMet
     return parts
 
 
-def remove_compensation(compensator: str, gains: dict[str, float]) -> tuple[str, dict[str, float]]:
+def remove_compensation(
+    compensator: str, gains: dict[str, float], axes: int = 1
+) -> tuple[str, dict[str, float]]:
     """Return the compensator and gains that leave the measured force unchanged, for "before".
 
     Neutral gains need no other program. A compensator without neutral gains is replaced by "none".
     """
-    if all(gain.neutral is None for gain in get_compensator(compensator).gains):
+    specifications = get_compensator(compensator, axes).gains
+    if not any(gain.neutral is not None for gain in specifications):
         return "none", {}
-    return compensator, neutralise_gains(compensator, gains)
+    return compensator, neutralise_gains(compensator, gains, axes)
 
 
-def neutralise_gains(compensator: str, gains: dict[str, float]) -> dict[str, float]:
+def neutralise_gains(compensator: str, gains: dict[str, float], axes: int = 1) -> dict[str, float]:
     """Return the gains with neutral values where the compensator defines them."""
     neutral = {
-        gain.name: gain.neutral for gain in get_compensator(compensator).gains if gain.neutral is not None
+        gain.name: gain.neutral
+        for gain in get_compensator(compensator, axes).gains
+        if gain.neutral is not None
     }
     return {**gains, **neutral}
 

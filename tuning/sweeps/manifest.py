@@ -17,7 +17,7 @@ from msgspec import Meta
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_regular
-from jaxhil.laws.compensators import get_compensator
+from jaxhil.laws.compensators import axes_of, get_compensator
 from jaxhil.rig import digest
 from jaxhil.simulation.gain_file import LoadedGains, check_document
 from jaxhil.simulation.jax_environment import active_xla_flags, rounding_flags
@@ -193,9 +193,10 @@ def list_process_differences(manifest: Manifest) -> list[str]:
 
 
 def _compute_sources_digest(loaded: LoadedGains) -> str:
+    law = get_compensator(loaded.compensator, axes_of(loaded.mechanism))
     contact = loaded.mechanism.contact
     contacts = contact.values() if isinstance(contact, dict) else [contact]
-    return sources_sha256(get_compensator(loaded.compensator), *(find_contact_law(c.law) for c in contacts))
+    return sources_sha256(law, *(find_contact_law(c.law) for c in contacts))
 
 
 def _list_version_differences(manifest: Manifest, sources: str, here: Mapping[str, str]) -> list[str]:

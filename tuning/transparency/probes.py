@@ -46,14 +46,14 @@ class ProbedScenarios(NamedTuple):
     late: Any  # e* with a late push, by the same integration (scenarios,)
 
 
-def choose_default_weights(compensator: str) -> dict[str, float]:
+def choose_default_weights(compensator: str, axes: int = 1) -> dict[str, float]:
     """Return the default weights of `tuning.gains.objective.Objective` for a compensator, by name.
 
     For a law that anticipates, errors of probes count as much as those of scenarios, and excess force is
     penalised, since such a law can correct a late response by a short, large force, which the error alone
     rewards. For a law that only passes on the measured force, neither counts.
     """
-    return dict(ANTICIPATING_WEIGHTS) if get_compensator(compensator).anticipates else {}
+    return dict(ANTICIPATING_WEIGHTS) if get_compensator(compensator, axes).anticipates else {}
 
 
 def mask_probes(lanes: int) -> np.ndarray:

@@ -1,3 +1,1 @@
 """No compensation."""
-
-AXES = (1, 6)

@@ -1,3 +1,1 @@
 """Phase lead of the measured force."""
-
-AXES = (1, 6)

@@ -1,3 +1,1 @@
 """Phase lead with a lead time for each channel of the wrench."""
-
-AXES = (6,)

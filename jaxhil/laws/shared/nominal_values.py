@@ -8,6 +8,7 @@ import math
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
 from jaxhil.mechanism.structs import Mechanism
 
 FORCE_DELAY = "force delay"
@@ -44,6 +45,24 @@ def simulator_lag(mechanism: Mechanism) -> float:
     return simulator_inverse(mechanism)[0]
 
 
+def axis_lags(mechanism: SixAxisMechanism) -> list[float]:
+    """Return the delay [s] of each coordinate in uniform motion.
+
+    With two robots it is the mean of both delays, weighted by their shares. A hexapod's legs have six delays,
+    each of which affects all coordinates: the result is their mean.
+    """
+    simulator = mechanism.rig.simulator
+    lags, robot = _lags(simulator, simulator), simulator.target_robot
+    if simulator.space == "stewart":
+        return [sum(lags) / 6] * 6
+    if robot is None:
+        return lags
+    return [
+        (1 - share) * chaser + share * target
+        for share, chaser, target in zip(robot.share, lags, _lags(simulator, robot), strict=True)
+    ]
+
+
 def is_damped(mechanism: Mechanism) -> bool:
     """Return whether the mechanism's contact law dissipates energy."""
     return find_contact_law(mechanism.contact.law).damped and any(b > 0 for b in mechanism.contact.damping)
@@ -77,6 +96,27 @@ def noise_bound(mechanism: Mechanism) -> float:
     sensor = mechanism.rig.force_sensor
     # 3 standard deviations are not enough: one reading above, at a small depth, identifies a wrong stiffness.
     return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
+
+
+def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
+    """Return the delay [s] of each axis of a robot in uniform motion: transport delay plus -G'(0)."""
+
+    def of(key: str) -> list[float]:
+        return getattr(robot, key) or getattr(simulator, key)
+
+    lag = [0.0] * 6
+    if simulator.model == "first_order":
+        lag = of("time_constant")
+    elif simulator.model == "second_order":
+        pairs = zip(of("damping_ratio"), of("natural_frequency"), strict=True)
+        lag = [damping / (math.pi * frequency) for damping, frequency in pairs]
+    elif simulator.model == "third_order" and simulator.coefficients:
+        lag = [simulator.coefficients[0]] * 6
+    elif simulator.model == "transfer_function":
+        *_, slope, value = simulator.denominator or []
+        *_, lead, gain = 0.0, *(simulator.numerator or [])
+        lag = [slope / value - lead / gain] * 6
+    return [axis_lag + delay for axis_lag, delay in zip(lag, of("delay"), strict=True)]
 
 
 def _inverse_series(simulator) -> tuple[float, float]:

@@ -107,7 +107,7 @@ def _cells(figures: Any) -> tuple[Any, ...]:
 
 def _gain_tables(options: Tune, result: Any) -> list[Any]:
     """Return a list with the table of gains; an empty one if the compensator has no gains."""
-    from jaxhil.laws.compensators import get_compensator
+    from jaxhil.laws.compensators import axes_of, get_compensator
 
     mechanism = result.mechanism
     rows = [
@@ -117,7 +117,7 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
             result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
             *([f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())] or ["", ""]),
         )
-        for gain in get_compensator(options.compensator).gains
+        for gain in get_compensator(options.compensator, axes_of(mechanism)).gains
     ]
     headings = ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"]
     return (

@@ -1,0 +1,93 @@
+"""Impulse ledger in six axes in JAX.
+
+A wrench that is read now is the wrench that should have acted on the numerical model D ago, where D is the
+delay of the whole loop. The compensator credits the impulse of every reading to the model's time t - D,
+bridges the time since then with a scalar model of the contact, and commands the impulse that the numerical
+model still owes. `six_axes/README.md` states the equations, with the letters in brackets of the comments.
+"""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from jaxhil.laws.impulse_ledger.six_axes.booking.simulation import follow, onset
+from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
+from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
+from jaxhil.laws.impulse_ledger.six_axes.simulation import select, wrench_at_target
+from jaxhil.laws.impulse_ledger.six_axes.state import Contact, Flight, LedgerState, Prepared
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import begin_estimate
+from jaxhil.laws.shared import nominal_values
+from jaxhil.laws.simulation_base import Gain
+from jaxhil.laws.six_axis_base import SixAxisCompensator
+
+LONG_AGO = 1e9  # ticks since a contact before the run
+SPREADS = "stiffness_spread", "damping_spread", "force_spread", "curvature_spread"
+
+
+class ImpulseLedger(SixAxisCompensator):
+    """Compensator that books impulses at the time of the numerical model; see the module's docstring."""
+
+    name: ClassVar[str] = "impulse_ledger"
+    knows: ClassVar[tuple[str, ...]] = (
+        nominal_values.EQUIVALENT_MASS,
+        nominal_values.FORCE_DELAY,
+        nominal_values.FORCE_NOISE,
+    )
+    reads_pose: ClassVar[bool] = True
+    is_large: ClassVar[bool] = True
+    gains: ClassVar[tuple[Gain, ...]] = GAINS
+
+    def prepare(self, gains, constants):
+        period = constants.control_period
+        delay = gains["identification_delay"]
+        filter_lag = jnp.minimum(gains["pose_filter"], delay)
+        return Prepared(
+            gains=gains,
+            constants=constants,
+            pole=filter_lag / (filter_lag + period),
+            back=(delay - filter_lag) / period,
+            prior=begin_estimate(tuple(gains[name] for name in SPREADS)),
+        )
+
+    def init(self, prepared, constants, start, ring):
+        period = constants.control_period
+        zero, zeros = jnp.zeros_like(period), jnp.zeros_like(start.pose_desired)
+        # The slot of tick k contains uniform motion of tick k - ring.
+        ticks = jnp.arange(-ring, 0, dtype=period.dtype).reshape(-1, 1, *[1] * period.ndim)
+        moving = start.pose_desired[None] + ticks * (period[None] * start.twist_desired)[None]
+        still = jnp.zeros_like(moving)
+        rows = [still, moving, still + start.twist_desired[None], still]
+        return LedgerState(
+            ring=jnp.concatenate(rows, axis=1),
+            filtered=zeros,
+            first=zeros,
+            aligned=zeros,
+            impulse=zeros,
+            flight=Flight(zeros, zero, zeros, zeros, zero, zero + LONG_AGO),
+            in_contact=zero > 0,
+            contact=Contact(zero, zero + 1, zeros, zeros, zeros, zeros, zero, zero, zero),
+            estimate=prepared.prior,
+        )
+
+    def step(self, prepared, state, signals, tick):
+        state = record(prepared, state, signals, tick)
+        reading, state = read(prepared, state, signals, tick)
+        begins = reading.loud & ~state.in_contact
+        contact = select(begins, onset(prepared, state, reading, signals), state.contact)
+        in_contact = state.in_contact | reading.loud
+        command, contact, estimate = follow(prepared, state, reading, (contact, state.estimate, begins), tick)
+        quiet = jnp.where(reading.loud, 0, state.flight.quiet + 1)
+        period = prepared.constants.control_period
+        in_contact = in_contact & ~(quiet * period > prepared.gains["release_time"])
+        command = jnp.where(in_contact[None], command, 0)
+        state = state._replace(
+            impulse=state.impulse + period[None] * command,
+            flight=state.flight._replace(quiet=quiet),
+            in_contact=in_contact,
+            contact=contact,
+            estimate=estimate,
+        )
+        return tuple(wrench_at_target(command, signals.pose_desired)), state
+
+
+COMPENSATOR = ImpulseLedger()

@@ -1,0 +1,192 @@
+"""Booking of impulses in JAX: onset, reference trajectory at the model's time, bridge, and command."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.laws.impulse_ledger.six_axes import constants as fixed
+from jaxhil.laws.impulse_ledger.six_axes.simulation import dot, look_back, product, select, size
+from jaxhil.laws.impulse_ledger.six_axes.state import (
+    DESIRED,
+    IMPULSE,
+    TWIST,
+    Contact,
+    LedgerState,
+    Prepared,
+    Reading,
+)
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
+    Estimate,
+    Tangent,
+    bridge,
+    learn,
+    restoring,
+)
+from jaxhil.laws.six_axis_base import Six, SixAxisSignals
+
+
+def onset(prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals) -> Contact:
+    """Return the contact that begins with this reading (b).
+
+    Its impulse is set when the delay line is read.
+    """
+    period, mass = prepared.constants.control_period, prepared.constants.mass_matrix
+    flight, last = state.flight, state.contact
+    has_flown = flight.ticks > 0
+    lag = jnp.where(has_flown[None], flight.lag, signals.pose_desired - reading.pose)
+    twist = jnp.where(has_flown[None], flight.twist, signals.twist_desired)
+    direction = reading.wrench / _size_of(prepared, reading.wrench)[None]
+    closing, whole = -dot(direction, twist), dot(twist, product(mass, twist))
+    least = fixed.LEAST_SHARE * size(whole) + fixed.LEAST_TWIST
+    is_closing = closing > least
+    slowest = fixed.LEAST_SPEED * size(whole) + fixed.LEAST_TWIST
+    # Where the contact is across the motion, the delay is the mean over all directions.
+    mean = dot(lag, product(mass, twist)) / (whole + fixed.LEAST_TWIST**2)
+    delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
+    longest = len(state.ring) - 2.0
+    delay = jnp.clip(delay, prepared.gains["identification_delay"] / period, longest)
+    is_recent = flight.quiet * period < fixed.RECENT
+    zeros = jnp.zeros_like(lag)
+    return Contact(
+        delay=jnp.where(is_recent, last.delay, delay),
+        speed=jnp.where(is_recent, last.speed, jnp.maximum(closing, slowest)),
+        impulse=zeros,
+        drift=zeros,
+        direction=reading.wrench,
+        modelled=direction,
+        path=jnp.zeros_like(delay),
+        peak=jnp.zeros_like(delay),
+        tool=jnp.where(is_recent, last.tool, 0),
+    )
+
+
+def follow(
+    prepared: Prepared,
+    state: LedgerState,
+    reading: Reading,
+    contact: tuple[Contact, Estimate, Bool[Array, "*batch"]],
+    tick: Int[Array, ""],
+) -> tuple[Six, Contact, Estimate]:
+    """Return the command about C's origin, and the contact after a reading.
+
+    Args:
+        prepared: gains and constants.
+        state: state with the reading of this tick.
+        reading: reading of this tick.
+        contact: contact and estimate before the reading, and whether the contact begins with it.
+        tick: number of this tick.
+    """
+    contact_now, estimate, begins = contact
+    gains, period = prepared.gains, prepared.constants.control_period
+    inverse_mass, loud = prepared.constants.inverse_mass, reading.loud
+    delay = jnp.broadcast_to(contact_now.delay, state.impulse.shape)
+    desired, twist, impulse = (
+        look_back(state.ring[:, rows], tick, delay) for rows in (DESIRED, TWIST, IMPULSE)
+    )
+    old = contact_now._replace(impulse=jnp.where(begins[None], impulse, contact_now.impulse))
+    direction, mixed = _direction(prepared, old, reading, begins)
+    # Another surface, or another part of it, needs another model.
+    along = dot(old.modelled, product(inverse_mass, direction))
+    turns = begins | (loud & (along < fixed.TURNED))
+    modelled = jnp.where(turns[None], direction, old.modelled)
+    estimate = select(turns, prepared.prior, estimate)
+    path = jnp.where(turns, 0, old.path - dot(direction, reading.moved))
+    force = dot(reading.wrench, product(inverse_mass, direction))
+    estimate, tangent = _learned(prepared, old, reading, estimate, (direction, path, force))
+
+    # Reference at its own time t - D (c).
+    missing = product(inverse_mass, impulse - old.impulse)
+    drift = old.drift + period[None] * missing
+    deeper = -dot(direction, reading.pose - (desired - drift))
+    faster = -dot(direction, reading.twist - (twist - missing))
+    least = jnp.minimum(force, 0)
+    corrected = jnp.maximum(force + restoring(tangent, -deeper) - tangent.damping * faster, least)
+    corrected = jnp.where(loud, corrected, force)
+    booked = old.impulse + period[None] * (reading.wrench + (corrected - force)[None] * direction)
+
+    # Bridge from t - D to the middle of the command's period (d).
+    velocity = -dot(direction, twist - product(inverse_mass, impulse - booked))
+    ahead = (old.delay + fixed.AHEAD) * period
+    touches = loud & (corrected != 0)
+    bridged, last_force = bridge(tangent, corrected, least, deeper, velocity, ahead)
+    stiffness = jnp.maximum(tangent.stiffness, fixed.LEAST_STIFFNESS)
+    peak = jnp.maximum(old.peak, jnp.abs(force))
+    expected = jnp.maximum(jnp.sqrt(stiffness) * old.speed, peak)
+    last_force = jnp.minimum(last_force, fixed.HIGHEST * expected)
+    bridged, last_force = (jnp.where(touches, value, 0) for value in (bridged, last_force))
+    rest = jnp.where(loud[None], reading.wrench - force[None] * direction, 0)
+    unpaid = state.impulse - booked - bridged[None] * direction - ahead[None] * rest
+
+    # Command (e).
+    pulled = unpaid + jnp.where(touches, gains["position_gain"], 0)[None] * product(
+        prepared.constants.mass_matrix, drift
+    )
+    command = last_force[None] * direction + rest + _correction(prepared, pulled, stiffness, old.speed)
+    share = product(prepared.constants.tool_correction, reading.wrench) - reading.wrench
+    tool = jnp.maximum(old.tool, dot(share, product(inverse_mass, share)))
+    later = old._replace(
+        impulse=booked, drift=drift, direction=mixed, modelled=modelled, path=path, peak=peak, tool=tool
+    )
+    return command, later, estimate
+
+
+def _correction(
+    prepared: Prepared, unpaid: Six, stiffness: Float[Array, "*batch"], speed: Float[Array, "*batch"]
+) -> Six:
+    """Return the wrench that pays the unpaid impulse, with limited size."""
+    wrench = -prepared.gains["velocity_gain"][None] * unpaid
+    limit = prepared.gains["correction_limit"] * jnp.sqrt(stiffness) * speed
+    large = size(dot(wrench, product(prepared.constants.inverse_mass, wrench)))
+    return wrench * jnp.where(large > limit, limit / jnp.where(large > 0, large, 1), 1)[None]
+
+
+def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
+    """Return the size of a wrench, never 0."""
+    square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
+    return jnp.where(square > 0, size(square), 1)
+
+
+def _direction(
+    prepared: Prepared, contact: Contact, reading: Reading, begins: Bool[Array, "*batch"]
+) -> tuple[Six, Six]:
+    """Return the contact's direction, and the filtered wrench that determines it.
+
+    The sign is continuous: a latch that pulls does not turn the direction.
+    """
+    old, pole = contact.direction, prepared.gains["direction_pole"][None]
+    along = dot(old, product(prepared.constants.inverse_mass, reading.wrench))
+    wrench = jnp.where((along < 0)[None], -1, 1) * reading.wrench
+    mixed = jnp.where((reading.loud & ~begins)[None], wrench + pole * (old - wrench), old)
+    return mixed / _size_of(prepared, mixed)[None], mixed
+
+
+def _learned(
+    prepared: Prepared,
+    contact: Contact,
+    reading: Reading,
+    estimate: Estimate,
+    along: tuple[Six, Float[Array, "*batch"], Float[Array, "*batch"]],
+) -> tuple[Estimate, Tangent]:
+    """Return the estimate after a reading and its tangent; `along` are direction, path and force."""
+    direction, path, force = along
+    gains, period, speed = prepared.gains, prepared.constants.control_period, contact.speed
+    growth = gains["forgetting"] ** (-period / 1e-3)
+    rate = -dot(direction, reading.twist)
+    learned = learn(
+        estimate,
+        prepared.prior,
+        path / speed,
+        rate / speed,
+        force / speed,
+        reading.variance / speed**2,
+        growth,
+    )
+    mean = jnp.where(reading.loud[None], learned.mean, estimate.mean)
+    covariance = jnp.where(reading.loud[None, None], learned.covariance, estimate.covariance)
+    tangent = Tangent(
+        stiffness=jnp.maximum(mean[0], 0),
+        curvature=mean[3] / fixed.BEND,
+        damping=jnp.clip(mean[1], 0, fixed.MOST_DAMPING / period),
+        path=path / speed,
+        speed=speed,
+    )
+    return Estimate(mean, covariance), tangent

@@ -1,0 +1,1 @@
+"""Reading of a tick: wrench about C, pose of the same age, gate, and means over free flight."""

@@ -1,0 +1,113 @@
+"""Reading of a tick in JAX: delay line, pose filter, tool correction, gate, means over free flight."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.laws.impulse_ledger.six_axes import constants as fixed
+from jaxhil.laws.impulse_ledger.six_axes.simulation import (
+    dot,
+    look_back,
+    product,
+    running_mean,
+    wrench_at_chaser,
+)
+from jaxhil.laws.impulse_ledger.six_axes.state import POSE, Flight, LedgerState, Prepared, Reading
+from jaxhil.laws.shared.ring_buffer import write_sample
+from jaxhil.laws.six_axis_base import Six, SixAxisSignals
+
+
+def record(
+    prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
+) -> LedgerState:
+    """Filter the measured pose, and write this tick into the delay line."""
+    assert signals.pose_measured is not None
+    begins = (signals.age == 0)[None]
+    measured, pole = signals.pose_measured, prepared.pole[None]
+    # In uniform motion the filter lags by pole/(1 - pole) ticks.
+    stride = prepared.constants.control_period[None] * signals.twist_desired
+    before = jnp.where(begins, measured - stride * (1 / (1 - pole)), state.filtered)
+    filtered = measured + pole * (before - measured)
+    rows = jnp.concatenate([filtered, signals.pose_desired, signals.twist_desired, state.impulse])
+    return state._replace(
+        ring=write_sample(state.ring, tick, rows),
+        filtered=filtered,
+        first=jnp.where(begins, filtered, state.first),
+    )
+
+
+def read(
+    prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
+) -> tuple[Reading, LedgerState]:
+    """Return the reading of this tick, and the state with the means over free flight."""
+    constants, gains = prepared.constants, prepared.gains
+    period, inverse_mass = constants.control_period, constants.inverse_mass
+    pose = _aligned(prepared, state, signals, tick)
+    last = jnp.where((signals.age == 0)[None], pose - period[None] * signals.twist_desired, state.aligned)
+    wrench = wrench_at_chaser(jnp.stack(signals.wrench), pose)
+    # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (a).
+    corrected = product(constants.tool_correction, wrench)
+    unbiased = corrected - state.flight.bias
+    variance = noise_variance(prepared, pose)
+    settles = signals.age.astype(period.dtype) * period < gains["settle"]
+    is_recent = state.flight.quiet * period < fixed.RECENT
+    least = fixed.LEAST_RATE**2 * dot(
+        signals.twist_desired, product(constants.mass_matrix, signals.twist_desired)
+    )
+    tool = jnp.where(state.in_contact | is_recent, state.contact.tool, 0)
+    gate = fixed.ONSET_SIGMAS**2 * variance + least + tool
+    loud = (dot(unbiased, product(inverse_mass, unbiased)) > gate) & ~settles
+    reading = Reading(
+        wrench=unbiased,
+        variance=variance,
+        pose=pose,
+        twist=(pose - last) / period[None],
+        moved=pose - last,
+        loud=loud,
+    )
+    free = ~state.in_contact & ~loud
+    flight = _fly(state.flight, corrected, signals, pose, free, free & ~is_recent, period)
+    return reading, state._replace(aligned=pose, flight=flight)
+
+
+def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
+    """Return the mean square of the size |W| of the noise, whose moment is about T's origin."""
+    gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
+    force, torque = gains["force_noise"] ** 2, gains["torque_noise"] ** 2
+    moment = torque + force * jnp.sum(pose[:3] ** 2, axis=0)
+    linear, angular = (sum(inverse_mass[i, i] for i in part) for part in (range(3), range(3, 6)))
+    return linear * force + angular * moment
+
+
+def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]) -> Six:
+    """Return the filtered pose as old as the reading; before the first tick in uniform motion."""
+    back = prepared.back
+    recalled = look_back(state.ring[:, POSE], tick, jnp.broadcast_to(back, state.first.shape))
+    ago = back - signals.age.astype(back.dtype)
+    uniform = state.first - (prepared.constants.control_period * ago)[None] * signals.twist_desired
+    return jnp.where((ago > 0)[None], uniform, recalled)
+
+
+def _fly(
+    flight: Flight,
+    wrench: Six,
+    signals: SixAxisSignals,
+    pose: Six,
+    free: Bool[Array, "*batch"],
+    uniform: Bool[Array, "*batch"],
+    period: Float[Array, "*batch"],
+) -> Flight:
+    """Update the bias where the tick is `free`, and lag and twist where the motion is `uniform` as well."""
+    readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.LONGEST_MEAN)
+    ticks = jnp.minimum(flight.ticks + 1, fixed.LONGEST_FLIGHT / period)
+    ticks = jnp.where(uniform, ticks, jnp.where(free, 0, flight.ticks))
+    lag, twist = (
+        running_mean(mean, value, ticks, uniform)
+        for mean, value in ((flight.lag, signals.pose_desired - pose), (flight.twist, signals.twist_desired))
+    )
+    return flight._replace(
+        bias=running_mean(flight.bias, wrench, readings, free),
+        readings=readings,
+        lag=lag,
+        twist=twist,
+        ticks=ticks,
+    )

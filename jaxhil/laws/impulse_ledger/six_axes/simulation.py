@@ -1,0 +1,72 @@
+"""Linear algebra and delay line of the impulse ledger in six axes in JAX.
+
+Vectors are (6, *batch), matrices (6, 6, *batch).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+
+def product(matrix: Array, vector: Array) -> Float[Array, "6 *batch"]:
+    """Return matrix @ vector."""
+    return jnp.sum(matrix * vector[None], axis=1)
+
+
+def dot(one: Array, other: Array) -> Float[Array, "*batch"]:
+    """Return the scalar product."""
+    return jnp.sum(one * other, axis=0)
+
+
+def cross(one: Array, other: Array) -> Float[Array, "3 *batch"]:
+    """Return the vector product."""
+    (a, b, c), (x, y, z) = one, other
+    return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+
+
+def size(square: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return the square root, with derivative 0 where the number is not positive."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def wrench_at_chaser(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
+    """Return a wrench about C's origin from one about T's; `pose` are coordinates of C against T."""
+    return jnp.concatenate([wrench[:3], wrench[3:] - cross(pose[:3], wrench[:3])])
+
+
+def wrench_at_target(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
+    """Return a wrench about T's origin from one about C's; `pose` are coordinates of C against T."""
+    return jnp.concatenate([wrench[:3], wrench[3:] + cross(pose[:3], wrench[:3])])
+
+
+def look_back(
+    ring: Float[Array, "samples rows *batch"], tick: Int[Array, ""], ticks: Float[Array, "rows *batch"]
+) -> Float[Array, "rows *batch"]:
+    """Return each row so many ticks before `tick`, linear between samples; at most `samples` - 2."""
+    whole = lax.stop_gradient(jnp.floor(ticks))
+    newer, older = (_read(ring, tick - whole.astype(jnp.int32) - more) for more in (0, 1))
+    return newer + (ticks - whole) * (older - newer)
+
+
+def select(condition: Bool[Array, "*batch"], new: Any, old: Any) -> Any:
+    """Return the new leaves where the condition holds, else the old ones; lanes are the last axes."""
+
+    def either(one: Array, other: Array) -> Array:
+        return lax.select(jnp.broadcast_to(condition, one.shape), one, other)
+
+    return jax.tree.map(either, new, old)
+
+
+def running_mean(mean: Array, value: Array, count: Array, used: Bool[Array, "*batch"]) -> Array:
+    """Return the mean (rows, *batch) with one more `value`, where `used`; `count` includes it."""
+    share = jnp.where(used, 1 / jnp.maximum(count, 1), 0)
+    return mean + share[None] * (value - mean)
+
+
+def _read(ring: Array, index: Int[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
+    """Return each row at an index, which may be beyond the ring's ends."""
+    index = index & (len(ring) - 1)
+    return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]

@@ -1,0 +1,29 @@
+"""Phase lead with a lead time for each of six axes: F + T_lead dF/dt, channel by channel.
+
+The axes of a rig have different delays, and each lead time can compensate for that of its channel. The lead
+filter is common to all channels.
+"""
+
+from typing import ClassVar
+
+from jaxhil.laws.phase_lead.simulation_six_axes import PhaseLead
+from jaxhil.laws.shared.lead_filter import LEAD_FILTER, PHASE_LEAD
+from jaxhil.laws.simulation_base import Gain
+from jaxhil.laws.six_axis_base import COORDINATES, lag_leads
+
+
+class PhaseLeadPerAxis(PhaseLead):
+    """Compensator F_c = F + T_lead dF/dt of each channel, with a lead time of its own, filtered."""
+
+    name: ClassVar[str] = "phase_lead_per_axis"
+    gains: ClassVar[tuple[Gain, ...]] = (
+        *(PHASE_LEAD._replace(name=f"{PHASE_LEAD.name}_{axis}") for axis in COORDINATES),
+        LEAD_FILTER,
+        *lag_leads(equalise=False),
+    )
+
+    def channel(self, gains, name):
+        return {**gains, PHASE_LEAD.name: gains[f"{PHASE_LEAD.name}_{name}"]}
+
+
+COMPENSATOR = PhaseLeadPerAxis()

@@ -1,0 +1,198 @@
+"""Compensation of Qi et al. along the approach axis of a rig in six axes, and phase lead of every channel.
+
+    F_c = lead(F),  plus  g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)  along the docking axis, in contact
+
+The literature states the method for one axis (`simulation.py` in this folder): it knows where the surface is.
+Here x is the travel along the docking axis, and the surface is where the force exceeded `contact_threshold`.
+"""
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxhil.laws.shared.delay_line import (
+    DelayInPeriods,
+    DelayLine,
+    empty_delay_line,
+    read_delayed,
+    split_delay,
+)
+from jaxhil.laws.shared.lead_filter import (
+    LEAD_FILTER,
+    PHASE_LEAD,
+    LeadFilter,
+    LeadState,
+    apply_lead_filter,
+    build_lead_filter,
+)
+from jaxhil.laws.shared.nominal_values import FORCE_DELAY, force_delay
+from jaxhil.laws.shared.recursive_least_squares.simulation import ContactEstimate, update_estimate
+from jaxhil.laws.simulation_base import Gain, Gains, Signals, rig_gain
+from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
+
+AXIS = 2  # index of the docking axis z
+USUAL_SPEED = 0.02  # m/s; of an approach that the file does not state
+SHALLOW = 1e-3  # s; a sample at this depth over the approach speed sets half of k_hat
+
+
+class ResponseErrorState(NamedTuple):
+    """State of the compensator from tick to tick."""
+
+    leads: tuple[LeadState, ...]
+    line: DelayLine  # of the measured travel
+    position: Float[Array, "*batch"]  # measured on the last tick [m]
+    velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    aligned: Float[Array, "*batch"]  # travel as old as the force, on the last tick [m]
+    aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    surface: Float[Array, "*batch"]  # the same before contact [m]
+    in_contact: Bool[Array, "*batch"]
+    identified: ContactEstimate  # stiffness and damping
+
+
+class Prepared(NamedTuple):
+    """Gains and filter coefficients, computed once per run."""
+
+    gains: Gains
+    period: Float[Array, "*batch"]  # control period [s]
+    lead: LeadFilter
+    # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
+    rate_pole: Float[Array, "*batch"]
+    rate_gain: Float[Array, "*batch"]  # [1/s]
+    delay: DelayInPeriods  # of the travel, to align it with the force
+
+
+def approach_speed(mechanism: Any) -> float:
+    """Return the nominal approach speed along the docking axis [m/s]."""
+    if mechanism.approach is None or not mechanism.approach.velocity[AXIS]:
+        return USUAL_SPEED
+    return abs(mechanism.approach.velocity[AXIS])
+
+
+def noise_level(mechanism: Any) -> float:
+    """Return a force along the docking axis that noise hardly ever exceeds [N]."""
+    sensor = mechanism.rig.force_sensor
+    return 4 * sensor.noise_std[AXIS] + abs(sensor.bias[AXIS]) + sensor.quantum[AXIS]
+
+
+def _never(mechanism: Any) -> bool:
+    return False
+
+
+def _covariance(name: str, size: Any) -> Gain:
+    """Return an initial covariance whose nominal value is `size` of a mechanism."""
+    return rig_gain(
+        name, lambda m: 1e-3 * size(m), lambda m: 1e1 * size(m), size, logarithmic=True, tuned=_never
+    )
+
+
+class ResponseError(SixAxisCompensator):
+    """Phase lead of every channel, and response error along the docking axis; see the module's docstring."""
+
+    name: ClassVar[str] = "response_error"
+    knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
+    reads_pose: ClassVar[bool] = True
+    gains: ClassVar[tuple[Gain, ...]] = (
+        PHASE_LEAD,
+        LEAD_FILTER._replace(tuned=_never),
+        rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
+        rig_gain("response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
+        _covariance("stiffness_covariance", lambda m: 1 / (SHALLOW * approach_speed(m)) ** 2),
+        _covariance("damping_covariance", lambda m: 1 / approach_speed(m) ** 2),
+        rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
+        rig_gain(
+            "velocity_filter", lambda m: 0.5 * m.rig.control_period, lambda m: 20 * m.rig.control_period,
+            lambda m: 2 * m.rig.control_period, tuned=_never,
+        ),
+        rig_gain(
+            "identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02, force_delay,
+            tuned=_never,
+        ),
+        rig_gain(
+            "contact_threshold", lambda m: 0.0, lambda m: 10 + 10 * noise_level(m),
+            lambda m: max(0.1, noise_level(m)), tuned=_never,
+        ),
+        *lag_leads(equalise=False),
+    )  # fmt: skip
+
+    def prepare(self, gains, constants):
+        period, filter_time = constants.control_period, gains["velocity_filter"]
+        scale = 1 / (2 * filter_time + period)
+        return Prepared(
+            gains=gains,
+            period=period,
+            lead=build_lead_filter(gains, constants.of_channel),
+            rate_pole=(2 * filter_time - period) * scale,
+            rate_gain=2 * scale,
+            delay=split_delay(gains["identification_delay"], period),
+        )
+
+    def init(self, prepared, constants, start, ring):
+        zero = jnp.zeros_like(constants.control_period)
+        variances = (prepared.gains[f"{name}_covariance"] for name in ("stiffness", "damping"))
+        identified = ContactEstimate(zero, zero, zero, *variances)
+        leads = tuple(LeadState(zero, zero) for _ in COORDINATES)
+        return ResponseErrorState(
+            leads=leads,
+            line=empty_delay_line(ring, zero),
+            position=zero,
+            velocity=zero,
+            aligned=zero,
+            aligned_velocity=zero,
+            surface=zero,
+            in_contact=zero > 0,
+            identified=identified,
+        )
+
+    def step(self, prepared, state, signals, tick):
+        gains, period = prepared.gains, prepared.period
+        assert signals.pose_measured is not None
+        pairs = [
+            apply_lead_filter(prepared.lead, old, force)
+            for old, force in zip(state.leads, signals.wrench, strict=True)
+        ]
+        commands, leads = zip(*pairs, strict=True)
+        force, desired = signals.wrench[AXIS], -signals.pose_desired[AXIS]
+        speed, measured = -signals.twist_desired[AXIS], -signals.pose_measured[AXIS]
+        travel = Signals(force, desired, speed, measured, signals.age)
+        begins = signals.age == 0
+        aligned, line = read_delayed(prepared.delay, state.line, travel, tick)
+
+        def rate(position: Array, before: Array, velocity: Array) -> Array:
+            before = jnp.where(begins, position - period * speed, before)
+            velocity = jnp.where(begins, speed, velocity)
+            return prepared.rate_pole * velocity + prepared.rate_gain * (position - before)
+
+        velocity = rate(measured, state.position, state.velocity)
+        aligned_velocity = rate(aligned, state.aligned, state.aligned_velocity)
+        in_contact = jnp.abs(force) > gains["contact_threshold"]
+        surface = jnp.where(state.in_contact, state.surface, jnp.where(begins, aligned, state.aligned))
+        covariances = gains["stiffness_covariance"], gains["damping_covariance"]
+        identified = update_estimate(
+            state.identified,
+            gains["forgetting"],
+            covariances,
+            aligned - surface,
+            aligned_velocity,
+            force,
+            in_contact.astype(force.dtype),
+        )
+        stiffness, damping = jnp.maximum(identified.stiffness, 0), jnp.maximum(identified.damping, 0)
+        response = gains["response_error"] * stiffness * (desired - measured)
+        response = response + gains["response_error_damping"] * damping * (speed - velocity)
+        commands = list(commands)
+        commands[AXIS] = commands[AXIS] + jnp.where(in_contact, response, 0)
+        return tuple(commands), ResponseErrorState(
+            leads=leads,
+            line=line,
+            position=measured,
+            velocity=velocity,
+            aligned=aligned,
+            aligned_velocity=aligned_velocity,
+            surface=surface,
+            in_contact=in_contact,
+            identified=identified,
+        )
+
+
+COMPENSATOR = ResponseError()

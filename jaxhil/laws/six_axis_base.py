@@ -1,0 +1,125 @@
+"""Interface of compensators in six axes in JAX: a wrench before the integration, a pose command after it.
+
+As on one axis (`jaxhil.laws.simulation_base`), a compensator is stateless: its state is an explicit pytree of
+arrays, lanes last. Its gains are a dict of arrays, scalar or of the batch shape. Wrenches, poses and twists
+are six numbers (x, y, z, rx, ry, rz) in T axes (notebooks/guide/six_axes.md, section 1).
+"""
+
+import abc
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxhil.laws.shared.nominal_values import axis_lags
+from jaxhil.laws.simulation_base import Gain, Gains, KnownConstants
+
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+LAG_LEADS = tuple(f"lag_lead_{name}" for name in COORDINATES)
+
+Six = Float[Array, "6 *batch"]
+
+
+class SixAxisSignals(NamedTuple):
+    """Inputs of the compensator at a tick."""
+
+    wrench: tuple[Array, ...]  # measured, about T's origin [N, N m], six arrays (*batch)
+    pose_desired: Six  # coordinates of the numerical model [m, rad]
+    twist_desired: Six  # twist of the numerical model [m/s, rad/s]
+    pose_measured: Six | None  # coordinates of the hardware [m, rad]; None unless the class `reads_pose`
+    age: Int[Array, "*batch"]  # ticks since this run began, 0 on its first tick
+
+
+class SixAxisConstants(NamedTuple):
+    """Constants of the rig that the compensator knows."""
+
+    control_period: Float[Array, "*batch"]  # T [s]
+    mass_matrix: Float[Array, "6 6 *batch"]  # relative mass matrix M at the docking pose
+    inverse_mass: Float[Array, "6 6 *batch"]  # its inverse
+    # (1 - M_t M^-1)^-1, the contact's wrench per reading, about C's origin; the identity without a tool
+    tool_correction: Float[Array, "6 6 *batch"]
+
+    @property
+    def of_channel(self) -> KnownConstants:
+        """Constants of a compensator for one axis that acts on one channel."""
+        return KnownConstants(self.control_period, jnp.full_like(self.control_period, jnp.inf))
+
+
+class SixAxisCompensator(eqx.Module):
+    """Interface of a compensator in six axes; see the module's docstring.
+
+    The class variables are those of `jaxhil.laws.simulation_base.Compensator`.
+    """
+
+    name: eqx.AbstractClassVar[str]
+    knows: eqx.AbstractClassVar[tuple[str, ...]]
+    gains: eqx.AbstractClassVar[tuple[Gain, ...]]
+    settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    reads_pose: ClassVar[bool] = False
+    anticipates: ClassVar[bool] = False
+    is_large: ClassVar[bool] = False
+
+    def prepare(self, gains: Gains, constants: SixAxisConstants) -> Any:
+        """Return what `step` computes from gains and constants only once per run; by default the gains."""
+        return gains
+
+    def init(self, prepared: Any, constants: SixAxisConstants, start: SixAxisSignals, ring: int) -> Any:
+        """Return the state before the first tick; by default there is none.
+
+        Args:
+            prepared: result of `prepare`.
+            constants: constants of the rig.
+            start: signals of uniform motion without a wrench; `pose_measured` is None.
+            ring: number of samples that a delay line must store, a power of two.
+        """
+        return ()
+
+    @abc.abstractmethod
+    def step(
+        self, prepared: Any, state: Any, signals: SixAxisSignals, tick: Array
+    ) -> tuple[tuple[Array, ...], Any]:
+        """Return the wrench on the numerical model about T's origin [N, N m], and the next state.
+
+        Args:
+            prepared: result of `prepare`.
+            state: state after the last tick.
+            signals: inputs of this tick.
+            tick: number of this tick, common to all lanes.
+        """
+
+    def pose_command(self, gains: Gains, pose: Six, rates: Six) -> Six:
+        """Return the pose command for the coordinates of the numerical model and their rates.
+
+        By default, each coordinate is led by its gain `lag_lead_...`, if the class has these gains.
+        """
+        if LAG_LEADS[0] not in gains:
+            return pose
+        leads = jnp.stack([jnp.zeros_like(pose[0]) + gains[name] for name in LAG_LEADS])
+        return pose + leads * rates
+
+
+def lag_leads(equalise: bool) -> tuple[Gain, ...]:
+    """Return the gains by which the command of each coordinate is led.
+
+    Args:
+        equalise: whether their nominal values are the lags beyond the shortest one, so that all coordinates
+            lag equally; otherwise they are 0. Tuning does not change them.
+    """
+
+    def gain(index: int, name: str) -> Gain:
+        def upper(mechanism: Any) -> float:
+            return 2 * max(axis_lags(mechanism)) + 0.01
+
+        def excess(mechanism: Any) -> float:
+            lags = axis_lags(mechanism)
+            return lags[index] - min(lags)
+
+        def nominal(mechanism: Any) -> float:
+            return excess(mechanism) if equalise else 0.0
+
+        return Gain(name, "s", lambda mechanism: 0.0, upper, nominal, tuned=lambda mechanism: False)
+
+    return tuple(gain(index, name) for index, name in enumerate(LAG_LEADS))

@@ -1,0 +1,92 @@
+"""First touch of an ideal contact: point, normal, effective mass, and the bodies' states."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxhil.sixdof.bodies import Load, kick_drift
+from jaxhil.sixdof.candidates import Touch, motion_at
+from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
+from jaxhil.sixdof.space import Space, choose
+from jaxhil.sixdof.vectors import Vector
+
+TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
+
+
+class Meeting(NamedTuple):
+    """First touch of an episode, in T axes."""
+
+    states: States  # states of the bodies
+    point: Vector  # point of the touch [m]
+    normal: Vector  # normal of the target's surface
+
+
+def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]) -> Meeting:
+    """Return the first touch, found on the free flight before it.
+
+    Args:
+        space: constants of the contact.
+        before: last states without a touch, at most one step before it.
+        depths: penetrations at the end of this step [m]; 0 if nothing touches.
+    """
+    zero = jnp.zeros_like(before.target.position.x)
+    if not space.groups:
+        apart = zero + jnp.nan
+        nowhere = Vector(apart, apart, apart)
+        return Meeting(before, nowhere, nowhere)
+
+    def touch_of(states: States) -> tuple[Touch, Array]:
+        """Return a candidate's touch and the rate of its penetration.
+
+        The candidate is the one with the largest penetration at the end of the step.
+        """
+        pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
+        touches = [group.candidates.touch(pose) for group in space.groups]
+        rates = [motion_at(touch, pose, twist)[0] for touch in touches]
+        return _deepest(list(zip(touches, rates, strict=True)), depths)
+
+    # The loop is not unrolled: the compiler would fuse and repeat the computations.
+    def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
+        time, states, _ = carry
+        touch, rate = touch_of(states)
+        time = time - touch.depth / jnp.where(rate > 0, rate, jnp.inf)
+        ahead = glide(space.bodies, before, time)
+        return time, ahead, Meeting(states, touch.point, touch.normal)
+
+    nothing = Vector(zero, zero, zero)
+    start = zero, before, Meeting(before, nothing, nothing)
+    *_, meeting = lax.fori_loop(0, TOUCH_STEPS, newton, start)
+    return meeting
+
+
+def meeting_mass(bodies: Pair, meeting: Meeting) -> Float[Array, "*batch"]:
+    """Return the effective mass [kg] of the first touch along its normal."""
+    return effective_mass(bodies, meeting.states, meeting.point, meeting.normal)
+
+
+def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
+    """Return the states after a short free flight [s], in one step."""
+    zero = jnp.zeros_like(time)
+    nothing = Vector(zero, zero, zero)
+    return States(*(
+        kick_drift(body, state, Load(nothing, nothing), time, 1.0)
+        for body, state in zip(bodies, states, strict=True)
+    ))  # fmt: skip
+
+
+def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
+    """Return the candidate with the largest of the penetrations `depths`."""
+    best: tuple[tuple[Touch, Array], Array] | None = None
+    for candidate, depth in zip(candidates, depths, strict=True):
+        index = jnp.argmax(depth, axis=0)[None]
+
+        def pick(leaf: Array, index: Array = index, like: Array = depth) -> Array:
+            return jnp.take_along_axis(jnp.broadcast_to(leaf, like.shape), index, axis=0)[0]
+
+        deepest = jax.tree.map(pick, candidate), pick(depth)
+        best = deepest if best is None else choose(deepest[1] > best[1], deepest, best)
+    assert best is not None
+    return best[0]

@@ -1,0 +1,172 @@
+"""Record of the current episode of a rig in six axes, tick by tick, and the condition for its end.
+
+An episode is over at the first tick at which neither the rig nor the ideal contact has touched anything for
+`QUIET`, the numerical model is free, and its wrench has decayed. The wait for the wrench is at most
+`MAX_DECAY_WAIT`: with noise it never decays completely.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
+from jaxhil.sixdof.forces import deepest
+from jaxhil.sixdof.loop import Rig, Tick
+from jaxhil.sixdof.peaks import Peak, higher, no_peak
+from jaxhil.sixdof.reference import Reference, is_quiet
+from jaxhil.sixdof.relative import States, relative
+from jaxhil.sixdof.sensor import Sensor
+from jaxhil.sixdof.space import choose
+from jaxhil.sixdof.vectors import dot, norm
+
+QUIET = 0.06  # s; time without a touch, of rig and ideal contact, after which an episode is over
+
+
+class Beginning(NamedTuple):
+    """Start of an episode: that of the run, or the end of the last episode."""
+
+    states: States  # numerical model
+    tick: Int[Array, "*batch"]
+    energy: Float[Array, "*batch"]  # energy of the relative motion [J]
+    reference: Reference  # ideal contact from these states on
+
+
+class Watch(NamedTuple):
+    """Record of the current episode."""
+
+    begun: Bool[Array, "*batch"]  # whether anything has touched
+    touching: tuple[Bool[Array, "candidates *batch"], ...]
+    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
+    touched: Int[Array, "*batch"]  # ticks in touch
+    quiet: Int[Array, "*batch"]  # ticks since the last touch
+    caught: Bool[Array, "*batch"]  # whether a latch holds
+    force: Peak  # peak force of the real contact [N]
+    moment: Peak  # peak moment about T's origin [N m]
+    highest: tuple[Array, Array]  # largest force [N] and moment [N m] on the numerical model
+    faded: Int[Array, "*batch"]  # ticks since the wrench on the numerical model decayed
+    over: Bool[Array, "*batch"]  # whether the episode is over
+    end: States  # numerical model at its end
+    end_tick: Int[Array, "*batch"]
+    penetration: Float[Array, "*batch"]  # largest penetration, over the size of its shapes [1]
+    beyond: Bool[Array, "*batch"]  # whether an axis was commanded beyond its workspace
+
+
+def fresh_watch(rig: Rig, states: States, now: Array) -> Watch:
+    """Return the record at the start of an episode."""
+    zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
+    peak = no_peak(zero)
+    return Watch(
+        begun=none > 0,
+        touching=tuple(group.parameters.damping > jnp.inf for group in rig.groups),
+        touches=none,
+        touched=none,
+        quiet=none,
+        caught=none > 0,
+        force=peak,
+        moment=peak,
+        highest=(zero, zero),
+        faded=none,
+        over=none > 0,
+        end=states,
+        end_tick=now,
+        penetration=zero,
+        beyond=none > 0,
+    )
+
+
+def watch_tick(
+    rig: Rig, beginning: Beginning, watch: Watch, seen: Tick, after: States, ticks: Array
+) -> Watch:
+    """Update the record with a tick.
+
+    Args:
+        rig: constants of the run.
+        beginning: start of the episode.
+        watch: record before the tick.
+        seen: record of the tick.
+        after: numerical model at the end of the tick.
+        ticks: number of ticks of the run until then.
+    """
+    watch = _updated(rig, watch, seen)
+    time = (ticks - beginning.tick).astype(rig.period.dtype) * rig.period
+    quiet = is_quiet(beginning.reference, time, quiet_time(rig.sensor, rig.period))
+    pauses = watch.begun & is_rig_quiet(rig, watch) & quiet & ~watch.over
+
+    def are_free() -> Array:
+        return deepest(rig.groups, relative(rig.bodies, after)[0]) < 0
+
+    # Hardly any tick needs the depths of the numerical model.
+    ends = pauses & lax.cond(jnp.any(pauses), are_free, lambda: jnp.ones_like(pauses))
+    return watch._replace(
+        over=watch.over | ends,
+        end=choose(ends, after, watch.end),
+        end_tick=jnp.where(ends, ticks, watch.end_tick),
+    )
+
+
+def quiet_time(sensor: Sensor, period: Array) -> Array:
+    """Return the time [s] without a touch after which a contact is over.
+
+    It is `QUIET`, or the time tau_f + 20 sensor time constants + 2 T of a reading if that is longer.
+    """
+    return jnp.maximum(QUIET, sensor.delay + 20 * sensor.time_constant + 2 * period)
+
+
+def is_rig_quiet(rig: Rig, watch: Watch) -> Array:
+    """Return whether the hardware has touched nothing for the quiet time and the command has decayed."""
+    still = quiet_ticks(rig)
+    patience = still + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
+    return ((watch.quiet >= still) & (watch.faded > 0)) | (watch.quiet >= patience)
+
+
+def quiet_ticks(rig: Rig) -> Array:
+    """Return the number of ticks without a touch after which a contact is over."""
+    return jnp.floor(quiet_time(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
+
+
+def relative_energy(rig: Rig, states: States) -> Array:
+    """Return the energy of the relative motion [J], without the coupling of translation and rotation."""
+    _, (linear, angular) = relative(rig.bodies, states)
+    return dot(linear, linear) / mass_share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
+
+
+def mass_share(rig: Rig) -> Array:
+    """Return the inverse of the reduced mass [1/kg]."""
+    return 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
+
+
+def _updated(rig: Rig, watch: Watch, seen: Tick) -> Watch:
+    """Update touches, peaks and decay with a tick."""
+    touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
+    caught = watch.caught
+    for latch in seen.held:
+        caught = caught | jnp.any(latch.caught, axis=0)
+    now, touches = caught, watch.touches
+    for flags, before in zip(touching, watch.touching, strict=True):
+        now = now | jnp.any(flags, axis=0)
+        touches = touches + jnp.sum(flags & ~before, axis=0, dtype=touches.dtype)
+    penetration = watch.penetration
+    for group, forces in zip(rig.groups, seen.forces, strict=True):
+        share = jnp.max(forces.touch.depth / group.candidates.size, axis=0)
+        penetration = jnp.maximum(penetration, share)
+    command = norm(seen.command.force), norm(seen.command.moment)
+    highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
+    # No threshold depends on the noise; `jaxhil.simulation.watch` gives the reason.
+    faded = (command[0] <= COMMAND_DECAY_RATIO * highest[0]) & (
+        command[1] <= COMMAND_DECAY_RATIO * highest[1]
+    )
+    return watch._replace(
+        begun=watch.begun | now,
+        touching=touching,
+        touches=touches,
+        touched=watch.touched + now.astype(touches.dtype),
+        quiet=jnp.where(now, 0, watch.quiet + 1),
+        caught=caught,
+        force=higher(watch.force, norm(seen.contact.force), rig.period),
+        moment=higher(watch.moment, norm(seen.contact.moment), rig.period),
+        highest=(highest[0], highest[1]),
+        faded=jnp.where(faded, watch.faded + 1, 0),
+        penetration=penetration,
+    )

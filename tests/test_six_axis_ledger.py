@@ -1,0 +1,138 @@
+"""Impulse ledger in six axes: its errors beside those of a lead, silence without contact."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import QUICK
+from six_axis_ranges import POSE_NOISE, with_ranges
+
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
+from jaxhil.mechanism.file import load_any
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.jax_environment import jax_context
+from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.loop import run
+from jaxhil.sixdof.metrics import evaluate
+from jaxhil.sixdof.rollout import STATUS_NAMES
+
+LANES = 64
+LAW = "impulse_ledger"
+# By mechanism: largest rms of the energy error and of the twist error, and largest twist error.
+BARS = {
+    "probe-drogue": (0.05, 0.012, 0.05),
+    "ring-capture": (0.05, 0.08, np.inf),
+    "hydraulic-hexapod": (0.04, 0.02, np.inf),
+}
+
+
+def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None):
+    """Return the metrics of the first episode for each change of the literature's gains, from one program."""
+    with jax_context():
+        scenarios = build_scenarios(mechanism, draw(mechanism, lanes, 1), seed=1)
+        if scenario is not None:
+            scenarios = scenario(scenarios)
+        loop = loop_of(mechanism, compensator, scenarios)
+        gains = literature_gains(mechanism, compensator)
+        program = jax.jit(evaluate, static_argnums=0, compiler_options=QUICK)
+
+        def of(change):
+            arrays = {name: jnp.asarray(value) for name, value in {**gains, **change}.items()}
+            metrics = program(loop, arrays, scenarios).metrics
+            return {name: np.asarray(getattr(metrics, name))[..., 0, :] for name in metrics._fields}
+
+        return [of(change) for change in changes or ({},)]
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def check_good(metrics):
+    """Check that every lane has ended in one of the good ways."""
+    assert {STATUS_NAMES[status] for status in metrics["status"]} <= {"rebounded", "captured"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BARS)
+def test_ledger_leaves_a_small_share_of_the_errors_of_a_lead(name):
+    """Compare with the best of several leads as long as the whole loop, on the same draws."""
+    mechanism = with_ranges(name)
+    [ledger] = evaluated(mechanism, LAW)
+    check_good(ledger)
+    energy, twist, largest = BARS[name]
+    assert rms(ledger["energy_error"]) < energy
+    assert rms(ledger["twist_error"]) < twist
+    assert np.max(ledger["twist_error"]) < largest
+    leads = [{"phase_lead": lead} for lead in np.arange(0.018, 0.040, 0.004)]
+    best = min(rms(metrics["twist_error"]) for metrics in evaluated(mechanism, "phase_lead", *leads))
+    assert rms(ledger["twist_error"]) < 0.6 * best
+
+
+@pytest.mark.slow
+def test_ledger_tolerates_noise_of_the_pose():
+    [metrics] = evaluated(with_ranges("probe-drogue", POSE_NOISE), LAW)
+    check_good(metrics)
+    assert rms(metrics["energy_error"]) < 0.05 and rms(metrics["twist_error"]) < 0.012
+
+
+@pytest.mark.slow
+def test_ledger_tolerates_wrong_numbers():
+    """Cover a bias of 5 N, a tool 2 % too light, and a force delay 1 ms longer than assumed."""
+    mechanism = with_ranges("probe-drogue")
+    delay = mechanism.rig.force_sensor.delay
+
+    def biased(scenarios):
+        sensor = scenarios.sensor
+        errors = sensor.errors._replace(bias=sensor.errors.bias.at[2].set(5.0))
+        return scenarios._replace(sensor=sensor._replace(errors=errors))
+
+    def wrong_tool(scenarios):
+        tool = scenarios.sensor.assumed_tool
+        return scenarios._replace(
+            sensor=scenarios.sensor._replace(assumed_tool=tool._replace(mass=0.98 * tool.mass))
+        )
+
+    for scenario, change, bar in ((biased, {}, 0.055), (wrong_tool, {}, 0.055),
+                                  (None, {"identification_delay": delay - 1e-3}, 0.13)):  # fmt: skip
+        [metrics] = evaluated(mechanism, LAW, change, scenario=scenario)
+        check_good(metrics)
+        assert rms(metrics["energy_error"]) < bar
+
+
+@pytest.mark.slow
+def test_ledger_commands_nothing_without_contact():
+    """Approach from afar, with noise, a tool and gravity."""
+    mechanism = with_ranges("probe-drogue", POSE_NOISE)
+    with jax_context():
+        scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 2), seed=2)
+        # The chaser starts a second before the first touch.
+        away = scenarios.start.chaser.position + 1.0 * (
+            scenarios.start.target.velocity - scenarios.start.chaser.velocity
+        )
+        start = scenarios.start._replace(chaser=scenarios.start.chaser._replace(position=away))
+        scenarios = scenarios._replace(start=start)
+        loop = loop_of(mechanism, LAW, scenarios)
+        gains = {name: jnp.asarray(value) for name, value in literature_gains(mechanism, LAW).items()}
+        _, ticks = jax.jit(run, static_argnums=(0, 3), compiler_options=QUICK)(loop, gains, scenarios, 800)
+    assert all(np.all(np.asarray(part) == 0) for part in jax.tree.leaves(ticks.command))
+    depths = np.asarray(ticks.forces[0].touch.depth)
+    assert np.all(depths < 0)
+
+
+def test_gains_of_the_ledger_follow_from_the_file():
+    mechanism = load_any(
+        "probe-drogue", {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
+    ).mechanism
+    gains = literature_gains(mechanism, LAW)
+    assert gains["identification_delay"] == 0.0037 and gains["pose_filter"] == 0.0
+    assert (gains["force_noise"], gains["torque_noise"]) == (0.5, 0.05)
+    lags = 0.8 / (np.pi * np.array([14.0] * 3 + [11.0] * 3)) + mechanism.rig.simulator.delay
+    leads = [gains[f"lag_lead_{name}"] for name in ("x", "y", "z", "rx", "ry", "rz")]
+    np.testing.assert_allclose(leads, lags - lags.min(), rtol=1e-12)
+    noisy = with_ranges("petals", POSE_NOISE)
+    assert literature_gains(noisy, LAW)["pose_filter"] == 0.003
+    assert [gain.name for gain in SIX_AXIS_COMPENSATORS[LAW].gains if gain.tuned(mechanism)] == [
+        "velocity_gain",
+        "position_gain",
+    ]
