@@ -90,7 +90,7 @@ def _traced():
     """What is tested is traced, its shapes checked, and not run as a process before compiled it."""
     from jaxhil.simulation import cached_programs
 
-    cached_programs.load_or_compile = lambda made_of, made, arguments, folder: made()
+    cached_programs.load_or_compile = lambda identity, build, arguments, folder: build()
 
 
 @pytest.fixture(scope="module", autouse=True)

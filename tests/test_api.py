@@ -367,14 +367,14 @@ def test_jacobian_by_both_masses_matches_equivalent_mass():
     [
         (
             "approach.contacts",
-            "by approach.contacts: found no key to differentiate by, expected a real number",
+            "by approach.contacts: found no parameter with a derivative, expected the path of a real number",
         ),
         ("rig.force_sensor.dely", "did you mean rig.force_sensor.delay"),
-        ("rig.force_sensor.quantum", "found no key to differentiate by"),
+        ("rig.force_sensor.quantum", "found no parameter with a derivative"),
         ("contact.clearance", "found inf as its value, expected a key with a finite value"),
         ("contact.reference_depth", "found nothing as its value"),
-        ("contact.stiffness[7]", "expected indices into it"),
-        ("rig.force_sensor.time_constant", "there is a corner at 0"),
+        ("contact.stiffness[7]", "expected indices within this shape"),
+        ("rig.force_sensor.time_constant", "the derivative at 0 is one-sided"),
         ("gains.phase_led", "expected gains.phase_lead, gains.lead_filter (did you mean phase_lead?)"),
         ([], "expected dotted paths"),
     ],
@@ -388,4 +388,4 @@ def test_jacobian_rejects_metric_without_derivative():
     assert "of: found 'duration', expected one of restitution" in message
     rounded = jaxhil.load("varying", {"rig.force_sensor.quantum": 0.5})
     message = refusal(jaxhil.jacobian, rounded, "phase_lead", by="approach.velocity")
-    assert message == "rig.force_sensor.quantum: found 0.5, expected 0: what is rounded has no derivative"
+    assert message == "rig.force_sensor.quantum: found 0.5, expected 0: quantised readings have no derivative"

@@ -247,7 +247,7 @@ def run_in_c(folder, parsed: Mechanism, document: dict[str, Any], seeds: int, mo
     numbers = (
         *(parsed.bodies.mass, parsed.approach.velocity, contact.stiffness[0], contact.damping[0]),
         *(rig.simulator.natural_frequency, rig.simulator.damping_ratio, rig.simulator.delay, sensor.delay),
-        *(rig.command_latency, parsed.approach.phase, float(waits.max_quiet[0]) + more),
+        *(rig.command_latency, parsed.approach.phase, float(waits.max_force_free_ticks[0]) + more),
     )
     ran = subprocess.run(
         [program, *(repr(float(number)) for number in numbers), folder / "noise"],

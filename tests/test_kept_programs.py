@@ -186,10 +186,10 @@ def test_program_with_callback_into_python_is_not_cached(tmp_path):
 
 
 def test_program_is_not_cached_if_jax_does_not_name_the_processor(tmp_path, monkeypatch):
-    def not_there(made_of):
+    def raise_missing(identity):
         raise AttributeError
 
-    monkeypatch.setattr(cached_programs, "_hash_program", not_there)
+    monkeypatch.setattr(cached_programs, "_hash_program", raise_missing)
     for _ in range(2):
         check(run(tmp_path))
     assert len(traced) == 2 and not list(tmp_path.iterdir())

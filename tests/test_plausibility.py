@@ -180,7 +180,7 @@ def test_ideal_simulator_has_no_bandwidth():
             "rig.force_sensor.range",
             28.3,
             28.2,
-            "range: found 28.2 N, expected beyond the 28.3 N of contact 1",
+            "range: found 28.2 N, expected beyond the 28.3 N of the ideal contact 1",
         ),
         (
             "rig.simulator.delay",
@@ -344,8 +344,8 @@ def test_simulate_begins_with_the_summary_line(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=10")
     assert ran.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     assert ran.err == (
-        "warning: rig-300kg: rig.force_sensor.range: found 10 N, expected beyond the 28.3 N of contact 1 in "
-        "space\n"
+        "warning: rig-300kg: rig.force_sensor.range: found 10 N, expected beyond the 28.3 N of the "
+        "ideal contact 1\n"
     )
     result = jaxhil("simulate", "rig-300kg", "--json", "--set", "rig.force_sensor.range=1e9").document[
         "meaning"

@@ -118,7 +118,7 @@ def test_unusable_law_is_not_registered(registered):
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
         (Holding(), "a law holds no arrays"),
-        (OfItsOwnKey(), "keys: found toy_depth, expected keys that files have: tension, exponent, "),
+        (OfItsOwnKey(), "keys: found toy_depth, expected keys of mechanism files: tension, exponent, "),
     ):
         assert message in refusal(jaxhil.register, law)
     assert "expected one of none" in refusal(jaxhil.simulate, "varying", "holding")

@@ -192,7 +192,7 @@ def test_recorded_run_agrees_with_its_metrics(recorded):
         velocity = ticks.signals.velocity_desired[ticks_of_slot, lane]
         force, works = (
             ticks.plant_signals.force[ticks_of_slot, lane],
-            [w[ticks_of_slot, lane] for w in ticks.plant_signals.works],
+            [w[ticks_of_slot, lane] for w in ticks.plant_signals.work],
         )
         assert np.array_equal(ticks_of_slot, np.arange(ticks_of_slot[0], ticks_of_slot[-1] + 1))
         assert (

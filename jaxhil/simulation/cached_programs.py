@@ -1,14 +1,18 @@
-"""Cache of compiled programs across processes, which avoids both tracing and lowering.
+"""Disk cache of compiled programs, which saves later processes the tracing and the lowering.
 
-Tracing and lowering take longer than running a short batch. JAX's description of a compiled program is stored
-in a file, whose name is the hash of everything that determines it: sources, versions of dependencies, static
-arguments, shapes, settings of JAX, compiler flags and options, and processor. The machine code stays in the
-compile cache, and the file contains its key there: JAX can serialise machine code completely, but code that
-it has itself deserialised fails after another serialisation. As with the compile cache, anyone who may write
-into the folder may run code in the process that reads it: checksums protect against damage, not against
-malicious files.
+Tracing and lowering take longer than running a short batch. For each compiled program, a file contains the
+data that JAX needs to load this program. The file's name is the hash of everything that determines the
+program: sources, versions of dependencies, static arguments, array shapes, settings of JAX, compiler flags
+and options, and processor.
 
-Some functions of JAX used here are private. If one is missing, and on graphics cards, nothing is cached.
+The machine code is not in this file but in the compile cache (`jaxhil.simulation.compile_cache`); the file
+contains only the key of the machine code. JAX could also serialise the machine code, but machine code that
+JAX has loaded from a file cannot be serialised again.
+
+Anyone who can write to the folder of a cache can run code in the processes that read it: checksums protect
+against damage, not against malicious files.
+
+This module uses private functions of JAX. If one of them is missing, or on graphics cards, nothing is cached.
 """
 
 import dataclasses
@@ -36,13 +40,13 @@ from jaxhil.simulation.jax_environment import (
 )
 from jaxhil.simulation.source_fingerprint import OWN_PACKAGES, dependency_versions, sources_sha256
 
-PROGRAM_SUFFIX = ".compiled"  # suffix of the file names
-READ_TIME_EVENT = (
-    "/jax/compilation_cache/cache_retrieval_time_sec"  # JAX's name for the time of reading a program
-)
-MACHINE_CODE_TAG = "exec"  # JAX's tag of machine code in its pickles
-# Calls that a program may contain: of LAPACK, which is initialised before the program is used, and
-# annotations of the arrays' placement. Any other call may refer to a function of the writing process.
+PROGRAM_SUFFIX = ".compiled"  # suffix of the names of the cached files
+# Name under which JAX records how long it takes to read a program.
+READ_TIME_EVENT = "/jax/compilation_cache/cache_retrieval_time_sec"
+MACHINE_CODE_TAG = "exec"  # tag with which JAX marks machine code in its pickles
+# Custom calls that a cached program may contain: LAPACK, which is initialised before the program is used, and
+# annotations that say on which device an array is. Any other call may need a function of the process that
+# wrote the program.
 CACHEABLE_CALLS = re.compile(r"lapack_\w+|Sharding|SPMD\w+|xla\.sdy\.\w+")
 
 Options = Mapping[str, int | str]  # of the compiler, by name
@@ -54,11 +58,16 @@ _programs: dict[Any, Any] = {}  # programs of this process
 def run_cached(
     function: Callable[..., Any], static: Any, *arguments: Any, options: Options = NO_OPTIONS
 ) -> Any:
-    """Return `function(static, *arguments)`, compiled with the compiler's `options`.
+    """Return `function(static, *arguments)`, computed by a compiled program from the cache.
 
-    `function` is defined at the top of a module; its result consists of arrays, tuples and named tuples.
-    `static` is hashable, and its `repr` describes it completely. `arguments` are pytrees of arrays; arrays of
-    equal shape have equal placement. Programs are cached on disk unless they contain user-registered laws.
+    A program that is not in the cache is compiled and written there, unless it contains user-registered laws.
+
+    Args:
+        function: Function defined at the top of a module. Its result consists of arrays, tuples and named
+            tuples.
+        static: Hashable argument whose `repr` describes it completely.
+        *arguments: Pytrees of arrays. Arrays of equal shape must be placed on the same devices.
+        options: Options of XLA's compiler.
     """
     program, leaves = _find_program(function, static, arguments, options)
     return program(*leaves)
@@ -74,7 +83,7 @@ def compile_cached(
 
 
 def _find_program(function, static, arguments, options):
-    """Return the program for these arguments, and their leaves."""
+    """Return the compiled program for these arguments, and the array leaves with which to call it."""
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
@@ -91,34 +100,40 @@ def _find_program(function, static, arguments, options):
 
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
         name = function.__module__, function.__qualname__
-        made_of = (*name, static, structure, placed, sorted(options.items()))
-        # The structure of the arguments may contain laws.
-        foreign = has_user_objects((static, jax.tree.unflatten(structure, [None] * len(leaves))))
-        program = load_or_compile(made_of, jitted, leaves, None if foreign else folder)
+        identity = (*name, static, structure, placed, sorted(options.items()))
+        # A law may be in the static argument or in the tree structure of the array arguments.
+        is_uncacheable = has_user_objects((static, jax.tree.unflatten(structure, [None] * len(leaves))))
+        program = load_or_compile(identity, jitted, leaves, None if is_uncacheable else folder)
         _programs[key] = program
     return program, leaves
 
 
 def load_or_compile(
-    made_of: Any,
-    made: Callable[[], Any],
+    identity: Any,
+    build: Callable[[], Any],
     arguments: Iterable[Any],
     folder: str | os.PathLike[str] | None,
 ) -> Callable[..., Any]:
-    """Return the jitted program from `made`, compiled for such arrays; without a folder not yet compiled.
+    """Load a compiled program from the cache folder, or compile and store the program.
 
-    The `repr` of `made_of` describes completely from what the program is made.
+    Without a folder, or on a graphics card, the returned program is jitted but not yet compiled.
+
+    Args:
+        identity: Object whose `repr` describes completely how the program is built.
+        build: Function that returns the jitted program.
+        arguments: Arrays, or their shapes, for which the program is compiled.
+        folder: Folder of cached programs; None to cache nothing.
     """
     if folder is None or jax.default_backend() != "cpu":
-        return made()
+        return build()
     try:
-        path = Path(folder) / f"{_hash_program(made_of)}{PROGRAM_SUFFIX}"
+        path = Path(folder) / f"{_hash_program(identity)}{PROGRAM_SUFFIX}"
     except Exception:
-        # This version of JAX lacks a part of the name.
-        return made()
+        # This version of JAX does not provide everything that determines the program.
+        return build()
     program = _read_program(path)
     if program is None:
-        lowered = made().lower(*arguments)
+        lowered = build().lower(*arguments)
         program, key = compile_cache.compile_with_key(lowered)
         if key is not None:
             _write_program(path, program, key, find_calls(lowered.as_text()))
@@ -126,14 +141,14 @@ def load_or_compile(
 
 
 def find_calls(text: str) -> set[str]:
-    """Return the names of all calls in a lowered program."""
+    """Return the names of the custom calls (to functions outside XLA) in a lowered program."""
     return {quoted or plain for quoted, plain in re.findall(r'custom_call @(?:"([^"]*)"|([^\s(]+))', text)}
 
 
 def has_user_objects(value: Any) -> bool:
-    """Return whether a value contains objects of other packages, or arrays or functions.
+    """Return whether a value contains objects that their `repr` may not describe completely.
 
-    Their `repr` may not describe them completely.
+    These are arrays, functions, and objects whose class is defined outside this project.
     """
     if value is None or isinstance(value, (str, bool, int, float)):
         return False
@@ -148,27 +163,27 @@ def has_user_objects(value: Any) -> bool:
     return any(has_user_objects(getattr(value, field.name)) for field in dataclasses.fields(value))
 
 
-def _hash_program(made_of) -> str:
-    """Return the hash of everything that determines a program."""
+def _hash_program(identity) -> str:
+    """Return a SHA-256 hash of everything that determines a compiled program."""
     from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 
     processor = xla_client.get_topology_for_devices(jax.devices()).fingerprint()
     settings = _read_jax_settings()
     if not settings:
-        raise LookupError("settings")
+        raise LookupError("settings of JAX: found none")
     process = processor, jax.device_count(), rounding_flags(active_xla_flags()), sorted(settings)
-    text = repr((made_of, process, sources_sha256(), dependency_versions()))
+    text = repr((identity, process, sources_sha256(), dependency_versions()))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read_jax_settings() -> tuple[tuple[str, Any], ...]:
-    """Return JAX's settings in this thread, except folders; empty if JAX does not provide them."""
+    """Return names and values of JAX's settings in this thread, except folders; empty if unavailable."""
     values = getattr(jax.config, "values", {})
     return tuple([(name, getattr(jax.config, name, values[name])) for name in values if name[-4:] != "_dir"])
 
 
 def _read_program(path: Path) -> Any:
-    """Return the program from a file; None if there is none or it is unreadable."""
+    """Return the compiled program in a file; None if the file is missing or cannot be used."""
     start = time.monotonic()
     content = read_checksummed(path)
     if content is None:
@@ -178,14 +193,15 @@ def _read_program(path: Path) -> Any:
         jax.monitoring.record_event_duration_secs(READ_TIME_EVENT, time.monotonic() - start)
         return program
     except Exception:
-        # Another version wrote the file, or the machine code was deleted.
+        # Another version of JAX wrote the file, or the machine code was deleted from the compile cache.
         return None
 
 
 def _write_program(path: Path, program: Any, key: str, calls: set[str]) -> None:
-    """Write a program atomically; errors are ignored, since only the next call takes longer.
+    """Write a compiled program to a file if all its custom calls can be cached.
 
-    Possible errors are a full or read-only folder, or a version of JAX that cannot serialise.
+    Errors are ignored, because an uncached program only costs time. Typical errors are a full disk, a
+    read-only folder, or a version of JAX that cannot serialise the program.
     """
     if not all(CACHEABLE_CALLS.fullmatch(name) for name in calls):
         return
@@ -196,16 +212,16 @@ def _write_program(path: Path, program: Any, key: str, calls: set[str]) -> None:
 
 
 def _serialise_program(program, key, calls_lapack):
-    """Return the content of a program's file."""
+    """Return a compiled program as bytes; `key` is the key of its machine code in the compile cache."""
     from jax.experimental import serialize_executable
 
     content, unloaded = io.BytesIO(), program._executable._unloaded_executable
 
     class Pickler(serialize_executable._JaxPjrtPickler):
-        """Pickler that writes the key of the machine code instead of the code."""
+        """Pickler that writes the key of the machine code instead of the machine code itself."""
 
         def persistent_id(self, obj):
-            """Return the key instead of the machine code."""
+            """Return the key if the object is the machine code, else the result of JAX's pickler."""
             return (MACHINE_CODE_TAG, key) if obj is unloaded.xla_executable else super().persistent_id(obj)
 
     pickle.dump((calls_lapack, [device.id for device in unloaded.device_list]), content)
@@ -214,7 +230,7 @@ def _serialise_program(program, key, calls_lapack):
 
 
 def _deserialise_program(content):
-    """Return the program from a file's content."""
+    """Return the compiled program from the bytes that `_serialise_program` returned."""
     from jax._src import compilation_cache
     from jax._src.lax import linalg
     from jax.experimental import serialize_executable
@@ -223,19 +239,19 @@ def _deserialise_program(content):
         """Unpickler that reads the machine code from the compile cache."""
 
         def persistent_load(self, pid):
-            """Return the machine code with a key."""
+            """Return the machine code that the compile cache holds for a key."""
             if pid[0] != MACHINE_CODE_TAG:
                 return super().persistent_load(pid)
             client, devices = self.backend, self.execution_devices
             code, _ = compilation_cache.get_executable_and_time(pid[1], None, client, devices)
             if code is None:
-                raise LookupError(pid[1])
+                raise LookupError(f"machine code: found none with key {pid[1]}")
             return code
 
     file = io.BytesIO(content)
     calls_lapack, indices = pickle.load(file)
     if calls_lapack:
-        # Normally JAX does this when it lowers a call of LAPACK.
+        # JAX initialises LAPACK when it lowers a call of LAPACK; a loaded program was not lowered here.
         linalg.initialize_lapack()
     devices = {device.id: device for device in jax.devices()}
     client, used_devices = jax.devices()[0].client, [devices[index] for index in indices]

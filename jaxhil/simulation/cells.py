@@ -1,10 +1,14 @@
-"""Cells: short parts of a sampling interval, in each of which the motion is computed as a power series.
+"""Cells: subdivision of a sampling interval, with the motion in each cell as a power series.
 
 A sampling interval has two parts: before and after the instant at which the force is sampled. Each part is
-divided into cells of at most one radian of the motion simulator's fastest pole. In a cell a Taylor series of
-the exact response is exact to rounding. A force sensor whose lag is much shorter than a control period
-depends only on a short window before its sample. This window has its own cells, each at most one time
-constant long. The number of cells is static; their positions depend on the lane.
+divided into cells. The length of a cell times the motion simulator's fastest pole is at most one radian.
+Within a cell, a Taylor series of the motion simulator's response is therefore accurate to rounding.
+
+If the lag of the force sensor is much shorter than a control period, a reading depends only on the force in a
+short window before the sample. This window has separate cells, each at most one time constant of the lag
+long.
+
+The number of cells is static. The positions of the cells differ between the lanes of a batch.
 """
 
 import math
@@ -18,24 +22,26 @@ from jaxtyping import Array, Float
 
 from jaxhil.simulation.motion_simulator import SimulatorState, generator_rows, matrix_exponential
 
-MAX_POLE = 64.0  # rad per control period; up to it the motion simulator's matrix exponential is exact
-# Degree of the series by the longest cell [rad of the fastest pole]; the error is below 1e-13.
+# rad per control period; for faster poles of the motion simulator, the matrix exponential loses accuracy.
+MAX_POLE = 64.0
+# Degree of the power series for each greatest cell length, which is the length times the fastest pole [rad].
+# The truncation error is below 1e-13.
 SERIES_DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
-CELL_LENGTH_TOLERANCE = 1e-3  # relative excess of a cell over its greatest length
-LAG_WINDOW = 40.0  # time constants; exp(-40) is below rounding
-MIN_LAG = 1e-12  # control periods; a shorter lag counts as no lag
+CELL_LENGTH_TOLERANCE = 1e-3  # [1]; relative amount by which a cell may exceed its greatest length
+LAG_WINDOW = 40.0  # time constants; older forces change a reading by exp(-40), which is below rounding
+MIN_LAG = 1e-12  # control periods; a force sensor with a shorter lag counts as a sensor without lag
 
 
 class CellCounts(NamedTuple):
-    """Number of cells in each of the two parts of a sampling interval; static."""
+    """Number of cells in each of the two parts of a sampling interval, and degree of their power series."""
 
-    plain: int  # in the part, or in its rest before the window of a lagging force sensor
-    window: int  # in the window of a lagging force sensor; 0 without one
+    plain: int  # number of cells before the window of a lagging force sensor
+    window: int  # number of cells in this window; 0 for a sensor without lag
     degree: int  # degree of the power series of the motion in a cell
 
     @property
     def part(self) -> int:
-        """Return the number of cells of a part."""
+        """Return the number of cells in either part of a sampling interval."""
         return self.plain + self.window
 
 
@@ -43,39 +49,44 @@ NO_CELLS = CellCounts(0, 0, 0)
 
 
 class Cells(NamedTuple):
-    """Tables of a lane's cells; those of the first part come before those of the second."""
+    """Positions of the cells in a sampling interval, and matrices that give the motion in each cell.
+
+    Cells are in the order of time.
+    """
 
     begin: Float[Array, "cells *batch"]  # start of a cell in the sampling interval [periods]
     length: Float[Array, "cells *batch"]  # length of a cell [periods]
-    rest: Float[Array, "cells *batch"]  # from a cell's end to the end of its part [periods]
-    # rows that give the motion simulator's state at a cell's start
+    rest: Float[Array, "cells *batch"]  # time from a cell's end to the end of its part [periods]
+    # Matrix from (state, command at the interval's start, command at its end) to the state at a cell's start.
     states: Float[Array, "order cells columns *batch"]
-    # rows that give the coefficients of tau^j, with tau the time since the cell's start [periods], from
-    # (state, command, growth of the command in a period)
+    # Matrix from (state, command, increase of the command in a period) at a cell's start to the coefficients
+    # of tau^j, where tau is the time since the cell's start [periods].
     series: Float[Array, "powers columns *batch"]
 
 
 class IntervalInputs(NamedTuple):
     """Inputs that determine the motion within a sampling interval."""
 
-    state: SimulatorState  # of the motion simulator at the interval's start
-    start: Float[Array, "*batch"]  # command at the interval's start [m]
-    end: Float[Array, "*batch"]  # command at its end [m]
+    state: SimulatorState  # state of the motion simulator at the interval's start
+    start: Float[Array, "*batch"]  # position command at the interval's start [m]
+    end: Float[Array, "*batch"]  # position command at the interval's end [m]
     surface: Float[Array, "*batch"]  # position of the mechanism's surface [m]
 
 
 def count_cells(fastest: float, lags: Any) -> CellCounts:
-    """Return the number of cells; counts are powers of two, so that mechanisms share compiled programs.
+    """Return the numbers of cells that a mechanism needs.
+
+    The numbers are powers of two, so that similar mechanisms share a compiled program.
 
     Args:
-        fastest: Fastest pole [rad per period].
-        lags: Time constants of the force sensors [periods].
+        fastest: Magnitude of the motion simulator's fastest pole [rad per period].
+        lags: Time constants of the force sensor in each lane [periods].
     """
     lags = np.asarray(lags)
     plain, window = _power_of_two(fastest), 0
     if np.any(lags > 0):
         shortest = float(np.min(lags))
-        # The window may be the whole part.
+        # The window covers the whole part if the lag is long.
         if shortest * LAG_WINDOW >= 1:
             plain, window = 0, max(plain, _power_of_two(1 / shortest))
         else:
@@ -88,20 +99,24 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
 
 
 def merge_cell_counts(counts: Sequence[CellCounts]) -> CellCounts:
-    """Return the number of cells that suffices for all mechanisms with these counts."""
+    """Return numbers of cells that are large enough for several mechanisms in one program."""
     used = [count for count in counts if count.part]
     if not used:
         return NO_CELLS
     plain, window, degree = (max(numbers) for numbers in zip(*used, strict=True))
     if window and any(count.plain or not count.window for count in counts):
-        # Lanes whose window was the whole part now have plain cells too; the others keep their window.
+        # In the common program, all mechanisms have a window of full length and cells before this window,
+        # including mechanisms whose own window covered the whole part.
         plain = max(count.plain or count.window for count in used)
         window = max(window, _power_of_two(LAG_WINDOW))
     return CellCounts(plain, window, degree)
 
 
 def fastest_pole(denominator: Any) -> np.ndarray:
-    """Return the magnitude of the fastest pole [rad/s] of each lane; `denominator` is (order + 1, lanes)."""
+    """Return the magnitude [rad/s] of the fastest pole of each lane's motion simulator.
+
+    `denominator` has the shape (order + 1, lanes), with descending powers of s.
+    """
     coefficients = np.asarray(denominator, float)
     order = len(coefficients) - 1
     if order == 0:
@@ -113,7 +128,7 @@ def fastest_pole(denominator: Any) -> np.ndarray:
         half, constant = lower[0] / 2, lower[1]
         real = np.abs(half) + np.sqrt(np.maximum(half**2 - constant, 0))
         return np.where(half**2 < constant, np.sqrt(np.abs(constant)), real)
-    # Dividing by the poles' mean magnitude gives coefficients of similar size.
+    # In units of the poles' geometric mean, all coefficients have similar magnitudes.
     unit = np.abs(lower[-1]) ** (1 / order)
     scaled = lower / unit ** np.arange(1, order + 1)[:, None]
     companion = np.zeros((scaled.shape[1], order, order))
@@ -131,9 +146,18 @@ def build_cells(
     fraction: Float[Array, "*batch"],
     time_constant: Float[Array, "*batch"],
 ) -> Cells:
-    """Compute the tables of all cells; the force is sampled at `fraction` [periods] of the interval."""
+    """Compute positions and matrices of the cells of a sampling interval.
+
+    Args:
+        counts: Numbers of cells.
+        numerator: Numerator of the motion simulator's transfer function, descending powers of s.
+        denominator: Denominator of this transfer function.
+        control_period: Control period [s].
+        fraction: Time from the interval's start to the force sample [periods].
+        time_constant: Lag of the force sensor [s].
+    """
     lag = bound_time_constant(time_constant, control_period) / control_period
-    first, second = _edges(counts, fraction, lag), _edges(counts, 1 - fraction, lag)
+    first, second = _divide_part(counts, fraction, lag), _divide_part(counts, 1 - fraction, lag)
     begin = jnp.concatenate([fraction - first.before[:-1], 1 - second.before[:-1]])
     length = jnp.concatenate([first.length, second.length])
     rest = jnp.concatenate([first.before[1:], second.before[1:]])
@@ -153,54 +177,55 @@ def build_cells(
 
 
 @jax.numpy_rank_promotion("allow")
-def power_series(cells: Cells, course: IntervalInputs) -> Float[Array, "powers cells *batch"]:
-    """Return the coefficients of the position [m], relative to the surface.
+def power_series(cells: Cells, inputs: IntervalInputs) -> Float[Array, "powers cells *batch"]:
+    """Return the mechanism's position relative to the surface [m] as a power series in each cell.
 
-    They belong to powers of the time since a cell's start [periods].
+    The series' variable is the time since the cell's start [periods].
     """
-    growth = course.end - course.start
+    growth = inputs.end - inputs.start
     state = [
         sum(
-            (row[:, i] * component for i, component in enumerate(course.state)),
-            row[:, -2] * course.start + row[:, -1] * course.end,
+            (row[:, i] * component for i, component in enumerate(inputs.state)),
+            row[:, -2] * inputs.start + row[:, -1] * inputs.end,
         )
         for row in cells.states
     ]
-    drive = course.start + growth * cells.begin
+    drive = inputs.start + growth * cells.begin
     position = cells.series[:, None, -2] * drive + cells.series[:, None, -1] * growth
     for i, component in enumerate(state):
         position = position + cells.series[:, None, i] * component
-    return position.at[0].add(-course.surface)
+    return position.at[0].add(-inputs.surface)
 
 
 def bound_time_constant(time_constant: Array, control_period: Array) -> Array:
-    """Return a time constant [s], or `MIN_LAG` control periods if it is shorter."""
+    """Return the time constant [s], raised to at least `MIN_LAG` control periods."""
     least = MIN_LAG * control_period
     return jnp.where(time_constant > least, time_constant, least)
 
 
-class _Edges(NamedTuple):
-    """Edges of a part's cells."""
+class _CellEdges(NamedTuple):
+    """Positions of the cells in one part of a sampling interval."""
 
-    before: Float[Array, "edges *batch"]  # from a cell's edges to the end of its part [periods]
-    length: Float[Array, "cells *batch"]  # length of the cells [periods]
+    # time from each edge between two cells, first and last edge included, to the end of the part [periods]
+    before: Float[Array, "edges *batch"]
+    length: Float[Array, "cells *batch"]  # length of each cell [periods]
 
 
-def _edges(counts, whole, lag):
-    """Return the edges of the cells of a part that is `whole` periods long."""
+def _divide_part(counts, whole, lag):
+    """Divide one part of a sampling interval, `whole` periods long, into cells; `lag` is in periods."""
     window = jnp.minimum(whole, LAG_WINDOW * lag) if counts.plain else whole
     window = window if counts.window else jnp.zeros_like(whole)
     left = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
     inside = [window * (i / max(counts.window, 1)) for i in range(counts.window, -1, -1)]
     before = jnp.stack([window + before_window for before_window in left] + inside)
     lengths = [(whole - window) / max(counts.plain, 1)] * counts.plain
-    return _Edges(before, jnp.stack(lengths + [window / max(counts.window, 1)] * counts.window))
+    return _CellEdges(before, jnp.stack(lengths + [window / max(counts.window, 1)] * counts.window))
 
 
 def _series(generator, output, degree):
-    """Return the rows of y^(j)/j!, (degree + 1, columns, *batch), for y = output w and w' = generator w.
+    """Return y^(j)/j! as rows that multiply w, (degree + 1, columns, *batch).
 
-    The vector w is (state, command, growth of the command in a period).
+    Here y = output w, w' = generator w, and w = (state, command, increase of the command in a period).
     """
     order, columns = generator.shape[:2]
     zero = jnp.zeros_like(output[0])
@@ -217,5 +242,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """Return the least power of two not below a number, within the relative `CELL_LENGTH_TOLERANCE`."""
+    """Round a number up to a power of two; a relative excess of `CELL_LENGTH_TOLERANCE` is ignored."""
     return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + CELL_LENGTH_TOLERANCE))))

@@ -1,9 +1,10 @@
-"""Cache of compiled programs in checksummed files.
+"""Compile cache: machine code of compiled programs in checksummed files, read and written for JAX.
 
-JAX has its own cache but does not verify the content of its files if zstandard is installed: a flipped bit is
-executed as machine code. It also never replaces a damaged file, and warns about it every time. Therefore this
-module reads and writes the programs in our folder. JAX has no public interface for this. If the private one
-is missing, programs are not cached, which costs only time.
+JAX has its own cache of machine code. If zstandard is installed, this cache does not verify the content of
+its files, so that a flipped bit is executed as machine code. JAX also never replaces a damaged file, and
+warns about the damage at every use. This module therefore replaces JAX's cache in the folders of this
+project. JAX has no public interface for this. If the private interface is missing, nothing is cached, which
+costs only time.
 """
 
 import os
@@ -14,14 +15,15 @@ from typing import Any
 
 from jaxhil.files import read_checksummed, remove_stale, write_checksummed
 
-EXECUTABLE_SUFFIX = ".executable"  # suffix of the file names
+EXECUTABLE_SUFFIX = ".executable"  # suffix of the names of the cached files
 
 _folders: set[str] = set()
-_this_thread = threading.local()  # its `key` is that of the program last read from or written to a folder
+# Per thread; the attribute `key` is the key of the program that this thread last read or wrote.
+_this_thread = threading.local()
 
 
 def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
-    """Make JAX use checksummed files in the folder from now on; return False if this JAX cannot."""
+    """Make JAX cache machine code in `folder` as checksummed files; return False if impossible."""
     try:
         from jax._src import compilation_cache
         from jax._src.compilation_cache_interface import CacheInterface
@@ -30,8 +32,8 @@ def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
     except (ImportError, AttributeError):
         return False
 
-    class SealedCache(CacheInterface):
-        """JAX cache whose files have a checksum."""
+    class ChecksummedCache(CacheInterface):
+        """Replacement for JAX's cache class; its files contain a checksum."""
 
         def __init__(self, path: str) -> None:
             self._path = Path(path)
@@ -39,22 +41,22 @@ def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
                 remove_stale(self._path)
 
         def get(self, key: str) -> bytes | None:
-            """Return the program with this key, or None if it is missing or damaged."""
+            """Return the machine code stored under a key; None if its file is missing or damaged."""
             content = read_checksummed(self._path / f"{key}{EXECUTABLE_SUFFIX}")
             if content is not None:
                 _this_thread.key = key
             return content
 
         def put(self, key: str, value: bytes) -> None:
-            """Write a program; errors of the file system are ignored."""
-            # With a full or read-only folder only the next call takes longer.
+            """Store machine code under a key; ignore errors of the file system."""
+            # If the folder is full or read-only, later processes compile again, which costs only time.
             with suppress(OSError):
                 write_checksummed(self._path / f"{key}{EXECUTABLE_SUFFIX}", value, lasting=False)
                 _this_thread.key = key
 
     def get_file_cache(path: str):
-        """Return our cache for our folders, JAX's cache for others."""
-        return (SealedCache(path), path) if path in _folders else original(path)
+        """Return the checksummed cache for a folder of this project, else JAX's own cache."""
+        return (ChecksummedCache(path), path) if path in _folders else original(path)
 
     if not _folders:
         compilation_cache.get_file_cache = get_file_cache
@@ -63,6 +65,6 @@ def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
 
 
 def compile_with_key(lowered: Any) -> tuple[Any, str | None]:
-    """Compile a lowered program; return it with its key in our folder, or None if it is not cached there."""
+    """Compile a lowered program; return it with its key in the compile cache, or None if not cached."""
     _this_thread.key = None
     return lowered.compile(), _this_thread.key

@@ -1,19 +1,22 @@
-"""Bounds on the real contact relative to the ideal one: peak force and duration.
+"""Bounds on the peak force and the duration of a real contact, relative to the ideal contact.
 
-The restitution alone does not show whether a contact tests the hardware: a command can return the correct
-energy after a real contact that is much harder and longer than the ideal contact. A contact is therefore good
-only if its largest real force is at most `MAX_PEAK_FORCE_RATIO` times the ideal contact's peak force, and if
-the duration of the real force is `MIN_DURATION_RATIO` to `MAX_DURATION_RATIO` times the ideal contact's
-duration. The ideal contact is the undelayed one, entered at the same speed. notebooks/guide/model.md, section
-2, gives the reasons for the numbers.
+The real contact is the contact of the hardware on the rig. The ideal contact is the contact without any delay
+at the same approach speed.
+
+A correct restitution does not prove that a contact tests the hardware. The force command can return the
+correct energy although the real contact is much harder and longer than the ideal contact. A contact is
+therefore good only if its largest real force is at most `MAX_PEAK_FORCE_RATIO` times the ideal contact's peak
+force, and if the duration of the real force is `MIN_DURATION_RATIO` to `MAX_DURATION_RATIO` times the ideal
+contact's duration. Section 2 of notebooks/guide/model.md gives the reasons for these numbers.
 """
 
 import math
 from typing import Any
 
-MAX_PEAK_FORCE_RATIO = 2.0  # times the ideal contact's peak force [1]
-MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # times the ideal contact's duration [1]
-DURATION_ROUNDING = 2  # control periods; rounding of a duration at both ends of a contact
+MAX_PEAK_FORCE_RATIO = 2.0  # [1]; multiple of the ideal contact's peak force
+MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; multiples of the ideal contact's duration
+# Control periods. Durations are whole numbers of periods: either end of a contact adds an error of 1.
+DURATION_ROUNDING = 2
 CONTACT_BOUNDS = {
     "peak_force_ratio": MAX_PEAK_FORCE_RATIO,
     "duration_ratio_lowest": MIN_DURATION_RATIO,
@@ -28,20 +31,22 @@ CONTACT_BOUNDS_SHORT_TEXT = (
     f"peak force at most {MAX_PEAK_FORCE_RATIO:g} times, "
     f"duration {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal"
 )
-# The following functions accept numbers and arrays of NumPy and JAX.
+
+# The functions below accept numbers, NumPy arrays and JAX arrays.
 
 
 def is_peak_force_excessive(peak_force: Any, ideal_peak_force: Any) -> Any:
-    """Return whether peak forces [N] of real contacts exceed the bound; False for NaN."""
+    """Return whether the peak force [N] of a real contact exceeds its bound; False for NaN."""
     return peak_force > MAX_PEAK_FORCE_RATIO * ideal_peak_force
 
 
 def is_duration_out_of_bounds(duration: Any, ideal_duration: Any, period: Any) -> Any:
-    """Return whether durations of real contacts are outside the bounds.
+    """Return whether the duration of a real contact is outside its bounds.
 
     Args:
-        duration: Time with a real force [s]; the result is False for NaN.
-        ideal_duration: Duration of the ideal contact [s]; the result is False if infinite (no separation).
+        duration: Time during which a real force acts [s]. For NaN, the result is False.
+        ideal_duration: Duration of the ideal contact [s]. If infinite, because the bodies do not separate,
+            the result is False.
         period: Control period [s].
     """
     slack = DURATION_ROUNDING * period
@@ -52,9 +57,9 @@ def is_duration_out_of_bounds(duration: Any, ideal_duration: Any, period: Any) -
 def is_contact_out_of_bounds(
     peak_force: Any, ideal_peak_force: Any, duration: Any, ideal_duration: Any, period: Any
 ) -> Any:
-    """Return whether real contacts are too hard, too short or too long.
+    """Return whether a real contact is too hard, too short or too long.
 
-    The arguments are those of `is_peak_force_excessive` and `is_duration_out_of_bounds`.
+    See `is_peak_force_excessive` and `is_duration_out_of_bounds` for the arguments.
     """
     return is_peak_force_excessive(peak_force, ideal_peak_force) | is_duration_out_of_bounds(
         duration, ideal_duration, period

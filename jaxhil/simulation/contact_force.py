@@ -1,10 +1,13 @@
-"""Force, peak force and mechanical work of the real contact in one sampling interval, and a sensor's lag.
+"""Real contact in one sampling interval, for slow motion: force, peak force, work, and the sensor's lag.
 
-The motion simulator moves smoothly within a sampling interval (`jaxhil.simulation.motion_simulator`); its
-motion has corners only at the interval's ends. The force is evaluated once per interval, where the sensor
-samples it. Whatever depends on the force in between follows, in loops with slow motion, the cubic (Hermite)
-through the exact positions and velocities at the ends of each smooth section. Other loops follow the exact
-motion (`jaxhil.simulation.contact_in_cells`).
+A sampling interval lasts from one tick to the next. The motion simulator moves smoothly within it
+(`jaxhil.simulation.motion_simulator`). The instant at which the force sensor samples divides the interval
+into two sections.
+
+The force at the sampling instant is computed from the exact motion. Peak force, work and sensor lag depend on
+the motion between samples. In each section, this motion is approximated by the cubic Hermite polynomial
+through the exact positions and velocities at both ends. The module `jaxhil.simulation.contact_in_cells` uses
+the exact motion instead, for faster motion simulators and contacts.
 """
 
 from typing import Any, NamedTuple
@@ -18,72 +21,77 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided
 from jaxhil.simulation.cells import IntervalInputs
 from jaxhil.simulation.sensors import apply_lag, lag_decay
 
-NEWTON_STEPS = 3  # steps of Newton's method, which starts at the root of the chord
-PARABOLAS_PER_SECTION = 2  # parabolas that approximate the force along one section, for the sensor's lag
-GAUSS_LEGENDRE = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))  # node, weight
+NEWTON_STEPS = 3  # number of steps of Newton's method, which starts at the root of the chord
+PARABOLAS_PER_SECTION = 2  # number of parabolas that approximate the force in a section, for the sensor's lag
+# Nodes and weights of three-point quadrature on (0, 1).
+GAUSS_LEGENDRE = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))
 
 
 class MotionSample(NamedTuple):
-    """Position [m] and velocity [m/s] at an instant of a sampling interval."""
+    """Position and velocity of the real mechanism at one instant."""
 
-    position: Float[Array, "*batch"]
-    velocity: Float[Array, "*batch"]
+    position: Float[Array, "*batch"]  # [m]
+    velocity: Float[Array, "*batch"]  # [m/s]
 
 
 class SamplingInterval(NamedTuple):
     """Motion of the real mechanism from one tick to the next."""
 
-    sample: MotionSample  # where the force is sampled
-    start: Any  # right limit at the interval's start; None for loops that use the samples alone
-    end: Any  # left limit at its end; None likewise
-    interval_inputs: (
-        IntervalInputs | None
-    )  # input of the exact motion in between; None for loops that do not use it
+    sample: MotionSample  # motion at the instant at which the force is sampled
+    # motion at the interval's start (right limit) and end (left limit); None if only the sample is used
+    start: Any
+    end: Any
+    # inputs of the exact motion between the samples; None if the motion is not divided into cells
+    interval_inputs: IntervalInputs | None
 
 
 class PlantSignals(NamedTuple):
-    """Contact in a sampling interval, without the effects of the sensors."""
+    """Force of the real contact in a sampling interval, without the effects of the sensors."""
 
     force: Float[Array, "*batch"]  # contact force at the sampling instant [N]
     # work done on the mechanism and work returned by it [J]; None unless energies are recorded
-    works: tuple[Array, Array] | None
-    # peak force in the interval [N]; None unless the force has corners between samples
+    work: tuple[Array, Array] | None
+    # peak force in the interval [N]; None if it follows from the samples
     peak: Float[Array, "*batch"] | None
-    # time with a force since the previous sample [periods]; None if touching samples are counted instead
-    touched: Float[Array, "*batch"] | None
+    # duration of contact since the previous sample [periods]; None if samples in contact are counted instead
+    contact_time: Float[Array, "*batch"] | None
 
 
 class IntervalContact(NamedTuple):
-    """Result of the contact in a sampling interval."""
+    """Real contact in a sampling interval: forces, sensor readings, and state of the contact law."""
 
-    plant_signals: PlantSignals  # contact without the effects of the sensors
-    # reading of a lagging force sensor at its sampling instant [N]; None without lag
+    plant_signals: PlantSignals  # force without the effects of the sensors
+    # output of the force sensor's lag at the sampling instant [N]; None for a sensor without lag
     reading: Float[Array, "*batch"] | None
-    lagged: Array  # reading of a lagging force sensor at the interval's end [N]
-    last: "ContactSample"  # the sample of the contact
-    # time with a force after the sample [periods]; None if touching samples are counted instead
-    touched: Float[Array, "*batch"] | None
+    lagged: Array  # output of the force sensor's lag at the interval's end [N]
+    last: "ContactSample"  # contact at the sampling instant
+    # duration of contact after the sample [periods]; None if samples in contact are counted instead
+    contact_time: Float[Array, "*batch"] | None
     law: tuple[Array, ...]  # state of the contact law at the interval's end
 
 
 class Surfaces(NamedTuple):
-    """Contact law at one surface or two."""
+    """Contact law, its parameters and its state at one surface or two opposite surfaces."""
 
-    law: ContactLaw  # the contact law
-    parameters: ContactParameters  # its parameters
-    state: tuple[Any, ...]  # its state
+    law: ContactLaw  # contact law
+    parameters: ContactParameters  # parameters of the contact law
+    state: tuple[Any, ...]  # state of the contact law
     clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
     def force(self, motion: MotionSample) -> tuple[Array, tuple[Any, ...]]:
-        """Return the signed force [N] and the law's next state."""
+        """Return the signed contact force [N] at this motion, and the contact law's next state."""
         return compute_two_sided_force(
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
 
-    def after(self, start: MotionSample, end: MotionSample, duration: Array, s: Any = 1) -> "Surfaces":
-        """Return the surfaces with the law's state at the fraction `s` of a smooth section of motion.
+    def advance(self, start: MotionSample, end: MotionSample, duration: Array, s: Any = 1) -> "Surfaces":
+        """Return a copy with the contact law's state after part of a smooth section of motion.
 
-        `self` has the state at the section's start; the section takes `duration` [s].
+        Args:
+            start: Motion at the section's start, to which the state of `self` belongs.
+            end: Motion at the section's end.
+            duration: Duration of the section [s].
+            s: Fraction of the section, from 0 to 1, after which the state is returned.
         """
         if not self.law.remembers:
             return self
@@ -99,7 +107,7 @@ class Surfaces(NamedTuple):
         return self._replace(state=state)
 
     def side(self, start: MotionSample, end: MotionSample) -> tuple[Array, Array]:
-        """Return side (1, -1, or 0 for none) and position [m] of the surface that a section touches."""
+        """Return side (1 or -1; 0 if none) and position [m] of the surface touched in a section of motion."""
         signed = deflection(start.position, self.clearance)
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
         return side, jnp.zeros_like(side) if self.clearance is None else jnp.where(
@@ -107,7 +115,7 @@ class Surfaces(NamedTuple):
         )
 
     def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
-        """Return a sample of the contact, with known force [N]."""
+        """Return the contact at this motion, given the contact force [N]."""
         if self.clearance is None:
             edge = self.law.edge(self.parameters, motion.velocity)
             return ContactSample(motion.position, force, edge, jnp.ones_like(edge))
@@ -119,32 +127,32 @@ class Surfaces(NamedTuple):
 
 
 class ContactSample(NamedTuple):
-    """Sample of the contact."""
+    """Real contact at one instant, at the nearer of the surfaces."""
 
-    distance: Float[Array, "*batch"]  # penetration of the nearer surface [m], negative outside
-    force: Float[Array, "*batch"]  # [N]
-    edge: Float[Array, "*batch"]  # limit of the force at that surface, from inside [N]
-    side: Float[Array, "*batch"]  # side of that surface, 1 or -1
+    distance: Float[Array, "*batch"]  # penetration of the nearer surface [m]; negative without contact
+    force: Float[Array, "*batch"]  # contact force [N]
+    edge: Float[Array, "*batch"]  # limit of the force as the penetration goes to 0 [N]
+    side: Float[Array, "*batch"]  # side of the nearer surface, 1 or -1
 
     def position(self, clearance: Array | None) -> Array:
-        """Return the position of the mechanism [m]."""
+        """Return the position of the mechanism [m]; `clearance` is the distance between two surfaces [m]."""
         if clearance is None:
             return self.distance
-        # The initial sample is far from both surfaces.
+        # The sample before a run (`no_contact`) may lie beyond the middle between the surfaces.
         distance = jnp.maximum(self.distance, -clearance / 2)
         return jnp.where(self.side > 0, distance, -clearance - distance)
 
 
 def no_contact(like: Array) -> ContactSample:
-    """Return a sample far from any surface."""
+    """Return a contact sample without contact, in the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
 
 def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and returned by it between two samples.
+    """Return the work [J] done on the mechanism and the work returned by it between two samples.
 
-    It is exact if the force is linear in the penetration.
+    The result is exact if the force is linear in the penetration.
     """
     depth_0 = jnp.where(before.distance > 0, before.distance, 0)
     depth_1 = jnp.where(now.distance > 0, now.distance, 0)
@@ -158,19 +166,19 @@ def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Arr
 def compute_work_along(
     surfaces: Surfaces, start: MotionSample, end: MotionSample, duration: Array
 ) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and returned by it along a smooth section of motion.
+    """Return the work [J] done on the mechanism and the work returned by it in a smooth section of motion.
 
-    Work of a pulling force while the penetration decreases is subtracted from the work returned.
+    If the force pulls while the penetration decreases, its work is subtracted from the work returned.
     """
     contact = _find_section_contact(surfaces, start, end, duration)
 
     def inward(s):
         return contact.side * interpolate_motion(start, end, duration, s).velocity
 
-    since, until = _find_positive_interval(inward, duration)
-    turn = jnp.clip(jnp.where(until < 1, until, since), contact.first, contact.last)
+    inward_begin, inward_end = _find_positive_interval(inward, duration)
+    turn = jnp.clip(jnp.where(inward_end < 1, inward_end, inward_begin), contact.begin, contact.end)
     done = returned = jnp.zeros_like(duration)
-    for a, b in ((contact.first, turn), (turn, contact.last)):
+    for a, b in ((contact.begin, turn), (turn, contact.end)):
         for node, weight in GAUSS_LEGENDRE:
             motion, force = _force_along(surfaces, start, end, duration, a + (b - a) * node)
             work = force * motion.velocity * (weight * (b - a) * duration)
@@ -185,11 +193,11 @@ def largest_force(
 ) -> Float[Array, "*batch"]:
     """Return the largest |force| [N] within a sampling interval.
 
-    It is the force at an end, or near the vertex of the parabola through both ends and the middle.
+    Candidates are both ends, and the vertex of the parabola through the forces at the ends and in the middle.
     """
 
     def magnitude(motion, s):
-        return jnp.abs(surfaces.after(start, end, duration, s).force(motion)[0])
+        return jnp.abs(surfaces.advance(start, end, duration, s).force(motion)[0])
 
     first, last = magnitude(start, 0), magnitude(end, 1)
     half = magnitude(interpolate_motion(start, end, duration, 0.5), 0.5)
@@ -204,40 +212,43 @@ def apply_sensor_lag(
     surfaces: Surfaces,
     reading: Float[Array, "*batch"],
     interval: SamplingInterval,
-    until: Array,
+    sample_time: Array,
     duration: Array,
     time_constant: Array,
 ) -> tuple[Array, Array]:
-    """Return the readings [N] of a lagging sensor at an interval's sample and at its end.
+    """Return the output [N] of a force sensor's lag at the sampling instant and at the interval's end.
 
     Args:
-        surfaces: Contact law at the interval's start.
-        reading: Reading at the interval's start [N].
+        surfaces: Contact law, with the state at the interval's start.
+        reading: Output of the lag at the interval's start [N].
         interval: Motion of the mechanism.
-        until: Time of the sample after the interval's start [s].
+        sample_time: Time from the interval's start to the sampling instant [s].
         duration: Duration of the interval [s].
-        time_constant: Time constant of the sensor [s].
+        time_constant: Time constant of the lag [s].
     """
 
     def follow(reading, interval):
-        sample = _apply_lag_along(surfaces, reading, interval.start, interval.sample, until, time_constant)
-        rest = duration - until
-        loaded = surfaces.after(interval.start, interval.sample, until)
-        return sample, _apply_lag_along(loaded, sample, interval.sample, interval.end, rest, time_constant)
+        sample = _apply_lag_along(
+            surfaces, reading, interval.start, interval.sample, sample_time, time_constant
+        )
+        rest = duration - sample_time
+        at_sample = surfaces.advance(interval.start, interval.sample, sample_time)
+        return sample, _apply_lag_along(at_sample, sample, interval.sample, interval.end, rest, time_constant)
 
     def fade(reading, interval):
-        # The same operations as in `follow`: a lane's bits must not depend on the contacts of other lanes.
-        sample = reading * lag_decay(until, time_constant)
-        return sample, sample * lag_decay(duration - until, time_constant)
+        # These are the operations of `follow` without a force, in the same order: the rounding of a lane must
+        # not depend on whether other lanes of the batch are in contact.
+        sample = reading * lag_decay(sample_time, time_constant)
+        return sample, sample * lag_decay(duration - sample_time, time_constant)
 
-    # Most of the time no lane touches.
+    # In most intervals no lane is in contact, and the force is 0.
     motions = interval.sample, interval.start, interval.end
     outside = [deflection(motion.position, surfaces.clearance) == 0 for motion in motions]
     return lax.cond(jnp.all(outside[0] & outside[1] & outside[2]), fade, follow, reading, interval)
 
 
 def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, s: Any) -> MotionSample:
-    """Return position and velocity at the fraction `s` of a section, from its cubic (Hermite)."""
+    """Interpolate the motion at the fraction `s` of a section by a cubic Hermite polynomial."""
     v_0, v_1 = start.velocity * duration, end.velocity * duration
     moved = end.position - start.position
     bend, twist = 3 * moved - 2 * v_0 - v_1, v_0 + v_1 - 2 * moved
@@ -248,10 +259,10 @@ def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, 
 
 
 def _find_turning_point(start, end, duration, side):
-    """Return the fraction of a section at which an inward motion reverses; 1 if it does not."""
+    """Return the fraction of a section at which motion into the surface reverses; 1 if it does not."""
     first, last = side * start.velocity, side * end.velocity
     turns = (first > 0) & (last < 0)
-    # first + slope s + bend s^2 is the velocity of the section's cubic, times the duration.
+    # The inward velocity, times the duration, is first + slope s + bend s^2 at the fraction s.
     moved = side * (end.position - start.position)
     first, last = first * duration, last * duration
     slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
@@ -260,27 +271,28 @@ def _find_turning_point(start, end, duration, side):
 
 
 def _force_along(surfaces, start, end, duration, s):
-    """Return motion and force [N] at the fraction `s` of a section, at whose start `surfaces` hold."""
+    """Return motion and contact force [N] at the fraction `s` of a section."""
     motion = interpolate_motion(start, end, duration, s)
-    force, _ = surfaces.after(start, end, duration, s).force(motion)
+    force, _ = surfaces.advance(start, end, duration, s).force(motion)
     return motion, force
 
 
 class _SectionContact(NamedTuple):
-    """Contact during a section of motion."""
+    """Begin and end of the contact in a section of motion."""
 
-    touches: Array  # whether there is contact
+    touches: Array  # whether there is contact in the section
     side: Array  # side of the surface, 1 or -1
-    first: Array  # fraction of the section at which it begins
-    last: Array  # fraction of the section at which it ends
-    at_surface: tuple[Array, Array]  # whether it begins, and whether it ends, at the surface
+    begin: Array  # fraction of the section at which the contact begins
+    end: Array  # fraction of the section at which the contact ends
+    # whether the contact begins, and whether it ends, within the section at zero penetration
+    at_surface: tuple[Array, Array]
 
 
 def _find_section_contact(surfaces, start, end, duration):
-    """Return the contact during a section.
+    """Return begin and end of the contact in a section.
 
-    Both of its instants are roots on the section's cubic: of the penetration, or of the law's `hold`, which
-    changes sign where the force vanishes before the penetration does.
+    The contact lasts while both the penetration and the contact law's `hold` are positive. The `hold` becomes
+    negative if the force vanishes before the penetration does.
     """
     side, surface = surfaces.side(start, end)
 
@@ -289,27 +301,27 @@ def _find_section_contact(surfaces, start, end, duration):
 
     def hold(s):
         motion = interpolate_motion(start, end, duration, s)
-        state = surfaces.after(start, end, duration, s).state
+        state = surfaces.advance(start, end, duration, s).state
         return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
 
-    enters, leaves = _find_positive_interval(depth, duration)
-    catches, lets_go = _find_positive_interval(hold, duration)
-    first = jnp.where(enters >= catches, enters, catches)
-    last = jnp.where(leaves <= lets_go, leaves, lets_go)
-    touches = (side != 0) & (first < last)
-    begins_at_surface = (enters > 0) & (enters >= catches)
-    ends_at_surface = (leaves < 1) & (leaves <= lets_go)
+    depth_begin, depth_end = _find_positive_interval(depth, duration)
+    hold_begin, hold_end = _find_positive_interval(hold, duration)
+    contact_begin = jnp.where(depth_begin >= hold_begin, depth_begin, hold_begin)
+    contact_end = jnp.where(depth_end <= hold_end, depth_end, hold_end)
+    touches = (side != 0) & (contact_begin < contact_end)
+    begins_at_surface = (depth_begin > 0) & (depth_begin >= hold_begin)
+    ends_at_surface = (depth_end < 1) & (depth_end <= hold_end)
     return _SectionContact(
         touches,
         side,
-        jnp.where(touches, first, 0),
-        jnp.where(touches, last, 0),
+        jnp.where(touches, contact_begin, 0),
+        jnp.where(touches, contact_end, 0),
         (begins_at_surface, ends_at_surface),
     )
 
 
 def _find_positive_interval(function, like):
-    """Return the bounds in [0, 1] between which a function is positive, if it changes sign at most once."""
+    """Return the subinterval of [0, 1] in which a function is positive; it may change sign at most once."""
     zeros, ones = jnp.zeros_like(like), jnp.ones_like(like)
     at_0, at_1 = function(zeros), function(ones)
     rises, falls = (at_0 <= 0) & (at_1 > 0), (at_0 > 0) & (at_1 <= 0)
@@ -317,7 +329,7 @@ def _find_positive_interval(function, like):
     root = jnp.where(rises | falls, -at_0 / chord, 0)
     for _ in range(NEWTON_STEPS):
         value, slope = jax.jvp(function, (root,), (ones,))
-        # A slope of the wrong sign would lead away from the root.
+        # If the slope has the wrong sign, a Newton step would lead away from the root.
         slope = jnp.where(slope * chord > 0, slope, chord)
         root = jnp.clip(root - value / slope, 0, 1)
     never = (at_0 <= 0) & (at_1 <= 0)
@@ -325,20 +337,20 @@ def _find_positive_interval(function, like):
 
 
 def _apply_lag_along(surfaces, reading, start, end, duration, time_constant):
-    """Return the lagging reading [N] after a smooth section of motion.
+    """Return the output [N] of the force sensor's lag after a smooth section of motion.
 
-    Between the begin and the end of contact, the force is approximated by parabolas, whose lag is exact.
+    During contact the force is approximated by parabolas. The lag's response to a parabola is exact.
     """
     contact = _find_section_contact(surfaces, start, end, duration)
-    span = contact.last - contact.first
+    span = contact.end - contact.begin
     forces = []
     for i in range(2 * PARABOLAS_PER_SECTION + 1):
-        s = contact.first + span * (i / (2 * PARABOLAS_PER_SECTION))
+        s = contact.begin + span * (i / (2 * PARABOLAS_PER_SECTION))
         motion, force = _force_along(surfaces, start, end, duration, s)
         if i in (0, 2 * PARABOLAS_PER_SECTION):
-            # At the surface, the force is its limit from inside.
+            # At zero penetration, use the limit of the force as the penetration goes to 0 from above.
             edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)
             force = jnp.where(contact.at_surface[i > 0], contact.side * edge, force)
         forces.append(jnp.where(contact.touches, force, 0))
-    idle, touching, free = (part * duration for part in (contact.first, span, 1 - contact.last))
+    idle, touching, free = (part * duration for part in (contact.begin, span, 1 - contact.end))
     return apply_lag(reading, idle, touching, free, forces, time_constant)

@@ -1,9 +1,10 @@
-"""Real contact along the exact motion of a sampling interval: lagged reading, work, peak force, duration.
+"""Real contact in one sampling interval, from the exact motion: sensor lag, work, peak force, duration.
 
-Each cell (`jaxhil.simulation.cells`) is divided where the motion reverses, into pieces of monotone motion. A
-piece is divided at the surface, where the law's slope changes, and where the force vanishes. On each
-resulting span the force is one smooth formula, which Gauss-Legendre quadrature integrates. All cells are
-computed in parallel; only the state of a law with memory passes from one cell to the next.
+Each cell (`jaxhil.simulation.cells`) is divided into pieces of monotone motion, at the instants at which the
+motion reverses. A piece is divided into spans: at the surface, where the slope of the contact law changes,
+and where the force vanishes. In each span the force is a smooth function, which Gauss-Legendre quadrature
+integrates. All cells are computed in parallel. Only the state of a contact law with memory is passed from
+cell to cell.
 """
 
 import functools
@@ -32,52 +33,54 @@ from jaxhil.simulation.roots import find_positive_part, find_sign_change
 class QuadratureRule(NamedTuple):
     """Gauss-Legendre quadrature on (0, 1)."""
 
-    nodes: np.ndarray
-    weights: np.ndarray
+    nodes: np.ndarray  # arguments in (0, 1)
+    weights: np.ndarray  # weights of the function values at the nodes
 
-    def places(self, dtype: Any) -> np.ndarray:
-        """Return the nodes, between two points close to the ends.
+    def nodes_and_ends(self, dtype: Any) -> np.ndarray:
+        """Return the nodes, preceded by a point just above 0 and followed by a point just below 1.
 
-        At these two points the force has its limit from inside.
+        At the two added points, a force that jumps at the ends of (0, 1) has its limits from inside.
         """
         inside = np.finfo(dtype).eps ** 0.5
         return np.concatenate([[inside], self.nodes, [1 - inside]]).astype(dtype)
 
 
 def _build_quadrature(number: int) -> QuadratureRule:
-    """Return a rule of `number` nodes for integrands with a power of the penetration at an end."""
+    """Return a rule of `number` nodes for forces that begin or end as a power of the penetration."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
-    # The substitution p -> 3 p^2 - 2 p^3 is flat at both ends, so that powers of the penetration are smooth.
+    # The slope of the substitution p -> 3 p^2 - 2 p^3 is 0 at both ends, so that powers of the penetration
+    # become smooth functions.
     return QuadratureRule(unit**2 * (3 - 2 * unit), weights * 3 * unit * (1 - unit))
 
 
-QUADRATURE_RULES = {True: _build_quadrature(12), False: _build_quadrature(16)}  # True: for short cells
-_RESULT_COUNT = 7  # number of results of a contact, see `_sum_surfaces`
-_SUMMED_AXES = (0, 1, 2, 3)  # axes: nodes, levels, pieces, cells
+# Key: whether the cells are short, with a series of low degree.
+QUADRATURE_RULES = {True: _build_quadrature(12), False: _build_quadrature(16)}
+_RESULT_COUNT = 7  # number of results that `_sum_surfaces` returns
+_SUMMED_AXES = (0, 1, 2, 3)  # array axes: nodes of a span, spans of a piece, pieces of a cell, cells
 
 
 class CellContact(NamedTuple):
-    """Contact in a sampling interval."""
+    """Real contact in a sampling interval: sensor lag, work, peak force, duration, state of the law."""
 
-    reading: Float[Array, "*batch"]  # reading of a lagging force sensor at the sample [N]
-    lagged: Float[Array, "*batch"]  # reading of a lagging force sensor at the interval's end [N]
-    works: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
+    reading: Float[Array, "*batch"]  # output of the force sensor's lag at the sampling instant [N]
+    lagged: Float[Array, "*batch"]  # output of the force sensor's lag at the interval's end [N]
+    work: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
     peak: Float[Array, "*batch"]  # largest |force| [N]
-    touched: tuple[Array, Array]  # time with a force, up to the sample and after it [periods]
-    at_sample: tuple[Any, ...]  # state of the contact law where the force is sampled
+    contact_time: tuple[Array, Array]  # duration of contact, before and after the sampling instant [periods]
+    at_sample: tuple[Any, ...]  # state of the contact law at the sampling instant
     at_end: tuple[Any, ...]  # state of the contact law at the interval's end
 
 
 class ContactSurfaces(NamedTuple):
-    """Contact law at one surface or two."""
+    """Contact law and its parameters at one surface or two opposite surfaces."""
 
-    law: ContactLaw
-    parameters: ContactParameters
+    law: ContactLaw  # contact law
+    parameters: ContactParameters  # parameters of the contact law
     clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
 
-# Arrays per lane are broadcast against those per cell, node and span.
+# Arrays with one value per lane are broadcast against arrays with a value per cell, node and span.
 @jax.numpy_rank_promotion("allow")
 def contact_in_cells(
     touch: ContactSurfaces,
@@ -88,34 +91,34 @@ def contact_in_cells(
     lagged: Float[Array, "*batch"],
     time_constant: Float[Array, "*batch"] | None,
 ) -> CellContact:
-    """Compute the contact of a sampling interval.
+    """Compute the real contact in a sampling interval.
 
     Args:
         touch: Contact law and surfaces.
-        state: State of the law at the interval's start.
+        state: State of the contact law at the interval's start.
         cells: Cells of the interval.
-        series: Motion in the cells, from `power_series`.
+        series: Power series of the position [m] in each cell, from `power_series`.
         period: Control period [s].
-        lagged: Reading of the lagging sensor at the interval's start [N].
-        time_constant: Lag of the force sensor [s]; None without lag.
+        lagged: Output of the force sensor's lag at the interval's start [N].
+        time_constant: Time constant of the force sensor's lag [s]; None for a sensor without lag.
     """
     rates = _sensor_rates(cells, period, time_constant)
 
-    # Each branch returns distinct arrays: without optimisation, the compiler confuses results that share one.
+    # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
-        """Return the contact's results and the law's states at the sample and at the end."""
+        """Return the results of the contact, and the contact law's states at the sample and at the end."""
         pieces = split_at_reversals(build_cell_motion(series, cells.length))
         states, at_sample, at_end = _compute_law_states(touch, state, pieces, period)
         parts = [_compute_side_contact(touch, states, pieces, side, period, rates) for side in _sides(touch)]
         return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
-        """Return the same without contact."""
+        """Return the results, all 0, and the contact law's states for an interval without contact."""
         fresh = touch.law.init(jnp.zeros_like(lagged))
         numbers = jnp.zeros((_RESULT_COUNT, *lagged.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
 
-    # In most intervals no lane touches.
+    # In most intervals no lane is in contact.
     numbers, states = lax.cond(_may_touch(touch, cells, series), touches, free, state)
     *readings, done, returned, before, after, peak = numbers
     sample, end = _decay_reading(lagged, rates, readings)
@@ -130,7 +133,7 @@ def compute_jump_work(
     before: Float[Array, "*batch"],
     now: Float[Array, "*batch"],
 ) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and returned by it in a jump between two positions."""
+    """Return the work [J] done on the mechanism and the work returned by it if the position jumps."""
     ones = jnp.ones_like(before)
     path = build_cell_motion(jnp.stack([before, now - before])[:, None], ones[None])
     pieces = split_at(path, jnp.stack([0 * ones, ones])[:, None])
@@ -138,35 +141,35 @@ def compute_jump_work(
     parts = [
         _compute_side_contact(touch, states, pieces, side, ones, None, still=True) for side in _sides(touch)
     ]
-    done, returned = (sum((part.works[i] for part in parts), 0 * ones) for i in (0, 1))
+    done, returned = (sum((part.work[i] for part in parts), 0 * ones) for i in (0, 1))
     return done, returned
 
 
 class _SurfaceContribution(NamedTuple):
-    """Contribution of the contact at one surface; all but the readings are summed over the cells."""
+    """Results of the contact at one surface in a sampling interval."""
 
-    readings: tuple[Array, Array]  # contribution to a lagging reading at the end of either part [N]
-    works: tuple[Array, Array]  # [J]
-    peak: Array  # [N]
-    touched: tuple[Array, Array]  # [periods]
+    # addition to the output of the force sensor's lag at the sampling instant and at the interval's end [N]
+    readings: tuple[Array, Array]
+    work: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
+    peak: Array  # largest |force| [N]
+    contact_time: tuple[Array, Array]  # duration of contact, before and after the sampling instant [periods]
 
 
 def _sum_surfaces(parts: list[_SurfaceContribution]) -> Array:
-    """Return the contact's results over all surfaces, (numbers, *batch); the peak force is the last."""
-    sums = [jnp.stack([*part.readings, *part.works, *part.touched]) for part in parts]
+    """Combine the results of all surfaces in one array, (results, *batch), with the peak force last."""
+    sums = [jnp.stack([*part.readings, *part.work, *part.contact_time]) for part in parts]
     peak = functools.reduce(jnp.maximum, [part.peak for part in parts])
     return jnp.concatenate([functools.reduce(jnp.add, sums), peak[None]])
 
 
 def _sides(touch):
-    """Return the sides of the surfaces."""
     return (1,) if touch.clearance is None else (1, -1)
 
 
 def _compute_law_states(touch, state, pieces, period):
-    """Return the law's state at the start of each piece, at the sample and at the end.
+    """Return the contact law's states at the start of each piece, at the sample and at the interval's end.
 
-    States at the pieces' starts are (pieces of a cell, cells, *batch).
+    The states at the starts of the pieces have the shape (pieces of a cell, cells, *batch).
     """
     cells = pieces.path.length.shape[0]
     if not touch.law.remembers:
@@ -189,15 +192,16 @@ def _compute_law_states(touch, state, pieces, period):
 
 
 class _SensorRates(NamedTuple):
-    """Lagging sensor in a lane's cells."""
+    """Decay of the force sensor's lag in a sampling interval."""
 
-    fades: tuple[Array, Array]  # duration of either part [time constants]
-    rate: Array  # time constants per period
+    # durations of the parts before and after the sampling instant [time constants of the lag]
+    part_durations: tuple[Array, Array]
+    rate: Array  # control period over the lag's time constant [1]
     rest: Array  # time from a cell's end to the end of its part [periods]
 
 
 def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
-    """Return the lagging sensor in the cells, or None without lag."""
+    """Return the decay of the force sensor's lag; None for a sensor without lag."""
     if time_constant is None:
         return None
     rate = period / bound_time_constant(time_constant, period)
@@ -208,15 +212,15 @@ def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
 
 
 def _decay_reading(lagged, rates, readings):
-    """Return the lagging reading at the sample and at the interval's end [N]."""
+    """Return the output [N] of the force sensor's lag at the sample and at the interval's end."""
     if rates is None:
         return lagged, lagged
-    sample = lagged * jnp.exp(-rates.fades[0]) + readings[0]
-    return sample, sample * jnp.exp(-rates.fades[1]) + readings[1]
+    sample = lagged * jnp.exp(-rates.part_durations[0]) + readings[0]
+    return sample, sample * jnp.exp(-rates.part_durations[1]) + readings[1]
 
 
 def _may_touch(touch, cells, series):
-    """Return whether any lane may touch, according to a bound on the series."""
+    """Return whether any lane may be in contact, from a bound on the position in each cell."""
     reach = horner(jnp.abs(series.at[0].set(0)), cells.length)
     may = series[0] + reach > 0
     if touch.clearance is not None:
@@ -225,7 +229,7 @@ def _may_touch(touch, cells, series):
 
 
 def _compute_side_contact(touch, states, pieces, side, period, rates, still=False) -> _SurfaceContribution:
-    """Return the contact at one side's surface; a `still` motion has zero velocity for the law."""
+    """Compute the contact at the surface on one side; with `still`, the contact law gets zero velocity."""
     law, parameters, path = touch.law, touch.parameters, pieces.path
     inward = side * pieces.way
     surface = 0.0 if side > 0 else touch.clearance
@@ -239,7 +243,8 @@ def _compute_side_contact(touch, states, pieces, side, period, rates, still=Fals
         speed = side * velocity_at(path, s) / period
         if not law.jumps:
             return speed
-        # The law depends on the sign of the velocity, which is uncertain by rounding at a reversal.
+        # The force jumps with the sign of the velocity. Near a reversal, rounding can change this sign, so
+        # the sign of the piece is used.
         return jnp.where(speed * inward > 0, speed, inward * jnp.finfo(speed.dtype).tiny)
 
     def height(data, s):
@@ -264,47 +269,50 @@ def _compute_side_contact(touch, states, pieces, side, period, rates, still=Fals
 
     shape = (-1, *[1] * width.ndim)
     rule = QUADRATURE_RULES[len(path.position) <= SHORT_CELL_DEGREE + 1]
-    ends_and_nodes = rule.places(width.dtype)
-    places = begin + width * ends_and_nodes.reshape(shape)
-    forces = force(places)
-    inside, nodes = forces[1:-1], places[1:-1]
+    ends_and_nodes = rule.nodes_and_ends(width.dtype)
+    arguments = begin + width * ends_and_nodes.reshape(shape)
+    forces = force(arguments)
+    inside, nodes = forces[1:-1], arguments[1:-1]
     impulses = inside * rule.weights.reshape(shape).astype(width.dtype) * (width * path.length)
     work = side * impulses * velocity_at(path, nodes)
     peak = jnp.where(width > 0, _find_largest_force(force, ends_and_nodes, begin, width, jnp.abs(forces)), 0)
     return _SurfaceContribution(
         readings=_lag_contributions(rates, path, side * impulses, nodes),
-        works=(
+        work=(
             jnp.sum(jnp.where(inward > 0, work, 0), axis=_SUMMED_AXES),
             -jnp.sum(jnp.where(inward > 0, 0, work), axis=_SUMMED_AXES),
         ),
         peak=jnp.max(peak, axis=_SUMMED_AXES[:-1]),
-        touched=_sum_by_part(jnp.sum(width * path.length, axis=(0, 1))),
+        contact_time=_sum_by_part(jnp.sum(width * path.length, axis=(0, 1))),
     )
 
 
-def _lag_contributions(rates, path, impulses, places):
-    """Return the contributions [N] of impulses [N periods] to a lagging reading at the end of either part."""
+def _lag_contributions(rates, path, impulses, arguments):
+    """Return what impulses [N periods] at relative times in the cells add to the force sensor's lag [N].
+
+    The two results are for the sampling instant and for the interval's end.
+    """
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
         return zeros, zeros
-    ago = rates.rest + (1 - places) * path.length
-    left = jnp.sum(impulses * jnp.exp(-ago * rates.rate) * rates.rate, axis=(0, 1, 2))
-    return _sum_by_part(left)
+    age = rates.rest + (1 - arguments) * path.length
+    remaining = jnp.sum(impulses * jnp.exp(-age * rates.rate) * rates.rate, axis=(0, 1, 2))
+    return _sum_by_part(remaining)
 
 
 def _sum_by_part(values):
-    """Return the sums over the cells of either part."""
+    """Return the sums over the cells before and over the cells after the sampling instant."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 
 
-def _find_largest_force(force, places, begin, width, magnitudes):
-    """Return the largest |force| [N] of a span: at a node, or at the vertex through three nodes."""
-    middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(places) - 2)[None]
+def _find_largest_force(force, arguments, begin, width, magnitudes):
+    """Return the largest |force| [N] in a span, at a node or at the vertex of a parabola near this node."""
+    middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(arguments) - 2)[None]
 
     def at(offset):
         return jnp.take_along_axis(magnitudes, middle + offset, axis=0)[0], jnp.asarray(
-            places, magnitudes.dtype
+            arguments, magnitudes.dtype
         )[middle[0] + offset]
 
     (low, a), (peak, b), (high, c) = at(-1), at(0), at(1)

@@ -1,7 +1,7 @@
-"""Plot of a run: force and position over time for each contact, beside the ideal contacts.
+"""Plot of a run: force and position against time for each contact, together with the ideal contact.
 
-The plots do not use pyplot or the caller's settings of matplotlib: nothing is shown, no figure stays open,
-and equal data gives equal files.
+The plots use neither pyplot nor the caller's settings of matplotlib. Therefore no window opens, no figure
+stays in memory, and equal data results in equal files.
 """
 
 import os
@@ -22,7 +22,7 @@ from jaxhil.errors import to_one_line
 from jaxhil.files import write_atomically
 from jaxhil.simulation.motion_curves import Curve, RunMotion
 
-# Colours of Okabe and Ito, distinct for colour-blind readers; line styles distinguish curves in print.
+# Colours of Okabe and Ito, distinct for colour-blind readers. Line styles help in black-and-white print.
 BLACK, ORANGE, SKY_BLUE, GREEN, BLUE, VERMILION = (
     "#000000",
     "#E69F00",
@@ -45,27 +45,30 @@ CURVE_LABELS = {
     "tuned": "tuned",
     "rig": "on the rig",
 }
-MAX_PANELS = 4  # greatest number of contacts side by side
+MAX_PANELS = 4  # greatest number of contacts in one plot, side by side
 
 
 @matplotlib.style.context("default")
-def plot_contacts(pieces: Sequence[RunMotion], title: str, sensors: str | None = None) -> Figure:
-    """Draw force and position over time for each contact, beside the ideal contact.
+def plot_contacts(motions: Sequence[RunMotion], title: str, sensors: str | None = None) -> Figure:
+    """Draw force and position against time for each contact, together with the ideal contact.
 
-    `sensors` is the name of the curve whose measured force and position are drawn too.
+    Args:
+        motions: Motion of each contact; the first `MAX_PANELS` are drawn.
+        title: Title of the plot.
+        sensors: Name of the curve for which the sensor readings are drawn too; None for no readings.
     """
-    shown = list(pieces[:MAX_PANELS])
-    if len(pieces) > len(shown):
-        title += f" (the first {len(shown)} of {len(pieces)} contacts)"
-    # There are two lines of title above the axes, and the legend below them.
+    shown = list(motions[:MAX_PANELS])
+    if len(motions) > len(shown):
+        title += f" (the first {len(shown)} of {len(motions)} contacts)"
+    # The margins leave space for two lines of panel titles above the axes and for the legend below them.
     width = max(7.0, 3.6 * len(shown) + 1)
     figure = create_figure((width, 6.4), title, above=1.0, below=0.95)
-    figure.subplots_adjust(left=1.1 / width)  # The label of the position takes two lines.
+    figure.subplots_adjust(left=1.1 / width)  # The label of the position axis has two lines.
     grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
-    for column, piece in enumerate(shown):
+    for column, motion in enumerate(shown):
         force, position = grid[0, column], grid[1, column]
         end = 0.0
-        for name, curve in piece.curves.items():
+        for name, curve in motion.curves.items():
             colour, line, width = CURVE_STYLES[name]
             style = {"color": colour, "linestyle": line, "linewidth": width, "label": CURVE_LABELS[name]}
             if name == "in space":
@@ -77,12 +80,12 @@ def plot_contacts(pieces: Sequence[RunMotion], title: str, sensors: str | None =
                 force.plot(1e3 * curve.time, curve.force_measured, label="measured", **extra)
                 position.plot(1e3 * curve.time, 1e3 * curve.position_measured, label="measured", **extra)
             end = max(end, _last_force_time(curve))
-        force.set_title(_panel_title(piece), fontsize=10)
+        force.set_title(_panel_title(motion), fontsize=10)
         force.set_xlim(-20, 1e3 * end + 20)
         position.set_xlabel("time since first touch [ms]")
-        for surface in piece.surfaces:
+        for surface in motion.surfaces:
             position.axhline(1e3 * surface, color=BLACK, linewidth=0.6)
-        _limit_position(position, piece, end)
+        _limit_position(position, motion, end)
         for axes in (force, position):
             finish_axes(axes, None)
     grid[0, 0].set_ylabel("force on the model [N]")
@@ -95,9 +98,16 @@ def plot_contacts(pieces: Sequence[RunMotion], title: str, sensors: str | None =
 def create_figure(
     size: tuple[float | int, float | int], title: str, above: float = 0.55, below: float = 0.6
 ) -> Figure:
-    """Create a figure with margins [inches] above and below its axes.
+    """Create a figure with a title and with fixed margins around its axes.
 
-    Sizes of labels and titles are known; an automatic layout would draw everything twice.
+    Fixed margins are enough because the sizes of labels and titles are known. An automatic layout would draw
+    everything twice.
+
+    Args:
+        size: Width and height of the figure [inches].
+        title: Title, as plain text.
+        above: Margin above the axes [inches].
+        below: Margin below the axes [inches].
     """
     width, height = size
     figure = Figure(figsize=size)
@@ -105,13 +115,13 @@ def create_figure(
         left=0.9 / width, right=1 - 0.25 / width, bottom=below / height, top=1 - above / height,
         wspace=0.24, hspace=0.12,
     )  # fmt: skip
-    # The title is not a formula.
+    # Matplotlib would read text between two dollar signs as a formula.
     figure.suptitle(to_one_line(title, 120).replace("$", r"\$"), fontsize=12, y=1 - 0.12 / height, va="top")
     return figure
 
 
 def finish_axes(axes: Axes, legend: Any) -> None:
-    """Set grid, spines and legend of drawn axes; `legend` is the legend's location, or None for no legend."""
+    """Add grid and legend to axes with curves; `legend` is matplotlib's location, or None for no legend."""
     axes.grid(True, color="0.88", linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -123,7 +133,7 @@ def finish_axes(axes: Axes, legend: Any) -> None:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int | None = None) -> None:
-    """Draw the legend of one of the axes below all, by default in one row."""
+    """Draw the legend of `axes` at the bottom of the figure, by default in one row."""
     handles, labels = axes.get_legend_handles_labels()
     columns = columns or len(labels)
     figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize=9, frameon=False)
@@ -131,44 +141,44 @@ def legend_below(figure: Figure, axes: Axes, columns: int | None = None) -> None
 
 @matplotlib.style.context("default")
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure atomically and create the parent folders.
+    """Write a figure to a file atomically; create the parent folders.
 
-    Raise OSError if this is impossible or if the path exists and is not a regular file.
+    Raise OSError if the file cannot be written, or if the path exists and is not a regular file.
     """
     target, content = Path(path), BytesIO()
     target.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    # Dates and versions would make equal figures differ.
+    # Without these fields, a file would contain its date or the version of matplotlib.
     fields = {"CreationDate": None} if target.suffix.lower() == ".pdf" else {}
     fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
     fields = {"Software": None} if target.suffix.lower() == ".png" else fields
     with rc_context({"svg.hashsalt": "jaxhil"}), warnings.catch_warnings():
-        # Letters of the title that the font lacks are drawn as boxes.
+        # Characters of the title that the font does not have are drawn as boxes; this needs no warning.
         warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)
         figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
     write_atomically(target, content.getvalue())
 
 
-def _panel_title(piece: RunMotion) -> str:
-    """Return the contact's name and approach speed, with those curves' speeds that differ."""
-    speed = piece.curves["in space"].velocity
-    text = f"{piece.name}, entered at {1e3 * speed:.3g} mm/s"
-    for name, curve in piece.curves.items():
+def _panel_title(motion: RunMotion) -> str:
+    """Return the title of a contact's panel: name, approach speed, and curves with another approach speed."""
+    speed = motion.curves["in space"].velocity
+    text = f"{motion.name}, entered at {1e3 * speed:.3g} mm/s"
+    for name, curve in motion.curves.items():
         if abs(curve.velocity - speed) > 0.005 * speed:
             text += f"\n({name}: {1e3 * curve.velocity:.3g} mm/s)"
     return text
 
 
 def _last_force_time(curve: Curve) -> float:
-    """Return the time [s] at which the last force ends."""
-    pushed = np.flatnonzero(np.abs(curve.force) > 1e-3 * np.max(np.abs(curve.force), initial=0.0))
-    return float(curve.time[pushed[-1]]) if len(pushed) else float(curve.time[-1])
+    """Return the last time [s] at which a force acts."""
+    pushing = np.flatnonzero(np.abs(curve.force) > 1e-3 * np.max(np.abs(curve.force), initial=0.0))
+    return float(curve.time[pushing[-1]]) if len(pushing) else float(curve.time[-1])
 
 
-def _limit_position(axes: Axes, piece: RunMotion, end: float) -> None:
-    """Set the position axis to the values within the displayed time."""
+def _limit_position(axes: Axes, motion: RunMotion, end: float) -> None:
+    """Fit the position axis to the positions up to 20 ms after the time `end` [s]."""
     values = []
-    for curve in piece.curves.values():
+    for curve in motion.curves.values():
         within = curve.time <= end + 0.02
         values.append(1e3 * curve.position[within])
     positions = np.concatenate(values)

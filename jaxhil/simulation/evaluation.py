@@ -1,8 +1,11 @@
-"""Evaluation of batches of any size on all cores, for rigs that move along one axis or in six.
+"""Evaluation of batches of scenarios on all cores, for rigs with one axis or with six axes.
 
-Lanes are sorted and divided into tiles: by delay, since lanes with equal delays read their delay lines
-together, and by expected duration, since a tile ends with its slowest lane. Tiles are assigned to the devices
-in turn. Batches are padded to a few sizes, so that most calls reuse a compiled program.
+Each scenario of a batch is a lane. The lanes that run together on one device are a tile. Lanes are sorted
+before they are divided into tiles. They are sorted by delay, because lanes with equal delays read their delay
+lines faster, and by expected duration, because a tile runs until its slowest lane has finished.
+
+Tiles are distributed to the devices in turn. Batches are padded with idle lanes to a few sizes, so that most
+calls reuse a compiled program.
 """
 
 import abc
@@ -21,65 +24,77 @@ from jaxhil.simulation import cached_programs
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS
 from jaxhil.simulation.outcome import Outcome
 
-TILE_SIZE = 64  # lanes run together on a device; more do not fit into its first-level cache
-MIN_TILE_SIZE = 16
-DEVICE_AXIS = PartitionSpec("device")  # leading axis: the device that has the tiles
-MIN_TILES_PER_DELAY = 8  # least number for sorting by delay; with fewer, tiles have more uneven durations
+TILE_SIZE = 64  # lanes per tile; more lanes do not fit into the first-level cache of a core
+MIN_TILE_SIZE = 16  # lanes per tile of a small batch
+DEVICE_AXIS = PartitionSpec("device")  # distributes arrays along their leading axis, one entry per device
+# Tiles per delay from which lanes are sorted by delay. With fewer tiles, durations in a tile differ too much.
+MIN_TILES_PER_DELAY = 8
 
 
 class Batch(NamedTuple):
-    """Scenarios on the devices, as `RigModel.place_batch` distributes them."""
+    """Scenarios that `RigModel.place_batch` has distributed to the devices."""
 
-    scenarios: Any  # distributed to the devices
+    scenarios: Any  # scenarios on the devices, (devices, tiles, ..., lanes of a tile)
     assignment: "_TileAssignment"  # assignment of lanes to tiles
-    places: np.ndarray  # index of each lane in the flattened assignment
+    positions: np.ndarray  # position of each lane in the flattened assignment
 
 
 class RigModel(abc.ABC):
-    """Model of a rig along one axis or in six: how its scenarios are drawn, run and compared.
+    """Interface to the simulation of rigs with one axis or with six axes.
 
-    Loops and scenarios are those that the model itself builds. A model has no state and equals any other
-    instance of its class.
+    A model builds scenarios and loops, runs the scenarios and compares the results with the ideal contact.
+    The methods of a model accept only scenarios and loops that the same model has built. A model has no
+    state; all instances of a class are equal.
+
+    A run is one contact on a rig with one axis, and one episode on a rig with six axes.
     """
 
-    axes: ClassVar[int]  # 1 or 6
-    run_name: ClassVar[str]  # what a run consists of: a contact or an episode
-    # names of the errors of a run; an outcome has the rows of the first error, then those of the next
+    axes: ClassVar[int]  # number of axes, 1 or 6
+    run_name: ClassVar[str]  # name of a run in messages: "contact" or "episode"
+    # names of the errors of a run; an outcome contains all runs' first errors, then all runs' second errors
     errors: ClassVar[tuple[str, ...]]
-    compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # for batches
+    compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
 
     @abc.abstractmethod
     def scenarios(
         self, mechanism: Any, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
     ) -> Any:
-        """Return scenarios of a mechanism as NumPy arrays: the nominal one, or those of the draws.
+        """Return scenarios of a mechanism as NumPy arrays.
 
-        Noise keys depend only on `seed` and on `first` + lane.
+        Args:
+            mechanism: Mechanism file.
+            draws: Values of uncertain parameters by dotted path, one per scenario; None for the nominal
+                scenario.
+            seed: Seed of the sensors' noise.
+            first: Index of the first scenario. The noise of a scenario depends only on seed and index.
         """
 
     @abc.abstractmethod
     def loop(self, mechanism: Any, compensator: str, scenarios: Any, **parts: bool) -> Any:
-        """Return the loop that runs all the scenarios; `parts` are options of the one-axis model."""
+        """Return the loop that runs all these scenarios; `parts` are options that only one-axis rigs have."""
 
     @abc.abstractmethod
     def runs(self, mechanism: Any) -> int:
-        """Return the number of contacts or episodes of a scenario."""
+        """Return the number of runs in a scenario of this mechanism."""
 
     @abc.abstractmethod
     def run(self, loop: Any, gains: Gains, scenario: Any) -> Outcome:
-        """Run a batch of scenarios, given as JAX arrays."""
+        """Run a batch of scenarios (JAX arrays) and return the outcome of every run."""
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
-        """Return scenarios in which the `idle` lanes do nothing."""
+        """Return the scenarios without runs in the `idle` lanes, which only fill a tile."""
 
     @abc.abstractmethod
     def expected_duration(self, scenarios: Any) -> np.ndarray:
-        """Return a rough duration [s] of each run, used only for sorting."""
+        """Return a rough estimate of each scenario's duration [s], used only for sorting lanes."""
 
     @abc.abstractmethod
     def whole_delays(self, scenarios: Any) -> np.ndarray:
-        """Return a number that differs if a delay's whole periods differ, used only for sorting."""
+        """Return a number per scenario by which lanes with equal delays are sorted together.
+
+        Two scenarios have different numbers if one of their delays differs in its whole control periods.
+        """
 
     @abc.abstractmethod
     def without_noise(self, scenarios: Any) -> Any:
@@ -94,23 +109,23 @@ class RigModel(abc.ABC):
         """Return the name of a loop's compensator."""
 
     def prepared(self, loop: Any, scenarios: Any) -> Any:
-        """Return the input of `outcome`, which depends on the scenarios but not on the gains."""
+        """Compute the part of a run that does not depend on the gains, as an argument of `outcome`."""
         return scenarios
 
     def outcome(self, loop: Any, gains: Gains, rig: Any) -> Outcome:
-        """Return the outcome of a result of `prepared`; differentiable with respect to the gains."""
+        """Run what `prepared` returned; the outcome is differentiable with respect to the gains."""
         return self.run(loop, gains, rig)
 
     def noise_amplification(self, loop: Any, gains: Gains, rig: Any) -> Float[Array, "*batch"]:
-        """Return the compensator's amplification of the force sensor's noise [1]; 1 if unknown."""
+        """Return the factor [1] by which the compensator amplifies force sensor noise; 1 if unknown."""
         return jnp.ones_like(rig.control_period)
 
     def rows(self, mechanism: Any) -> int:
-        """Return the number of rows of an outcome: errors times runs."""
+        """Return the number of rows of an outcome: number of errors times number of runs."""
         return len(self.errors) * self.runs(mechanism)
 
     def by_error(self, outcome: Outcome) -> dict[str, Outcome]:
-        """Return the outcome of each error separately, by the error's name."""
+        """Split an outcome into one outcome per error, by the name of the error."""
         runs = len(outcome.error) // len(self.errors)
         return {
             name: jax.tree.map(lambda leaf, first=first: leaf[first : first + runs], outcome)
@@ -118,11 +133,18 @@ class RigModel(abc.ABC):
         }
 
     def evaluate(self, loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1) -> Outcome:
-        """Run `scenarios` (NumPy arrays, one batch axis) on all devices; return NumPy arrays.
+        """Run scenarios on all devices and return their outcome as NumPy arrays.
 
-        `gains` are scalars, or all of them have one value per lane; they are converted to the scenarios'
-        precision. Batches of up to `at_least` lanes share a compiled program. A lane's outcome does not
-        depend, to the bit, on the other lanes or on its position among them.
+        The outcome of a scenario does not depend on the other scenarios of the batch, not even in the last
+        bit.
+
+        Args:
+            loop: Loop that runs the scenarios.
+            gains: Gains by name [SI units], each a scalar or one value per scenario. The values are converted
+                to the floating-point precision of the scenarios.
+            scenarios: NumPy arrays with one batch axis.
+            at_least: Number of scenarios to which smaller batches are padded, so that they share a compiled
+                program.
         """
         return self.begin_evaluation(loop, gains, scenarios, at_least)()
 
@@ -134,16 +156,17 @@ class RigModel(abc.ABC):
         at_least: int = 1,
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
-        """Start `evaluate`; the returned function waits for the value of `wanted(outcome)`."""
+        """Start `evaluate` and return a function that waits for `wanted(outcome)` and returns it."""
         return self.begin_batch(loop, gains, self.place_batch(scenarios, at_least), wanted)
 
     def place_batch(self, scenarios: Any, at_least: int = 1) -> Batch:
-        """Distribute scenarios to the devices; the arguments are those of `evaluate`."""
-        dealt = self._assign_tiles(scenarios, at_least)
-        places = np.empty_like(dealt.lane, shape=count_lanes(scenarios))
-        places[dealt.lane[~dealt.idle]] = np.flatnonzero(~dealt.idle)
-        # Every leaf is placed explicitly, since JAX compiles another program for another placement.
-        return Batch(_place_leaves(self._arrange_scenarios(dealt, scenarios), DEVICE_AXIS), dealt, places)
+        """Distribute scenarios to the devices; see `evaluate` for the arguments."""
+        assignment = self._assign_tiles(scenarios, at_least)
+        positions = np.empty_like(assignment.lane, shape=count_lanes(scenarios))
+        positions[assignment.lane[~assignment.idle]] = np.flatnonzero(~assignment.idle)
+        # All leaves are placed explicitly: JAX would compile another program for arrays placed otherwise.
+        arranged = self._arrange_scenarios(assignment, scenarios)
+        return Batch(_place_leaves(arranged, DEVICE_AXIS), assignment, positions)
 
     def begin_batch(
         self,
@@ -152,51 +175,53 @@ class RigModel(abc.ABC):
         batch: Batch,
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
-        """Start the evaluation of placed scenarios; see `begin_evaluation`."""
+        """Start the evaluation of scenarios on the devices; see `begin_evaluation` for the result."""
         common, per_lane = _arrange_gains(batch.assignment, batch.scenarios, gains)
         placed = _place_leaves(common, PartitionSpec()), _place_leaves(per_lane, DEVICE_AXIS)
-        running = wanted(self.run_tiles(loop, *placed, batch.scenarios))
+        outcome = wanted(self.run_tiles(loop, *placed, batch.scenarios))
 
         def unfold(leaf):
-            # (devices, tiles, ..., tile) -> (..., lanes); each device's part is read from that device.
+            # This changes (devices, tiles, ..., lanes of a tile) into (..., lanes), one device at a time.
             devices, tiles, *slots, tile = leaf.shape
             rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
             for part in leaf.addressable_shards:
                 rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
-            return np.take(rows.reshape(*slots, -1), batch.places, axis=-1)
+            return np.take(rows.reshape(*slots, -1), batch.positions, axis=-1)
 
-        return lambda: jax.tree.map(unfold, running)
+        return lambda: jax.tree.map(unfold, outcome)
 
     def shard(
         self, scenarios: Any, gains: Mapping[str, Any], at_least: int = 1
     ) -> tuple[dict[str, Any], dict[str, Any], Any]:
-        """Return arguments of `run_tiles`: gains common to all lanes, gains per lane, and scenarios.
+        """Arrange scenarios and gains in tiles; return the arguments of `run_tiles`.
 
-        Leaves are (devices, tiles, ..., lanes of a tile), padded with idle lanes.
+        These are the gains common to all lanes, the gains with one value per lane, and the scenarios. Arrays
+        with one value per lane have the shape (devices, tiles, ..., lanes of a tile), padded with idle lanes.
         """
-        dealt = self._assign_tiles(scenarios, at_least)
-        return *_arrange_gains(dealt, scenarios, gains), self._arrange_scenarios(dealt, scenarios)
+        assignment = self._assign_tiles(scenarios, at_least)
+        return *_arrange_gains(assignment, scenarios, gains), self._arrange_scenarios(assignment, scenarios)
 
     def run_tiles(self, loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-        """Run the result of `shard` after `place_on_devices`; leaves are (devices, tiles, ..., lanes)."""
+        """Run the scenarios that `shard` has arranged and `place_on_devices` has placed."""
         static, options = (self, loop), self.compiler_options
         return cached_programs.run_cached(run_tiles, static, common, per_lane, scenarios, options=options)
 
     def _assign_tiles(self, scenarios: Any, at_least: int) -> "_TileAssignment":
-        """Assign lanes to tiles of the devices; fill up with idle lanes."""
+        """Assign the lanes of a batch to tiles on the devices; fill the tiles with idle lanes."""
         number = count_lanes(scenarios)
         capacity = max(number, at_least)
         devices = jax.device_count()
         tile = TILE_SIZE
         while tile > MIN_TILE_SIZE and tile * devices >= 2 * capacity:
             tile //= 2
-        # Powers of two up to 16 tiles per device, then multiples of 16, give few programs and little padding.
+        # Few different numbers of tiles mean few compiled programs: powers of two up to 16 tiles per device,
+        # then multiples of 16.
         tiles = -(-capacity // (tile * devices))
         tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
         lanes = tiles * tile * devices
 
         def fold(order):
-            # Tiles of similar duration go to different devices.
+            # Tiles of similar duration are assigned to different devices.
             return order.reshape(tiles, devices, tile).swapaxes(0, 1)
 
         return _TileAssignment(
@@ -204,27 +229,27 @@ class RigModel(abc.ABC):
         )
 
     def _sort_lanes(self, scenarios: Any) -> np.ndarray:
-        """Return the order of lanes: by delay, if there are enough lanes per delay, then by duration."""
+        """Sort lane indices by delay, if there are enough lanes per delay, and by expected duration."""
         duration, delays = self.expected_duration(scenarios), self.whole_delays(scenarios)
         if MIN_TILES_PER_DELAY * TILE_SIZE * len(np.unique(delays)) > len(delays):
             delays = np.zeros_like(delays)
         order = np.argsort(-duration)
         return order[np.argsort(delays[order], kind="stable")]
 
-    def _arrange_scenarios(self, dealt: "_TileAssignment", scenarios: Any) -> Any:
-        """Return scenarios in the order of the assignment."""
+    def _arrange_scenarios(self, assignment: "_TileAssignment", scenarios: Any) -> Any:
+        """Arrange scenarios in tiles according to the assignment."""
 
         def fold(leaf):
             if leaf.strides[-1] == 0:
                 value = leaf[..., 0]
-                return _broadcast_to_lanes(value.tobytes(), value.dtype, value.shape, dealt.lane.shape)
-            return _arrange_leaf(dealt, leaf)
+                return _broadcast_to_lanes(value.tobytes(), value.dtype, value.shape, assignment.lane.shape)
+            return _arrange_leaf(assignment, leaf)
 
-        return self.at_rest(jax.tree.map(fold, scenarios), dealt.idle)
+        return self.at_rest(jax.tree.map(fold, scenarios), assignment.idle)
 
 
 def place_on_devices(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
-    """Place the result of `RigModel.shard` on its devices, for several runs."""
+    """Place the arrays that `RigModel.shard` returned on the devices, to run them several times."""
     return (
         _place_leaves(common, PartitionSpec()),
         _place_leaves(per_lane, DEVICE_AXIS),
@@ -233,12 +258,12 @@ def place_on_devices(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, A
 
 
 def count_lanes(scenarios: Any) -> int:
-    """Return the number of scenarios."""
+    """Return the number of scenarios in a batch."""
     return np.shape(scenarios.control_period)[-1]
 
 
 def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    """Run the tiles of all devices; `static` is the model and the loop."""
+    """Run the tiles of all devices, those of one device one after another; `static` is (model, loop)."""
     model, loop = static
 
     def one_device(common, arguments):
@@ -249,7 +274,7 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
         tiles = jax.tree.map(lambda leaf: leaf[0], arguments)
         return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, tiles))
 
-    # Devices exchange no data and do not wait for each other.
+    # The devices exchange no data and do not wait for each other.
     specs = PartitionSpec(), DEVICE_AXIS
     return jax.shard_map(
         one_device, mesh=_build_device_mesh(), in_specs=specs, out_specs=DEVICE_AXIS, check_vma=False
@@ -257,33 +282,33 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
 
 
 class _TileAssignment(NamedTuple):
-    """Assignment of lanes to tiles, (devices, tiles, lanes of a tile)."""
+    """Assignment of lanes to tiles; arrays have the shape (devices, tiles, lanes of a tile)."""
 
-    lane: np.ndarray  # index of the lane
+    lane: np.ndarray  # index of the lane in the batch
     idle: np.ndarray  # whether the lane only fills the tile
 
 
 def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:
-    """Place the leaves of a tree on the devices."""
+    """Place the leaves of a pytree on the devices."""
     return jax.device_put(tree, NamedSharding(_build_device_mesh(), spec))
 
 
-def _arrange_gains(dealt: _TileAssignment, scenarios: Any, gains: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return gains common to all lanes, and gains per lane in the order of the assignment."""
-    # The program computes in the scenarios' precision.
+def _arrange_gains(assignment: _TileAssignment, scenarios: Any, gains: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the gains common to all lanes, and the gains per lane, arranged in tiles."""
+    # The program computes in the floating-point precision of the scenarios.
     values = {name: np.asarray(value, scenarios.control_period.dtype) for name, value in gains.items()}
     common = {name: value for name, value in values.items() if not value.ndim}
-    return common, {name: _arrange_leaf(dealt, value) for name, value in values.items() if value.ndim}
+    return common, {name: _arrange_leaf(assignment, value) for name, value in values.items() if value.ndim}
 
 
-def _arrange_leaf(dealt: _TileAssignment, leaf: np.ndarray) -> np.ndarray:
-    """Return a leaf in the order of the assignment, (devices, tiles, ..., lanes of a tile)."""
-    return np.moveaxis(np.take(leaf, dealt.lane, axis=-1), (-3, -2), (0, 1))
+def _arrange_leaf(assignment: _TileAssignment, leaf: np.ndarray) -> np.ndarray:
+    """Arrange an array with one value per lane as (devices, tiles, ..., lanes of a tile)."""
+    return np.moveaxis(np.take(leaf, assignment.lane, axis=-1), (-3, -2), (0, 1))
 
 
-@lru_cache(maxsize=128)  # leaves; enough for a few batches of similar scenarios
+@lru_cache(maxsize=128)  # arrays; enough for a few batches of similar scenarios
 def _broadcast_to_lanes(content, dtype, slots, lanes):
-    """Place a value common to all lanes on the devices; it is sent once for all batches."""
+    """Place a value common to all lanes on the devices; later batches reuse the array."""
     devices, tiles, tile = lanes
     value = np.frombuffer(content, dtype).reshape(1, 1, *slots, 1)
     return jax.device_put(
@@ -293,5 +318,5 @@ def _broadcast_to_lanes(content, dtype, slots, lanes):
 
 
 def _build_device_mesh():
-    """Return the mesh of all devices."""
+    """Return JAX's mesh of all devices, with the one axis `device`."""
     return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))

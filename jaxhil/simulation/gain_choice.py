@@ -1,4 +1,4 @@
-"""Choice of a compensator's gains: from the literature, a setting, a dict, or a gain file."""
+"""Choice of a compensator's gains: rule of the literature, named setting, dict, or gain file."""
 
 import math
 import os
@@ -16,15 +16,19 @@ from jaxhil.simulation.gain_file import LoadedGains, find_compensator, load_gain
 
 
 def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) -> tuple[str, dict[str, float]]:
-    """Return the compensator's name and its gains [SI units] for a mechanism.
+    """Return the name of the compensator and its gains by name [SI units].
 
-    `gains` is None (from the literature), the name of a setting of the compensator, a dict of some gains (the
-    others are from the literature), or a gain file's path. With a file, the compensator "none" means the
-    file's compensator. Text that is not a setting's name is a path if it has a separator or a suffix, or if
-    the file exists.
+    Args:
+        mechanism: Mechanism that the compensator will control.
+        compensator: Name of the compensator. With a gain file, "none" selects the compensator of the file.
+        gains: One of the following. None: all gains by the rule of the literature. Text that names a setting
+            of the compensator: the gains of this setting. Dict: values of some gains; the others are by the
+            rule of the literature. Path, or text with a separator or a suffix or the name of an existing
+            file: the gains of this gain file.
 
-    Raise `InputError` for an unknown compensator, setting or gain, for a value outside its bounds, and for a
-    gain file that is invalid or does not fit the compensator, the control period or the bounds.
+    Raises:
+        InputError: The compensator, the setting or a gain is unknown; a value is out of its bounds; or the
+            gain file is invalid, or is for another compensator, control period or number of axes.
     """
     law = find_compensator(compensator, "", axes_of(mechanism))
     if gains is None:
@@ -42,9 +46,10 @@ def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) ->
 
 
 def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
-    """Raise `InputError` if the gains of a file do not fit a mechanism.
+    """Raise `InputError` if the gains of a file are not usable with a mechanism.
 
-    Gains act per control period, and the upper bound of a gain may be the length of a delay line.
+    The control periods must be equal, because gains act once per control period. All gains must lie within
+    their bounds for this mechanism, because a bound may be the length of a delay line.
     """
     period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
     if period != tuned:
@@ -62,7 +67,7 @@ def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
 
 
 def _is_path(text: str) -> bool:
-    """Return whether a text has a separator or a suffix, or names an existing file."""
+    """Return whether a text is a path: it has a separator or a suffix, or it names an existing file."""
     if os.sep in text or os.path.splitext(text)[1]:
         return True
     try:
@@ -92,7 +97,7 @@ def _complete_gains(
 
 
 def _to_float(value: Any) -> float:
-    """Return a number of Python, NumPy or JAX as a float; NaN for anything else."""
+    """Convert a number of Python, NumPy or JAX to a float; return NaN for any other object."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return math.nan
@@ -105,7 +110,7 @@ def _to_float(value: Any) -> float:
 def _read_gains(
     mechanism: AnyMechanism, law: Compensator | SixAxisCompensator, path: str | os.PathLike[str]
 ) -> tuple[str, dict[str, float]]:
-    """Return the compensator and the gains of a file; raise `InputError` if they do not fit."""
+    """Return the compensator and the gains of a gain file; raise `InputError` if they are not usable."""
     label = to_one_line(os.fsdecode(path)) or "''"
     loaded = load_gain_file(os.fsdecode(path), any_axes=True)
     if isinstance(loaded.mechanism, Mechanism) != isinstance(mechanism, Mechanism):
@@ -119,5 +124,5 @@ def _read_gains(
 
 
 def _describe_axes(mechanism: AnyMechanism) -> str:
-    """Return the mechanism's number of axes in words."""
+    """Return "one axis" or "six axes"."""
     return "one axis" if isinstance(mechanism, Mechanism) else "six axes"

@@ -1,7 +1,9 @@
-"""Reading of gain files: a compensator's gains, and the mechanism and rig for which they were tuned.
+"""Reading and checking of gain files.
 
-The first checks are those that the rig also makes (`jaxhil.rig.gain_file`). Further checks need the mechanism
-and the registry of compensators. An invalid file is rejected as a whole, with a one-line message.
+A gain file contains the gains of a compensator, and the mechanism for which the gains were tuned. The rig's
+controller checks a file without the simulation (`jaxhil.rig.gain_file`). This module repeats these checks and
+adds checks that need the mechanism and the registered compensators. A file with any error is rejected with a
+one-line message.
 """
 
 import os
@@ -21,22 +23,24 @@ from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
 
-BOUND_TOLERANCE = 1e-9  # relative tolerance of bounds computed on another machine
+BOUND_TOLERANCE = (
+    1e-9  # [1]; relative tolerance, because bounds may be rounded differently on another machine
+)
 
 
 class LoadedGains(NamedTuple):
-    """Checked gain file."""
+    """Content of a valid gain file."""
 
-    document: dict[str, Any]  # whole content of the file
-    compensator: str  # name
-    gains: dict[str, float]  # by name, in SI units
-    mechanism: Any  # for which the gains were tuned; a `Mechanism`, or a `SixAxisMechanism` if allowed
+    document: dict[str, Any]  # all keys of the file
+    compensator: str  # name of the compensator
+    gains: dict[str, float]  # gains by name [SI units]
+    mechanism: Any  # mechanism for which the gains were tuned: `Mechanism` or `SixAxisMechanism`
 
 
 def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:
-    """Read and check the gain file at `path`; it must be of one axis unless `any_axes` is set.
+    """Read and check the gain file at `path`; accept a file of six axes only with `any_axes`.
 
-    Raise `InputError` if anything is wrong.
+    Raise `InputError` if the file cannot be read or is invalid.
     """
     source = to_one_line(os.fspath(path))
     try:
@@ -49,9 +53,9 @@ def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> Load
 def check_document(
     document: dict[str, Any], source: str = "gain document", any_axes: bool = False
 ) -> LoadedGains:
-    """Check the content of a gain file; it must be of one axis unless `any_axes` is set.
+    """Check the content of a gain file; accept six axes only with `any_axes`.
 
-    Raise `InputError`, which calls the document `source`.
+    Raise `InputError` if the content is invalid; `source` names the file in the message.
     """
     axes = 6 if document.get("axes") == 6 else 1
     try:
@@ -88,7 +92,7 @@ def find_compensator(compensator: object, source: str, axes: int = 1) -> Compens
 
 
 def check_gain_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: str) -> None:
-    """Raise `InputError` unless `gains` are exactly the gains of the law."""
+    """Raise `InputError` unless the names of `gains` are exactly the names of a compensator's gains."""
     names = [gain.name for gain in law]
     if set(gains) != set(names):
         wrong = sorted(set(gains) ^ set(names))[0]
@@ -97,7 +101,7 @@ def check_gain_names(gains: Mapping[str, Any], law: tuple[Gain, ...], source: st
 
 
 def resolve_gain_bounds(gain: Gain, mechanism: Any) -> tuple[float, float, float]:
-    """Return a gain's lower and upper bound for a mechanism, and their tolerance for rounding."""
+    """Return lower bound, upper bound and rounding tolerance of a gain for a mechanism [unit of the gain]."""
     lower, upper = float(gain.lower(mechanism)), float(gain.upper(mechanism))
     return lower, upper, BOUND_TOLERANCE * max(abs(lower), abs(upper))
 
@@ -112,7 +116,7 @@ def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]
 
 
 def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, source: str) -> None:
-    """Raise `InputError` if a gain's unit or bounds in the file differ from the law's."""
+    """Raise `InputError` if unit or bounds of a gain in the file are not those of the compensator."""
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
         raise _make_error(source, f"{key}.unit", format_value(entry["unit"]), f"'{gain.unit}'")
@@ -124,13 +128,13 @@ def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, 
 
 
 def _make_error(source: str, key: str, found: str, allowed: str) -> InputError:
-    """Return the error for a key."""
+    """Return the error with the message "source: key: found ..., expected ..."."""
     where = f"{source}: {key}" if source else key
     return InputError(f"{where}: found {found}, expected {allowed}")
 
 
 def _is_date(value: object) -> bool:
-    """Return whether a value is an ISO date and time with time zone."""
+    """Return whether a value is a text in ISO format with date, time and time zone."""
     try:
         return isinstance(value, str) and datetime.fromisoformat(value).tzinfo is not None
     except ValueError:
@@ -138,23 +142,24 @@ def _is_date(value: object) -> bool:
 
 
 def _is_envelope(value: object) -> bool:
-    """Return whether a value is an object of {low, high, unit} objects."""
+    """Return whether a value is a JSON object whose values are objects with the keys low, high, unit."""
     return isinstance(value, Mapping) and all(
         isinstance(span, Mapping) and {"low", "high", "unit"} <= span.keys() for span in value.values()
     )
 
 
 def _is_object(value: object) -> bool:
-    """Return whether a value is an object."""
+    """Return whether a value is a JSON object."""
     return isinstance(value, Mapping)
 
 
 def _is_table_of_texts(value: object) -> bool:
-    """Return whether a value is an object of texts."""
+    """Return whether a value is a JSON object whose values are texts."""
     return isinstance(value, Mapping) and all(isinstance(text, str) for text in value.values())
 
 
-# For each further key of a gain file: the check of its value, and a description of the allowed values.
+# Keys of a gain file that the rig's controller does not check, each with a check of its value and a text that
+# describes valid values.
 _REQUIRED_KEYS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "mechanism_sha256": (
         lambda value: isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None,

@@ -1,8 +1,10 @@
-"""Integrators of the numerical model M x'' = -F_c over one control period, as used on rigs.
+"""Integrators of the numerical model M x'' = -F_c over one control period, as rigs use them.
 
-Their own delays are (notebooks/guide/model.md, section 6, item 7): semi-implicit Euler 0, exact zero-order
-hold T/2, explicit Euler T. All functions accept arrays that broadcast, or floats: position [m], velocity
-[m/s], acceleration [m/s^2], control period T [s]. They return the next position and velocity.
+Each integrator adds its own delay to the loop: 0 for semi-implicit Euler, T/2 for the exact zero-order hold,
+and T for explicit Euler, where T is the control period (notebooks/guide/model.md, section 6, item 7).
+
+All functions take position [m], velocity [m/s], acceleration [m/s^2] and control period [s], as floats or as
+arrays that broadcast. They return the position and the velocity one control period later.
 """
 
 from typing import TypeVar
@@ -13,19 +15,19 @@ Number = TypeVar("Number", Array, float)
 
 
 def semi_implicit_euler(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """Compute v += T a, then x += T v."""
+    """Integrate one control period by semi-implicit Euler: v += T a, then x += T v."""
     velocity = velocity + control_period * acceleration
     return position + control_period * velocity, velocity
 
 
 def zero_order_hold(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """Compute x += T v + T^2 a / 2 and v += T a, exact for a constant force in the period."""
+    """Integrate one control period exactly for a constant force: x += T v + T^2 a / 2, v += T a."""
     increment = control_period * acceleration
     return position + control_period * (velocity + increment / 2), velocity + increment
 
 
 def explicit_euler(position: Number, velocity: Number, acceleration: Number, control_period: Number):
-    """Compute x += T v, then v += T a."""
+    """Integrate one control period by explicit Euler: x += T v, then v += T a."""
     return position + control_period * velocity, velocity + control_period * acceleration
 
 

@@ -1,7 +1,7 @@
-"""Derivatives of a run's results with respect to the mechanism's numbers and the gains.
+"""Derivatives of a run's results with respect to mechanism parameters and gains.
 
-Forward-mode differentiation passes through all ticks of the run. Each number has its own lane in a batch of
-equal runs, and varies in that lane only.
+Forward-mode differentiation passes through all ticks of the run. The run is computed as a batch with one lane
+per parameter. All lanes are equal, and each lane is differentiated with respect to its own parameter.
 """
 
 import os
@@ -34,21 +34,22 @@ from jaxhil.simulation.run import ContactResult, check_seed
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 GAIN_PREFIX = "gains."
-# These results have no derivative: they are counted in ticks, or are not numbers.
+# These results have no derivative: durations are whole numbers of ticks, and the status is a text.
 NOT_DIFFERENTIABLE = ("duration", "duration_ratio", "status")
 DIFFERENTIABLE_RESULTS = tuple(name for name in ContactResult._fields if name not in NOT_DIFFERENTIABLE)
 _QUANTUM_KEYS = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
-# At 0 the rig lacks the part that the key describes, and the results have a corner.
+# With the value 0, the effect is absent from the simulated rig, and only a one-sided derivative exists.
 _KEYS_WITH_CORNER_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
-_KEY_INCREMENT = 1e-9  # added to the keys' values, so that the loop contains the parts that they switch on
+# Added to the values of the keys when the loop is built, so that the loop contains effects whose value is 0.
+_KEY_INCREMENT = 1e-9
 
 
 class _Variable(NamedTuple):
-    """Number to differentiate with respect to: a gain, or a mechanism's key, for lists one entry or all."""
+    """Independent variable of a derivative: a gain, or a parameter of the mechanism."""
 
-    gain: str | None  # gain's name; None for a key of the mechanism
-    path: str  # dotted key
-    entry: tuple[int, ...]  # indices of the entry in a list; empty for all entries
+    gain: str | None  # name of the gain; None for a parameter of the mechanism
+    path: str  # dotted path of the parameter; empty for a gain
+    entry: tuple[int, ...]  # indices of one entry of a list; empty for all entries together
 
 
 def jacobian(
@@ -60,27 +61,31 @@ def jacobian(
     by: str | Sequence[str],
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Return d(of)/d(by) for each contact of the nominal run.
+    """Return the derivative d(of)/d(by) for each contact of the nominal run.
 
-    The result has an array of shape (contacts,) for each entry of `by`, in the unit of `of` over that of the
-    key. A contact that did not end normally has NaN; the derivatives of later contacts include the effect of
-    all earlier ones. Mechanism, compensator, gains and seed are those of `simulate`.
+    The derivative for a contact includes the effect of `by` on all earlier contacts. A contact that did not
+    end normally has the derivative NaN.
 
-    Derivatives are those of the program. A damped contact begins with a jump of the force; the change of the
-    tick at which the sensor reads this jump is not included.
+    The program is differentiated exactly, but one effect is missing: a damped contact begins with a jump of
+    the force, and the tick at which the sensor reads this jump counts as constant.
 
     Args:
-        mechanism: Mechanism, name of a built-in one, or path.
+        mechanism: Mechanism, name of a built-in mechanism, or path of a mechanism file.
         compensator: Name of the compensator.
         gains: Gains, as for `simulate`.
-        of: A number of `ContactResult`, such as "restitution", "error" or "peak_force".
-        by: Dotted paths of real numbers of the mechanism, such as "rig.force_sensor.delay", and "gains.NAME".
-            All entries of a list vary by the same amount; "contact.stiffness[1]" is one entry.
+        of: Name of a numeric field of `ContactResult`, such as "restitution", "error" or "peak_force".
+        by: One or several parameters: dotted paths of real numbers in the mechanism, such as
+            "rig.force_sensor.delay", or "gains.NAME". If the parameter is a list, all its entries vary by the
+            same amount; "contact.stiffness[1]" varies one entry only.
         seed: Seed of the sensors' noise.
 
+    Returns:
+        Array of shape (contacts,) for each entry of `by`, in the unit of `of` divided by the unit of `by`.
+
     Raises:
-        InputError: `of` or a key is unknown, a key is not a real number or not finite, or the run is not
-            differentiable with respect to it: quantisation, and delays or dead zones that are 0.
+        InputError: `of` or an entry of `by` is unknown; a parameter is not a finite real number; or the run
+            is not differentiable, because a sensor quantises its readings, or because the parameter is a
+            dead zone or a sensor time constant of 0.
 
     Example:
         >>> import jaxhil
@@ -97,14 +102,14 @@ def jacobian(
     if not isinstance(paths, Sequence) or isinstance(paths, bytes) or not paths:
         allowed = "dotted paths, such as ['rig.force_sensor.delay', 'gains.phase_lead']"
         raise InputError(f"by: found {format_value(by)}, expected {allowed}")
-    keys = [_parse_variable(checked, law, path) for path in paths]
+    variables = [_parse_variable(checked, law, path) for path in paths]
     _check_no_quantum(checked)
     check_run(checked)
     with jax_context():
         slopes, status = _compute_derivatives(
             of,
-            _build_probed_loop(checked, name, keys, number),
-            *_perturb_scenarios(checked, keys, values, number),
+            _build_complete_loop(checked, name, variables, number),
+            *_perturb_scenarios(checked, variables, values, number),
         )
     ended = np.asarray(status) == OK
     slopes = np.where(ended, np.asarray(slopes, float), np.nan)[: checked.approach.contacts]
@@ -112,7 +117,7 @@ def jacobian(
 
 
 def _check_result(of: object, law: Compensator) -> None:
-    """Raise `InputError` unless `of` is a result with a derivative."""
+    """Raise `InputError` unless `of` names a differentiable field of `ContactResult`."""
     names = [name for name in DIFFERENTIABLE_RESULTS if name != "force_delay" or law.estimates_delay]
     if not isinstance(of, str) or of not in names:
         hint = suggest_names(of, names) if isinstance(of, str) else ""
@@ -123,12 +128,12 @@ def _check_no_quantum(mechanism: Mechanism) -> None:
     """Raise `InputError` if a sensor quantises its readings."""
     for path in _QUANTUM_KEYS:
         if value_at(mechanism, path) != 0.0:
-            allowed = "0: what is rounded has no derivative"
+            allowed = "0: quantised readings have no derivative"
             raise InputError(f"{path}: found {format_value(value_at(mechanism, path))}, expected {allowed}")
 
 
 def _parse_variable(mechanism: Mechanism, law: Compensator, path: object) -> _Variable:
-    """Return the number that an entry of `by` names, or raise `InputError`."""
+    """Return the variable that `path`, an entry of `by`, names; raise `InputError` if it is unusable."""
     if isinstance(path, str) and path.startswith(GAIN_PREFIX):
         gain, names = path.removeprefix(GAIN_PREFIX), [gain.name for gain in law.gains]
         if gain not in names:
@@ -147,60 +152,72 @@ def _parse_variable(mechanism: Mechanism, law: Compensator, path: object) -> _Va
     key = format_key_path(parts[: len(parts) - len(entry)])
     if key not in numeric_keys() or key in _QUANTUM_KEYS:
         names = [k for k in numeric_keys() if not k.startswith("uncertainty") and k not in _QUANTUM_KEYS]
-        raise _make_error(path, "no key to differentiate by", f"a real number{suggest_names(key, [*names])}")
+        allowed = f"the path of a real number{suggest_names(key, [*names])}"
+        raise _make_error(path, "no parameter with a derivative", allowed)
     value = value_at(mechanism, key)
     if value is None or value == [] or (isinstance(value, float) and not np.isfinite(value)):
         raise _make_error(path, f"{format_value(value)} as its value", "a key with a finite value")
     if key in _KEYS_WITH_CORNER_AT_0 and value == 0.0:
-        raise _make_error(path, "0 as its value", "a number > 0: there is a corner at 0")
+        raise _make_error(path, "0 as its value", "a number > 0: the derivative at 0 is one-sided")
     shape = np.shape(value)
     if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
-        raise _make_error(path, f"a value of the shape {shape}", "indices into it")
+        raise _make_error(path, f"a value of shape {shape}", "indices within this shape")
     return _Variable(None, key, entry)
 
 
 def _make_error(path: object, found: str, allowed: str) -> InputError:
-    """Return the error for an entry of `by`."""
+    """Return the error with the message "by PATH: found ..., expected ..."."""
     return InputError(f"by {path}: found {found}, expected {allowed}")
 
 
-def _build_probed_loop(mechanism: Mechanism, compensator: str, keys: list[_Variable], seed: int) -> Loop:
-    """Return the loop with all parts that the keys switch on when they are not 0."""
+def _build_complete_loop(
+    mechanism: Mechanism, compensator: str, variables: list[_Variable], seed: int
+) -> Loop:
+    """Return a loop that includes every effect whose parameter is differentiated, even if its value is 0."""
     scenarios = build_scenarios(
-        mechanism, _build_draws(mechanism, keys, np.full(len(keys), _KEY_INCREMENT)), seed
+        mechanism, _build_draws(mechanism, variables, np.full(len(variables), _KEY_INCREMENT)), seed
     )
     return build_loop(mechanism, compensator, scenarios)
 
 
-def _build_draws(mechanism: Mechanism, keys: list[_Variable], moved: Any) -> dict[str, Any]:
-    """Return the values of all keys, a lane per key, in which this key is increased by `moved`, (keys,)."""
-    # Without a key of the mechanism, this entry determines the number of lanes.
-    draws: dict[str, Any] = {"approach.phase": np.full(len(keys), mechanism.approach.phase)}
-    for lane, key in enumerate(keys):
-        if key.gain is None:
-            nominal = np.asarray(value_at(mechanism, key.path), float)
-            direction = np.zeros((len(keys), *nominal.shape))
-            direction[(lane, *key.entry)] = 1.0
-            step = moved.reshape(-1, *[1] * nominal.ndim) * direction
-            draws[key.path] = draws.get(key.path, np.broadcast_to(nominal, direction.shape)) + step
+def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: Any) -> dict[str, Any]:
+    """Return values of the parameters in one lane per variable, by dotted path.
+
+    In its own lane, a variable has its nominal value plus its entry of `increments`, (variables,).
+    """
+    # If all variables are gains, this entry alone determines the number of lanes.
+    draws: dict[str, Any] = {"approach.phase": np.full(len(variables), mechanism.approach.phase)}
+    for lane, variable in enumerate(variables):
+        if variable.gain is None:
+            nominal = np.asarray(value_at(mechanism, variable.path), float)
+            direction = np.zeros((len(variables), *nominal.shape))
+            direction[(lane, *variable.entry)] = 1.0
+            step = increments.reshape(-1, *[1] * nominal.ndim) * direction
+            draws[variable.path] = draws.get(variable.path, np.broadcast_to(nominal, direction.shape)) + step
     return draws
 
 
 def _perturb_scenarios(
-    mechanism: Mechanism, keys: list[_Variable], gains: dict[str, float], seed: int
+    mechanism: Mechanism, variables: list[_Variable], gains: dict[str, float], seed: int
 ) -> tuple[Gains, Gains, Scenario, Scenario]:
-    """Return gains and scenarios with a lane for each key, and their derivatives with respect to this key."""
-    lanes = len(keys)
-    values = {name: jnp.full(lanes, value) for name, value in gains.items()}
-    rates = {name: jnp.array([1.0 * (key.gain == name) for key in keys]) for name in gains}
+    """Return gains and scenarios with one lane per variable, and their derivatives.
 
-    def scenarios(moved: Array) -> Scenario:
+    The order is gains, derivatives of the gains, scenarios, derivatives of the scenarios. Each lane has the
+    derivatives with respect to its own variable.
+    """
+    lanes = len(variables)
+    values = {name: jnp.full(lanes, value) for name, value in gains.items()}
+    rates = {name: jnp.array([1.0 * (variable.gain == name) for variable in variables]) for name in gains}
+
+    def scenarios(increments: Array) -> Scenario:
         return build_scenarios(
-            mechanism, {k: jnp.asarray(v) for k, v in _build_draws(mechanism, keys, moved).items()}, seed
+            mechanism,
+            {k: jnp.asarray(v) for k, v in _build_draws(mechanism, variables, increments).items()},
+            seed,
         )
 
     batch, slopes = jax.jvp(scenarios, (jnp.zeros(lanes),), (jnp.ones(lanes),))
-    # All lanes have the noise of the first one.
+    # All lanes have the sensor noise of the first lane.
     batch = batch._replace(key=jnp.broadcast_to(batch.key[:, :1], batch.key.shape))
     slopes = jax.tree.map(lambda leaf, slope: slope if eqx.is_inexact_array(leaf) else None, batch, slopes)
     return values, rates, batch, slopes
@@ -210,7 +227,7 @@ def _perturb_scenarios(
 def _compute_derivatives(
     of: str, loop: Loop, gains: Gains, gain_rates: Gains, batch: Scenario, batch_rates: Any
 ) -> tuple[Array, Array]:
-    """Return the derivative of the result `of` and the status of every contact, (slots, lanes)."""
+    """Return the derivative of the result `of`, and the status, of every contact, (contacts, lanes)."""
     moving, fixed = eqx.partition(batch, eqx.is_inexact_array)
 
     def result(gains: Gains, moving: Any) -> tuple[Array, Array]:

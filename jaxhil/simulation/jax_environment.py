@@ -1,8 +1,8 @@
-"""Settings of JAX: devices, fast compilation, precision, and the folder of compiled programs.
+"""Settings of JAX: number of devices, fast compilation, precision, and the folder of compiled programs.
 
-A command has its own process: it calls `prepare_jax` before importing anything that imports JAX. A function
-called from Python runs in its caller's process: it computes within `jax_context`, which restores the settings
-of JAX and the environment afterwards.
+A command of the command line has its own process. It calls `prepare_jax` before it imports any module that
+imports JAX. A function of the Python interface runs in the process of its caller. It computes within
+`jax_context`, which restores the caller's settings of JAX and environment variables afterwards.
 """
 
 import gc
@@ -19,41 +19,41 @@ from pathlib import Path
 from jaxhil.simulation import jax_startup
 from jaxhil.simulation.compile_cache import use_checksummed_cache
 
-CACHE_VARIABLE = "JAXHIL_CACHE"
-# Least level of the compiler's messages on standard error. It reports slow compilation as an error; real
-# errors are raised as exceptions anyway.
+CACHE_VARIABLE = "JAXHIL_CACHE"  # environment variable with the folder of compiled programs
+# Least severity of XLA's messages on standard error. XLA reports slow compilation as an error, which would
+# confuse users; real errors are also raised as exceptions.
 LOG_LEVEL_VARIABLE, FATAL_LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
 DEVICE_COUNT_PATTERN = re.compile(rf"{DEVICE_COUNT_FLAG}=[1-9]\d{{,2}}")
-# For one device the compiler orders sums differently: the last bits differ from those of two or more.
+# With one device, XLA orders sums differently than with two or more, so that the last bits of results differ.
 MIN_DEVICES = 2
-# Thresholds of garbage collection. Tracing creates millions of objects, few of them in cycles: the default
-# thresholds cost 10 % of the time of a short command.
+# Thresholds of Python's garbage collector. Tracing creates millions of objects, of which few are in reference
+# cycles. With the default thresholds, their collection costs 10 % of the time of a short command.
 GC_THRESHOLDS = 100_000, 50, 50
-# Programs are cached if they take longer to compile than to read.
+# JAX caches only programs that take longer to compile than to read from a file.
 CACHE_SETTINGS = {
     "jax_persistent_cache_min_compile_time_secs": 0.05,
     "jax_persistent_cache_min_entry_size_bytes": 0,
 }
-# Compiler options of programs that run ticks: the processor's widest vectors, and fewer copies of the state
-# between ticks.
+# Compiler options of programs that run ticks: use the processor's widest vectors, and copy the state less
+# often between ticks.
 TICK_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_region_analysis": True}
-# Options of batches without derivatives: each array is also computed separately. Together this is twice as
-# fast, but a Jacobian would take three times as long.
+# Compiler options of batches without derivatives: `TICK_OPTIONS`, and each array is computed by its own loop.
+# Batches become twice as fast, but a Jacobian would take three times as long.
 ROLLOUT_OPTIONS = {**TICK_OPTIONS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
-# Options for six axes, with hundreds of arrays: the older of two loop emitters is 10 % faster.
+# Compiler options for six axes, with hundreds of arrays: the older of XLA's two loop emitters is 10 % faster.
 SIX_AXIS_OPTIONS = {**ROLLOUT_OPTIONS, "xla_cpu_use_fusion_emitters": False}
-# Options of short programs that run once: they compile in half the time.
+# Compiler options of short programs that run only once: these options halve the compile time.
 SINGLE_RUN_OPTIONS = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_use_fusion_emitters": False,
 }
-# An option of LLVM, to unroll loops completely or not at all, and the tested versions of the compiler: an
-# option that LLVM does not have ends the process.
+# An option of LLVM to unroll loops completely or not at all, and the versions of jaxlib tested with it. An
+# option that LLVM does not know would end the process.
 FULL_UNROLL_OPTION, TESTED_JAXLIB_VERSIONS = "-unroll-allow-partial=false", ("0.10.",)
-# Debugging modes are off, whatever JAX_... variables say: they treat NaN as an error, prevent compilation
-# ahead of time, or require explicit transfers.
+# Settings that switch off JAX's debugging modes, even if the user's environment variables switch them on.
+# These modes treat NaN as an error, prevent compilation ahead of time, or forbid implicit transfers.
 DEBUGGING_OFF = {
     "jax_debug_nans": False,
     "jax_debug_infs": False,
@@ -61,15 +61,17 @@ DEBUGGING_OFF = {
     "jax_no_tracing": False,
     "jax_transfer_guard": "allow",
 }
-_started_with: list[str] = []  # XLA_FLAGS with which `start_jax` started JAX
+_startup_flags: list[str] = []  # XLA_FLAGS with which `start_jax` started JAX; empty if started elsewhere
 
 
 def prepare_jax() -> None:
     """Set up JAX for the rest of the process.
 
-    This means float64, one device per usable core but at least two, fast compilation, and compiled programs
-    cached between calls. Flags in the user's XLA_FLAGS have priority. Flags have no effect once JAX runs, and
-    are not changed then. Raise `InputError` if JAX cannot be imported with the user's environment variables.
+    The settings are float64, one device per usable core but at least two, fast compilation, and a folder that
+    caches compiled programs between processes. Flags in the user's XLA_FLAGS have priority over ours. If JAX
+    has already been imported, XLA_FLAGS stays unchanged, because JAX would ignore it.
+
+    Raise `InputError` if JAX cannot be imported with the user's environment variables.
     """
     if "jax" not in sys.modules:
         os.environ.update(_check_jax_variables())
@@ -92,9 +94,9 @@ def prepare_jax() -> None:
 
 @contextmanager
 def jax_context() -> Iterator[None]:
-    """Use float64 and cached programs within this context and thread.
+    """Use float64 and the folder of compiled programs within this context and thread.
 
-    Start JAX as for a command, unless it runs already. The caller's settings are restored afterwards.
+    Start JAX if it does not run yet (`start_jax`). Restore the caller's settings at the end of the context.
     """
     start_jax()
     thresholds = gc.get_threshold()
@@ -107,7 +109,7 @@ def jax_context() -> Iterator[None]:
 
 
 def start_jax() -> None:
-    """Start JAX as for a command, unless it runs already; restore the environment variables afterwards.
+    """Start JAX with our environment variables, unless it runs already; then restore the caller's variables.
 
     Raise `InputError` if JAX cannot start.
     """
@@ -118,11 +120,11 @@ def start_jax() -> None:
     try:
         import jax
 
-        # JAX reads the flags at the first use of a device. If that was earlier, they have no effect and the
-        # number of devices may be another one.
+        # JAX reads the flags when a device is first used. If the caller had already used a device, our flags
+        # have no effect. The number of devices then usually differs from the number in our flags.
         count, flags_text = jax.device_count(), ours["XLA_FLAGS"]
-        if not _started_with and f"{DEVICE_COUNT_FLAG}={count}" in flags_text.split():
-            _started_with.append(flags_text)
+        if not _startup_flags and f"{DEVICE_COUNT_FLAG}={count}" in flags_text.split():
+            _startup_flags.append(flags_text)
     except (AssertionError, RuntimeError, ValueError) as error:
         raise jax_startup.convert_jax_error(error) from None
     finally:
@@ -135,7 +137,7 @@ def start_jax() -> None:
 
 @contextmanager
 def use_float64() -> Iterator[None]:
-    """Use float64 in this thread, without JAX's debugging modes."""
+    """Use float64 and no debugging modes of JAX within this context and thread."""
     import jax
 
     with ExitStack() as stack:
@@ -149,7 +151,7 @@ def use_float64() -> Iterator[None]:
 
 @contextmanager
 def _cache_programs() -> Iterator[None]:
-    """Cache compiled programs in our folder, unless the caller has a folder for them."""
+    """Cache compiled programs in our folder within this context, unless the caller has set a folder."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -166,33 +168,34 @@ def _cache_programs() -> Iterator[None]:
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
-        # Otherwise JAX would continue to cache the caller's programs in our folder.
+        # Without this reset, JAX would continue to cache the caller's programs in our folder.
         compilation_cache.reset_cache()
 
 
 def program_folder() -> str | None:
-    """Return the folder of compiled programs and related files; None before `prepare_jax`."""
+    """Return the folder in which JAX caches compiled programs; None if no folder is set."""
     import jax
 
     return getattr(jax.config, "jax_compilation_cache_dir", None)
 
 
-def build_jax_variables(given: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables that JAX reads at its start, made from the variables `given`.
-
-    XLA's devices share one pool of threads. A thread that splits a large task waits for another one to be
-    free; without spare threads all of them would wait forever.
-    """
-    threads = given.get("NPROC", str(4 * count_usable_cores()))
+def build_jax_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables with which JAX is started, given the user's `environment`."""
+    # XLA's devices share a pool of threads. A thread that splits a large task waits for a free thread. With
+    # only one thread per device, all threads could wait forever.
+    threads = environment.get("NPROC", str(4 * count_usable_cores()))
     return {
-        "XLA_FLAGS": build_xla_flags(given.get("XLA_FLAGS", "")),
+        "XLA_FLAGS": build_xla_flags(environment.get("XLA_FLAGS", "")),
         "NPROC": threads,
-        LOG_LEVEL_VARIABLE: given.get(LOG_LEVEL_VARIABLE, FATAL_LOG_LEVEL),
+        LOG_LEVEL_VARIABLE: environment.get(LOG_LEVEL_VARIABLE, FATAL_LOG_LEVEL),
     }
 
 
 def _check_jax_variables() -> dict[str, str]:
-    """Return `build_jax_variables` of this process; raise `InputError` for XLA_FLAGS that would end it."""
+    """Return the environment variables with which JAX is started in this process.
+
+    Raise `InputError` if XLA rejects the user's XLA_FLAGS; XLA itself would end the process.
+    """
     ours = build_jax_variables(os.environ)
     default_flags = build_xla_flags("").split()
     unusual = [
@@ -206,48 +209,54 @@ def _check_jax_variables() -> dict[str, str]:
 
 
 def active_xla_flags() -> str:
-    """Return the flags with which programs are compiled here, as far as known."""
-    return _started_with[0] if _started_with else os.environ.get("XLA_FLAGS", "")
+    """Return the XLA_FLAGS with which this process compiles programs, as far as known."""
+    return _startup_flags[0] if _startup_flags else os.environ.get("XLA_FLAGS", "")
 
 
 def rounding_flags(flags: str) -> str:
-    """Return those XLA_FLAGS that may change the last bits of a result.
+    """Return, sorted, the XLA flags that may change the last bits of a result.
 
-    These are all flags except a number of devices of two or more.
+    These are all flags except the flag for the number of devices, if this number is at least 2.
     """
     alone = f"{DEVICE_COUNT_FLAG}=1"
     return " ".join(sorted(flag for flag in flags.split() if DEVICE_COUNT_FLAG not in flag or flag == alone))
 
 
-def build_xla_flags(given: str) -> str:
-    """Return XLA_FLAGS: the user's flags, which may be in a file, and our flags that the user did not set."""
-    if given and not given.startswith("-"):
-        given = jax_startup.read_xla_flags(given)
+def build_xla_flags(user_flags: str) -> str:
+    """Return the value of XLA_FLAGS: the user's flags, and our flags for names that the user did not set.
+
+    Args:
+        user_flags: The user's XLA_FLAGS: flags, or the name of a file that contains flags.
+    """
+    if user_flags and not user_flags.startswith("-"):
+        user_flags = jax_startup.read_xla_flags(user_flags)
     ours = {
         DEVICE_COUNT_FLAG: max(MIN_DEVICES, count_usable_cores()),
-        # Compilation takes a third of the time; the programs are as fast.
+        # This level takes a third of the compile time, and the programs are not slower.
         "--xla_backend_optimization_level": 1,
-        # The tick's loop becomes one function that computes several arrays at a time, instead of about 60
-        # calls a tick: half the time per tick, a third of a gradient's time, and half the compile time.
+        # With these options, the loop over ticks becomes one function that computes several arrays at a time,
+        # instead of about 60 function calls per tick. The time of a tick and the compile time are halved; a
+        # gradient takes a third of the time.
         "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1000000000,"
         "xla_cpu_use_multi_output_fusion",
     }
     if find_spec("jax_plugins") and os.environ.get("JAX_PLATFORMS") != "cpu":
-        # This flag, unlike the others, would also reduce the optimisation of a graphics card's programs.
+        # Unlike our other flags, this flag would also make programs on a graphics card slower.
         del ours["--xla_backend_optimization_level"]
     elif version("jaxlib").startswith(TESTED_JAXLIB_VERSIONS):
-        # LLVM discards its analysis of the surrounding loops after each loop that it unrolls partially. With
-        # a law of a thousand loops this is a third of the compile time; the programs are not faster.
+        # Each time LLVM unrolls a loop partially, it repeats its analysis of the surrounding loops. For a
+        # compensator with a thousand loops, this is a third of the compile time, and the programs are not
+        # faster.
         ours["--xla_backend_extra_options"] += f",{FULL_UNROLL_OPTION}"
-    user_names = {flag.split("=")[0] for flag in given.split()}
+    user_names = {flag.split("=")[0] for flag in user_flags.split()}
     added = [f"{name}={value}" for name, value in ours.items() if name not in user_names]
-    return " ".join([*given.split(), *added])
+    return " ".join([*user_flags.split(), *added])
 
 
 def supported_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
-    """Return those of a program's `compiler_options` that this version of the compiler has.
+    """Return the compiler options that this version of XLA supports; none on graphics cards.
 
-    On graphics cards there are none. This starts JAX.
+    This function starts JAX.
     """
     import jax
 
@@ -258,7 +267,7 @@ def supported_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
 
 @cache
 def _is_supported(name: str, value: int | str) -> bool:
-    """Return whether the compiler accepts an option."""
+    """Return whether XLA accepts a compiler option."""
     import jax
 
     try:
@@ -269,7 +278,7 @@ def _is_supported(name: str, value: int | str) -> bool:
 
 
 def count_usable_cores() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return os.cpu_count() or 1
@@ -277,11 +286,11 @@ def count_usable_cores() -> int:
 
 @contextmanager
 def use_half_the_cores(half: int) -> Iterator[None]:
-    """Restrict this thread to half of the usable cores (0 or 1), if the system allows it.
+    """Restrict this thread to one half of the usable cores, 0 or 1, within this context.
 
-    The system leaves a thread on its core. Work beside a program of all devices would therefore delay the
-    same device repeatedly, for which the others wait. Alternating between both halves delays all devices
-    equally.
+    Use it for work in a thread beside a program that runs on all devices. The operating system usually leaves
+    a thread on its core, so that such work always delays the same device, and the other devices wait. If
+    successive tasks alternate between both halves of the cores, the delay is shared by all devices.
     """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     cores = sorted(usable)[half::2]
@@ -293,14 +302,14 @@ def use_half_the_cores(half: int) -> Iterator[None]:
 
 
 def _restrict_to_cores(cores: Collection[int]) -> None:
-    """Restrict this thread to these cores, if there are any and the system allows it."""
+    """Restrict this thread to these cores; do nothing if there are none or if the system forbids it."""
     with suppress(OSError):
         if cores:
             os.sched_setaffinity(0, cores)
 
 
 def cache_folder() -> Path | None:
-    """Return $JAXHIL_CACHE or ~/.cache/jaxhil, created if necessary; None if it cannot be written."""
+    """Return the folder $JAXHIL_CACHE or ~/.cache/jaxhil, created if missing; None if not writable."""
     try:
         folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "jaxhil")
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
-"""Checks that JAX can start in this process, so that a failure gives one line and not a crash.
+"""Checks that JAX can start in this process, so that a failure results in a one-line error message.
 
-XLA ends the process for an unknown flag in XLA_FLAGS. JAX raises an exception if there is no device of the
-kind in JAX_PLATFORMS. A process forked from one that runs JAX hangs.
+Without these checks there would be three kinds of failure. XLA ends the process if XLA_FLAGS contains an
+unknown flag. JAX raises a long exception if a platform in JAX_PLATFORMS has no device. A process hangs if it
+was forked from a process that runs JAX.
 """
 
 import os
@@ -14,16 +15,18 @@ from importlib.metadata import version
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_input
 
-MAX_REASON_LENGTH = 300  # characters; greatest length of a reason in a message
+MAX_REASON_LENGTH = 300  # characters; longer texts of XLA and JAX are shortened in our messages
 
 _FLAG_TEST_CODE = "import jax; jax.jit(lambda: 0)()"
-_LOG_LINE = re.compile(r"[EF]\d{4} .*?\] (.*)|(xla: .*)")  # last message of XLA before it ends the process
-_processes: set[int] = set()  # ids of processes that started JAX: this one, or one from which it was forked
+# Message that XLA writes before it ends the process.
+_LOG_LINE = re.compile(r"[EF]\d{4} .*?\] (.*)|(xla: .*)")
+# Ids of processes that have started JAX: this process, and the process from which this process was forked.
+_processes: set[int] = set()
 
 
 @cache
 def check_xla_flags(flags: str) -> None:
-    """Raise `InputError` if XLA rejects the flags; a separate process tests them, since XLA would end it."""
+    """Raise `InputError` if XLA rejects these flags; test them in a child process, which XLA may end."""
     variables = {
         name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "TF_CPP_"))
     }
@@ -46,7 +49,7 @@ def check_xla_flags(flags: str) -> None:
 
 
 def read_xla_flags(name: str) -> str:
-    """Return the flags in a file, which XLA accepts too; raise `InputError` if it cannot be read."""
+    """Return the XLA flags in the file `name`; raise `InputError` if the file cannot be read."""
     try:
         with open_input(name) as file:
             return " ".join(file.read().decode().split())
@@ -56,7 +59,7 @@ def read_xla_flags(name: str) -> str:
 
 
 def find_startup_error() -> InputError | None:
-    """Return the error with which JAX does not start; None if it starts or was not asked to."""
+    """Return the error that JAX raises at its start; None if JAX starts or has not been imported."""
     try:
         if "jax" in sys.modules:
             import jax
@@ -68,7 +71,7 @@ def find_startup_error() -> InputError | None:
 
 
 def convert_jax_error(error: Exception) -> InputError:
-    """Return JAX's exception, raised during import or access to its devices, as a one-line error."""
+    """Convert an exception that JAX raises at its start to an error with a one-line message."""
     variables = {name: value for name, value in sorted(os.environ.items()) if name.startswith("JAX_")}
     found = ", ".join(f"{name}={value}" for name, value in variables.items()) or "no variable JAX_... set"
     reason = str(error) or "there is no such device"
@@ -80,7 +83,7 @@ def convert_jax_error(error: Exception) -> InputError:
 
 
 def check_not_forked() -> None:
-    """Raise `InputError` in a process forked after JAX had been started, since it would hang."""
+    """Raise `InputError` if this process was forked from a process that runs JAX; it would hang."""
     _processes.add(os.getpid())
     if len(_processes) > 1:
         allowed = 'one begun by spawn: multiprocessing.get_context("spawn")'

@@ -1,8 +1,11 @@
-"""Loop of a hardware-in-the-loop contact rig: its static structure, its constants, and the start of a run.
+"""Loop of a hardware-in-the-loop contact rig: static structure, constants, and state at the start of a run.
 
-`jaxhil.simulation.tick` runs one tick, with the stages of notebooks/guide/model.md, section 1. Time is in
-control periods, and each lane of a batch has its own. A `Loop` is static: it determines the compiled program.
-`RigConstants` are arrays that stay constant during a run. `LoopState` is the state.
+Three classes describe the loop. `Loop` is static and determines the compiled program. `RigConstants` contains
+arrays that stay constant during a run. `LoopState` contains arrays that change from tick to tick. The module
+`jaxhil.simulation.tick` computes one tick (notebooks/guide/model.md, section 1).
+
+The arrays have batch axes. A lane is one element of the batch, that is, one scenario. Time is in control
+periods, and every lane has its own control period.
 """
 
 from typing import NamedTuple
@@ -29,42 +32,43 @@ from jaxhil.simulation.scenario import Scenario
 
 
 class Loop(eqx.Module):
-    """Structure of the loop, which determines the compiled program; every field is static."""
+    """Static structure of the loop, which determines the compiled program."""
 
     law: ContactLaw = eqx.field(static=True)  # contact law
     compensator: Compensator = eqx.field(static=True)  # compensator
-    integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `INTEGRATORS`
-    hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
-    latency: int = eqx.field(static=True)  # latency of the command, 0 or 1 periods
+    integrator: str = eqx.field(static=True)  # integrator of the numerical model, a key of `INTEGRATORS`
+    hold: str = eqx.field(static=True)  # hold of the position command: "linear" or "zoh" (zero-order hold)
+    latency: int = eqx.field(static=True)  # delay of the position command, 0 or 1 [control periods]
     has_lag: bool = eqx.field(static=True)  # whether the force sensor has a first-order lag
     has_force_bias: bool = eqx.field(static=True)  # whether the force sensor has a bias
     has_force_noise: bool = eqx.field(static=True)  # whether the force sensor has noise
     has_position_noise: bool = eqx.field(static=True)  # whether the position sensor has noise
-    # whether a reading has a quantum, a dead zone or a range
+    # whether a sensor quantises its readings or has a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True)
-    # whether the motion simulator has limits of velocity or acceleration
+    # whether the motion simulator has a velocity limit or an acceleration limit
     has_limits: bool = eqx.field(static=True)
-    # order of the lowest derivative of the mechanism's position that jumps at the ticks; 3 if higher than 2
+    # order of the lowest time derivative of the mechanism's position that jumps at the ticks, at most 3
     discontinuity_order: int = eqx.field(static=True)
-    cells: CellCounts = eqx.field(static=True)  # cells of a sampling interval; `NO_CELLS` if samples suffice
+    cells: CellCounts = eqx.field(static=True)  # cells of a sampling interval; `NO_CELLS` if not used
     is_two_sided: bool = eqx.field(static=True)  # whether there is a second surface
-    ring: int = eqx.field(static=True)  # samples in the delay lines of the sensors
-    controller_ring: int = eqx.field(static=True)  # samples in the delay lines of the controller
+    ring: int = eqx.field(static=True)  # length of the sensors' delay lines [samples]
+    controller_ring: int = eqx.field(static=True)  # length of the compensator's delay lines [samples]
     energies: bool = eqx.field(static=True)  # whether the work of the contact force is recorded
-    probed: bool = eqx.field(static=True)  # whether scenarios have a `Probe`
-    chatter: bool = eqx.field(static=True)  # whether the swings of the force command are recorded
+    probed: bool = eqx.field(static=True)  # whether the scenarios have a `Probe`
+    chatter: bool = eqx.field(static=True)  # whether the total variation of the force command is recorded
 
     @property
     def reads_always(self) -> bool:
-        """Return whether the force sensor reads a force without contact, due to noise or bias."""
+        """Return whether noise or bias makes the force sensor read a force without contact."""
         return self.has_force_noise or self.has_force_bias
 
     @property
     def is_idle_in_flight(self) -> bool:
-        """Return whether nothing happens in flight before the hardware touches.
+        """Return whether the approach to a contact is uniform motion without any event, and can be skipped.
 
-        This requires no limits of the drives, no noise, bias or rounding of readings, a compensator that
-        waits for the contact, and no probe, whose time counts from x_d = 0.
+        This requires that readings have no noise, bias or quantisation, that the motion simulator has no
+        limits, and that the compensator does nothing before the contact. There must be no probe either,
+        because its time starts at x_d = 0.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)
@@ -72,54 +76,58 @@ class Loop(eqx.Module):
 
     @property
     def first_tick(self) -> int:
-        """Return the number of the first tick: delay lines are read up to one ring back."""
+        """Return the number of the first tick, so large that indices into delay lines are not negative."""
         return max(self.ring, self.controller_ring)
 
     @property
     def has_corners(self) -> bool:
-        """Return whether the real force may have its peak at a corner: at a tick or a reversal."""
+        """Return whether the peak of the real force may lie at a kink or jump of the force."""
         return self.discontinuity_order in (1, 2) or (self.discontinuity_order > 0 and self.law.jumps)
 
     @property
     def follows_intervals(self) -> bool:
-        """Return whether the motion between samples is needed."""
+        """Return whether the motion between the samples is needed."""
         return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
     @property
     def has_cells(self) -> bool:
-        """Return whether the contact follows the exact motion between samples."""
+        """Return whether the contact is computed from the exact motion between the samples."""
         return self.cells.part > 0
 
 
 class Delays(NamedTuple):
-    """Delays of a loop in sampling intervals.
+    """Delays of a loop, in sampling intervals.
 
-    With one surface the contact law is evaluated as soon as the motion is known, which is earlier than the
-    motion by the transport delay. With two surfaces its parameters may change in the meantime. It is then
-    evaluated when the motion takes place, and the other delays count from there.
+    With one surface, the contact law is evaluated as soon as the motion is known. This is earlier than the
+    motion itself by the transport delay. With two surfaces, the parameters of the contact law may change
+    before the motion takes place. The contact law is then evaluated when the motion takes place, and the
+    delay of the force reading counts from this evaluation.
     """
 
     force: SplitDelay  # delay of the force reading
     position: SplitDelay  # delay of the position reading
-    real: Int[Array, "*batch"]  # intervals to look back for the newest force that acts before a tick
-    contact: Int[Array, "*batch"]  # intervals after which the contact law is evaluated
+    real: Int[Array, "*batch"]  # age of the newest computed force that acts before the current tick
+    contact: Int[Array, "*batch"]  # delay of the contact law's evaluation
 
 
 class RigConstants(NamedTuple):
-    """Constants of a run, per lane."""
+    """Arrays that stay constant during a run."""
 
-    scenario: Scenario  # numbers of the lane
+    scenario: Scenario  # numbers of the scenarios
     propagation: Propagation  # discretised motion simulator
     cells: Cells | None  # cells of a sampling interval; None for a loop without cells
-    delays: Delays  # in sampling intervals
-    constants: KnownConstants  # rig data that the controller knows
-    inverse_mass: Float[Array, "*batch"]  # inverse of the equivalent mass [1/kg]
+    delays: Delays  # delays of the loop [sampling intervals]
+    constants: KnownConstants  # rig data that the compensator knows
+    inverse_mass: Float[Array, "*batch"]  # reciprocal of the equivalent mass [1/kg]
 
 
 def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -> RigConstants:
-    """Discretise the linear parts exactly and split every delay into sampling intervals and a fraction.
+    """Compute the constants of a run from its scenarios.
 
-    Without `measured`, runs have no position reading, which saves time in every tick.
+    Args:
+        loop: Loop that will run the scenarios.
+        scenario: Scenarios.
+        measured: Whether the position sensor is simulated. Without it, every tick takes less time.
     """
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)
@@ -153,7 +161,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
 
 
 def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
-    """Return every delay of a scenario in sampling intervals."""
+    """Convert the delays of the scenarios to sampling intervals."""
     period, simulator = scenario.control_period, scenario.simulator
     force = split_delay(simulator.delay + scenario.force_sensor.delay, period)
     position = split_delay(simulator.delay + scenario.position_sensor.delay, period)
@@ -174,10 +182,19 @@ def start_uniform_motion(
     velocity: Array,
     tick: Array,
 ) -> LoopState:
-    """Start a run at `tick` in uniform motion at `position` [m], `velocity` [m/s].
+    """Return the loop's state for a run that starts in uniform motion.
 
-    The motion simulator is in the steady state of this motion, including the hold of the command. The delay
-    lines need not be filled.
+    The motion simulator is in the steady state of this motion. The delay lines keep their content, because
+    samples from before the start of the run are never read.
+
+    Args:
+        loop: Loop.
+        rig: Constants of the run.
+        gains: Gains of the compensator.
+        state: State from which the compensator's state and the delay lines are taken.
+        position: Position of the numerical model at the start [m].
+        velocity: Velocity of the numerical model [m/s].
+        tick: Number of the first tick of the run.
     """
     stride = rig.constants.control_period * velocity
     commands = tuple(
@@ -203,7 +220,7 @@ def start_uniform_motion(
         ),
         sensed=state.sensed._replace(
             last=no_contact(position),
-            touched=jnp.zeros_like(position) if loop.has_cells else None,
+            contact_time=jnp.zeros_like(position) if loop.has_cells else None,
             lagged=jnp.zeros_like(position),
             first_position=first_position,
         ),

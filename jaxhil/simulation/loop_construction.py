@@ -1,7 +1,7 @@
-"""Construction of the static `Loop` of a mechanism and a compensator for a batch of scenarios.
+"""Construction of the static `Loop` for a mechanism, a compensator and a batch of scenarios.
 
-A `Loop` contains only what determines the compiled program. Delay lines have lengths that are powers of two,
-so that mechanisms with similar delays share one program.
+A `Loop` contains only what determines the compiled program. The lengths of delay lines are powers of two, so
+that mechanisms with similar delays share a program.
 """
 
 import jax
@@ -15,11 +15,15 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario
 
 MIN_RING_LENGTH = 16  # samples; least length of a delay line
-# Greatest pole and contact frequency [rad per control period] for which samples suffice.
-# SLOW: the peak force is accurate to 2e-3.
-# SLOW_BETWEEN, for force sensors with a lag and laws with memory: the restitution is accurate to 1e-5.
-MAX_SAMPLED_RATES, MAX_SAMPLED_RATES_WITH_MEMORY = (1.0, 0.1), (0.15, 0.05)
-DAMPER_WEIGHT = 2.0  # weight of a damper's rate b/M against a frequency, as its force jumps at the touch
+# Fastest pole of the motion simulator and contact frequency [rad per control period] up to which the contact
+# is computed without cells. Up to these rates, the peak force is accurate to 2e-3.
+MAX_SAMPLED_RATES = (1.0, 0.1)
+# The same rates for force sensors with a lag and for contact laws with memory: up to these rates, the
+# restitution is accurate to 1e-5.
+MAX_SAMPLED_RATES_WITH_MEMORY = (0.15, 0.05)
+# [1]; factor for the rate b/M of a damper, which is then compared with contact frequencies. The factor
+# exceeds 1 because a damper's force jumps at the onset of contact.
+DAMPER_WEIGHT = 2.0
 
 
 def build_loop(
@@ -30,11 +34,17 @@ def build_loop(
     chatter: bool = False,
     exact: bool = False,
 ) -> Loop:
-    """Return the loop of `mechanism` with the compensator named `compensator`, for all `scenarios`.
+    """Build the loop that runs all `scenarios` of a mechanism.
 
-    `energies` records the mechanical work of the real force, `chatter` the command's excess variation.
-    `exact` computes restitution, peak force, duration and work to 1e-6 from the motion between samples.
-    Without it, the samples alone are used where they are accurate enough, which is several times faster.
+    Args:
+        mechanism: Mechanism.
+        compensator: Name of the compensator.
+        scenarios: Scenarios; every effect that one of them has is included in the loop.
+        energies: Whether to record the mechanical work of the real force.
+        chatter: Whether to record the excess variation of the force command.
+        exact: Whether to compute the contact from the exact motion between the samples in every case.
+            Restitution, peak force, duration and work are then accurate to 1e-6. Otherwise a method that is
+            several times faster is used for slow motion, where its accuracy is sufficient.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator
@@ -43,7 +53,7 @@ def build_loop(
     aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
 
     def samples(delay) -> int:
-        """Return the length of a delay line that reaches `delay` [s] back, current interval included."""
+        """Return the length of a delay line for a delay of up to `delay` [s]."""
         periods = float(np.max(delay / scenarios.control_period))
         return max(MIN_RING_LENGTH, 1 << int(np.ceil(np.log2(periods + 4))))
 
@@ -79,9 +89,9 @@ def build_loop(
 
 
 def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts:
-    """Return the number of cells, or `NO_CELLS` if samples are accurate enough and `exact` is not set.
+    """Return the numbers of cells; `NO_CELLS` if the motion is slow and `exact` is not set.
 
-    Cells are counted for the fastest pole and the shortest lag of any lane, at the longest control period.
+    The numbers suffice for the fastest pole, shortest lag and longest control period of all scenarios.
     """
     period = float(np.max(scenarios.control_period))
     fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
@@ -95,12 +105,13 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
 
 
 def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
-    """Return the largest contact frequency [rad/s] of any lane, entered at the first approach's velocity.
+    """Return the largest contact frequency [rad/s] of all scenarios, for the first approach velocity.
 
-    This is sqrt(F'/M) at the greatest penetration, or 2 F_d/M if larger, where F_d is the slope of the force
-    against the penetration rate at the onset.
+    The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, k is the slope
+    of the force against the penetration at the greatest penetration, and b is the slope of the force against
+    the penetration rate at the onset of contact.
     """
-    # NumPy broadcasts slots and lanes; JAX, of which the scenarios may be, would refuse it.
+    # Scenarios may be JAX arrays. Only NumPy broadcasts arrays with a slot axis against arrays without one.
     law, contact = find_contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     if contact.stiffness.ndim > contact.damping.ndim:  # (slots, segments, lanes): the stiffest segment
@@ -114,7 +125,7 @@ def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
 def _find_discontinuity_order(numerator, hold: str) -> int:
     """Return the order of the lowest derivative of the position that jumps at the ticks, at most 3.
 
-    It is the relative degree of the motion simulator, plus 1 if the command itself does not jump.
+    The order is the relative degree of the motion simulator, plus 1 if the position command does not jump.
     """
     proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
     return min((proper[0] if proper else 0) + (hold == "linear"), 3)

@@ -1,4 +1,4 @@
-"""State of the loop from tick to tick: numerical model, motion simulator, delay lines of the sensors."""
+"""State of the loop: numerical model, motion simulator, sensors, contact law and compensator."""
 
 from typing import Any, NamedTuple
 
@@ -10,58 +10,58 @@ from jaxhil.simulation.probe import FirstContact
 
 
 class PlantState(NamedTuple):
-    """Drives and motion simulator."""
+    """State of the drives and of the motion simulator."""
 
-    commands: tuple[Array, ...]  # position commands sent to the drives, c(n), c(n-1), ... [m]
-    step: Array  # last step of the command [m]
+    commands: tuple[Array, ...]  # limited position commands c(n), c(n-1), ... that the drives received [m]
+    step: Array  # last step of the limited position command, c(n) - c(n-1) [m]
     state: tuple[Array, ...]  # state of the motion simulator
-    wanted: Float[Array, "*batch"] | None  # c(n) before the limits [m]; None without limits
+    wanted: Float[Array, "*batch"] | None  # unlimited position command for tick n [m]; None without limits
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
-        """Command c(n) of the controller [m], before any limits."""
+        """Unlimited position command of the compensator for tick n [m]."""
         return self.commands[0] if self.wanted is None else self.wanted
 
     @property
     def shortfall(self) -> Float[Array, "*batch"] | None:
-        """Distance [m] of c(n) from the command before the limits; None without limits."""
+        """Distance [m] between the limited and the unlimited position command; None without limits."""
         return None if self.wanted is None else abs(self.wanted - self.commands[0])
 
 
 class Rings(NamedTuple):
-    """Delay lines, each a ring of samples."""
+    """Delay lines of the sensors, stored as ring buffers."""
 
-    plant_signals: PlantSignals  # contact without the effects of the sensors
-    # force behind the sensor's lag [N]; None without lag
+    plant_signals: PlantSignals  # real forces, without the effects of the sensors
+    # output of the force sensor's lag at the sampling instants [N]; None for a sensor without lag
     reading: Float[Array, "samples *batch"] | None
-    # position of the mechanism at its sampling instant [m]; None if unused
+    # position of the mechanism when the position sensor samples it [m]; None if unused
     position: Float[Array, "samples *batch"] | None
-    # sampling intervals whose contact is not yet computed; None with one surface
+    # sampling intervals in which the contact is not yet computed; None with one surface
     interval: SamplingInterval | None
 
 
 class SensorState(NamedTuple):
-    """Inputs of future sensor readings."""
+    """State of the sensors, from which future readings are computed."""
 
-    rings: Any  # delay lines (`Rings`; None if they are stored separately)
-    last: ContactSample  # last sample of the contact
-    # time with a force since the last sample [periods]; None if touching samples are counted instead
-    touched: Array | None
-    lagged: Array  # reading of a lagging force sensor at the end of its sampling interval [N]
-    # position sample of the sampling interval before the run [m]; None if unused
+    rings: Any  # delay lines (`Rings`); None while they are stored separately
+    last: ContactSample  # contact at the last sampling instant
+    # duration of contact since the last sample [periods]; None if samples in contact are counted instead
+    contact_time: Array | None
+    lagged: Array  # output of the force sensor's lag at the end of the last sampling interval [N]
+    # sample of the position sensor in the sampling interval before the run [m]; None if unused
     first_position: Array | None
 
 
 class LoopState(NamedTuple):
-    """State of the loop."""
+    """State of the loop, which changes from tick to tick."""
 
     position: Float[Array, "*batch"]  # position of the numerical model [m]
     velocity: Float[Array, "*batch"]  # velocity of the numerical model [m/s]
-    plant: PlantState  # drives and motion simulator
-    sensed: SensorState  # inputs of future sensor readings
+    plant: PlantState  # state of the drives and of the motion simulator
+    sensed: SensorState  # state of the sensors
     law: tuple[Array, ...]  # state of the contact law
     controller: Any  # state of the compensator
-    parameters: ContactParameters  # contact law's parameters for the current contact
-    onset_velocity: Float[Array, "*batch"]  # velocity of the uniform motion in which the run began [m/s]
-    onset_tick: Int[Array, "*batch"]  # tick at which the run began
+    parameters: ContactParameters  # parameters of the contact law in the current contact
+    onset_velocity: Float[Array, "*batch"]  # velocity of the uniform motion at the start of the run [m/s]
+    onset_tick: Int[Array, "*batch"]  # number of the first tick of the run
     first_contact: FirstContact | None  # first touch of the hardware; None without a probe

@@ -1,4 +1,4 @@
-"""Metrics of finished contacts: restitution, peaks, duration, energies, and status."""
+"""Metrics of each contact on the rig: restitution, peaks, duration, work and status."""
 
 from typing import NamedTuple
 
@@ -18,52 +18,56 @@ CONTACT_STATUS_NAMES = {
     DIVERGED: "diverged",
     NON_FINITE: "non-finite",
 }
-# Explanations of the statuses other than `OK`.
+# Explanation of every status except `OK`.
 CONTACT_STATUS_REASONS = {
     "not reached": "the numerical model turned back without a measured force: the hardware did not touch, or "
-    "the force sensor did not show it; or the contact before left faster than velocity_limit, and the drives "
-    "cannot follow the next approach",
+    "the force sensor did not show the contact; or the rebound of the contact before was faster than "
+    "velocity_limit, and the drives cannot follow the next approach",
     "timeout": f"a contact was not over within {MAX_CONTACT_DURATION:g} s, the limit of a contact",
-    "diverged": f"the speed grew beyond {DIVERGENCE_SPEED_RATIO:g} times that of the first approach",
+    "diverged": f"the speed grew beyond {DIVERGENCE_SPEED_RATIO:g} times the speed of the first approach",
     "non-finite": "a number was no longer finite",
 }
 
 
 class Metrics(NamedTuple):
-    """Metrics of every contact, (slots, *batch).
+    """Metrics of every contact; arrays of shape (contacts, *batch).
 
-    excess_variation is V / 2 - (max F_c - min F_c), where V = sum |F_c(n+1) - F_c(n)| is the total variation
-    of the command, which counts as 0 before and after the contact. A command that rises to its maximum, falls
-    to its minimum and returns to 0 has the least V / 2, which is max - min. The excess is chatter: max - min
-    for each additional full swing.
+    `excess_variation` measures the chatter of the force command F_c. It is V/2 - (max F_c - min F_c), where
+    V = sum |F_c(n+1) - F_c(n)| is the total variation of F_c, which counts as 0 before and after the contact.
+    It is 0 for a command that rises to its maximum, falls to its minimum and returns to 0. Each further swing
+    adds its height.
 
-    position_shortfall is the largest |c - c'| at any tick of the contact, where c is the compensator's
-    position command and c' the command after the velocity and acceleration limits. It is exactly 0 if no
-    limit is active.
+    `position_shortfall` is the largest |c - c'| at any tick of the contact. Here c is the compensator's
+    position command, and c' is the command after the velocity and acceleration limits. The shortfall is
+    exactly 0 if no limit is active.
+
+    `trajectory_error` compares the penetration of the numerical model with the penetration of the ideal
+    contact. The time of each penetration counts from its own onset of contact. The error is the root mean
+    square of the difference over the duration of the ideal contact.
     """
 
     restitution: Float[Array, "slots *batch"]  # rebound speed over approach speed [1]
-    approach_velocity: Float[Array, "slots *batch"]  # of the numerical model before the contact [m/s]
+    approach_velocity: Float[Array, "slots *batch"]  # speed of the numerical model before the contact [m/s]
     peak_force: Float[Array, "slots *batch"]  # largest real contact force [N]
     peak_command: Float[Array, "slots *batch"]  # largest |F_c| [N]
-    excess_variation: Float[Array, "slots *batch"]  # of F_c [N], see above; 0 unless recorded
-    # greatest change of the position command by the limits [m], see above
+    excess_variation: Float[Array, "slots *batch"]  # chatter of F_c [N], see above; 0 unless recorded
+    # largest change of the position command by the limits [m], see above
     position_shortfall: Float[Array, "slots *batch"]
-    duration: Float[Array, "slots *batch"]  # time with a real force [s]
-    # work done on the mechanism by the real force along x_a [J]; 0 unless recorded
+    duration: Float[Array, "slots *batch"]  # time during which a real force acts [s]
+    # work done on the mechanism by the real force [J]; 0 unless recorded
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]  # work returned by the mechanism [J]; 0 unless recorded
-    # root mean square difference of the penetrations of x_d and of the ideal contact, each since its touch,
-    # for the ideal contact's duration [m]; 0 unless probed
+    # rms difference from the ideal contact [m], see above; 0 without a probe
     trajectory_error: Float[Array, "slots *batch"]
-    # compensator's estimate of the force measurement's delay [s]; 0 unless it has one
+    # delay of the force measurement as estimated by the compensator [s]; 0 if it estimates no delay
     force_delay: Float[Array, "slots *batch"]
-    status: Int[Array, "slots *batch"]  # one of `CONTACT_STATUS_NAMES`
-    ticks: Int[Array, "slots *batch"]  # ticks until then, including the skipped ticks of approaches
+    status: Int[Array, "slots *batch"]  # key of `CONTACT_STATUS_NAMES`
+    # ticks from the start of the first run to the end of this contact, with the skipped ticks of approaches
+    ticks: Int[Array, "slots *batch"]
 
 
 def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
-    """Return the metrics before any contact."""
+    """Return the initial metrics, before any contact: NaN, or 0 for metrics that are not recorded."""
     numbers = jnp.full((slots, *like.shape), jnp.nan, like.dtype)
     counts = jnp.zeros((slots, *like.shape), jnp.int32)
     return Metrics(
@@ -84,22 +88,22 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
 
 
 def determine_status(scenario: Scenario, watch: Watch, age: Array) -> Array:
-    """Return the status of the current contact, `age` ticks into its run.
+    """Return the status of the current contact; `OK` also while the contact continues.
 
-    It is OK also while the contact continues.
+    `age` is the number of ticks since the run began.
     """
     period = scenario.control_period
-    way = jnp.where(
+    distance = jnp.where(
         jnp.isfinite(scenario.clearance), scenario.clearance, -jnp.minimum(scenario.contact_plane, 0)
     )
     limit = scenario.time_limit / period
-    patience = limit + 10 * way / scenario.velocity / period
-    waiting = (watch.elapsed == 0) & (age.astype(period.dtype) > patience)
-    late = (watch.elapsed > limit) | waiting
-    # Without a measured force there was no contact, whatever reversed the numerical model.
+    max_flight = limit + 10 * distance / scenario.velocity / period
+    is_missing = (watch.elapsed == 0) & (age.astype(period.dtype) > max_flight)
+    late = (watch.elapsed > limit) | is_missing
+    # If the numerical model turned back without a measured force, there was no contact.
     ended = jnp.where(watch.measured, OK, NOT_REACHED)
-    cut = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
-    status = jnp.where(watch.over, ended, jnp.where(late, cut, OK))
+    timed_out = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
+    status = jnp.where(watch.over, ended, jnp.where(late, timed_out, OK))
     status = jnp.where(watch.rebound > DIVERGENCE_SPEED_RATIO * scenario.velocity, DIVERGED, status)
     finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
     return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
@@ -115,24 +119,28 @@ def store_metrics(
     ticks: Array,
     force_delay: Array | None = None,
 ) -> Metrics:
-    """Write the metrics of contacts that are `over` and were reached, at their `index`.
+    """Return the metrics, updated with the contacts that have ended.
+
+    A contact that was not reached is not written.
 
     Args:
         scenario: Scenarios.
-        metrics: Metrics so far.
-        watch: Records of the current contacts.
-        index: Slot of each lane's contact.
-        over: Whether a lane's contact is over.
-        status: Status of the contact.
-        ticks: Number of ticks so far.
-        force_delay: Compensator's estimate of the force measurement's delay [s]; None without one.
+        metrics: Metrics of earlier contacts.
+        watch: Record of the current contact of each lane.
+        index: Index of the current contact of each lane.
+        over: Whether the current contact of each lane has ended.
+        status: Status of the current contact.
+        ticks: Number of ticks since the first run began.
+        force_delay: Delay of the force measurement as estimated by the compensator [s]; None if it estimates
+            no delay.
     """
     period = scenario.control_period
     zeros = jnp.zeros_like(period)
-    work_in, work_out = watch.works or (zeros, zeros)
+    work_in, work_out = watch.work or (zeros, zeros)
     excess = zeros
-    if watch.swings is not None:
-        excess = watch.swings.variation / 2 - (watch.swings.highest - watch.swings.lowest)
+    if watch.command_variation is not None:
+        command = watch.command_variation
+        excess = command.variation / 2 - (command.highest - command.lowest)
     optional = {
         "position_shortfall": watch.shortfall,
         "trajectory_error": None if watch.deviation is None else root_mean_square(watch.deviation),
@@ -155,7 +163,7 @@ def store_metrics(
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
     mask = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
     updated = Metrics(*(jnp.where(mask, v[None], m) for v, m in zip(values, metrics, strict=True)))
-    # Values that are not recorded keep their initial value, which saves time.
+    # Metrics that are not recorded keep their initial arrays, which saves time.
     return updated._replace(
         **{name: getattr(metrics, name) for name, value in optional.items() if value is None}
     )

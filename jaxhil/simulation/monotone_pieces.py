@@ -1,6 +1,7 @@
-"""Motion in the cells of a sampling interval, and its monotone pieces.
+"""Division of the motion in each cell into pieces of monotone motion.
 
-The relative time s in a cell is from 0 to 1. Arrays have the axes (pieces of a cell, cells, *batch).
+A cell (`jaxhil.simulation.cells`) is a short part of a sampling interval. The relative time s in a cell runs
+from 0 to 1. Arrays have the axes (pieces of a cell, cells, *batch).
 """
 
 from typing import NamedTuple
@@ -11,33 +12,33 @@ from jaxtyping import Array
 
 from jaxhil.simulation.roots import find_sign_change
 
-SHORT_CELL_DEGREE = 8  # degree of a series on a short cell, in which the motion reverses at most once
+SHORT_CELL_DEGREE = 8  # degree of the series in a short cell, in which the motion reverses at most once
 
 
 class CellMotion(NamedTuple):
-    """Motion in each cell; the relative time s in a cell is from 0 to 1."""
+    """Position and velocity in each cell, as power series in the time since the cell's start [periods]."""
 
-    position: Array  # series of the position [m], (powers, cells, *batch)
-    rate: Array  # series of the velocity [m per period]
-    length: Array  # length of the cells [periods], (cells, *batch)
+    position: Array  # coefficients of the position [m], (powers, cells, *batch)
+    rate: Array  # coefficients of the velocity [m per period], (powers, cells, *batch)
+    length: Array  # length of each cell [periods], (cells, *batch)
 
 
 class MonotonePieces(NamedTuple):
-    """Cells divided where the motion reverses, (pieces of a cell, cells, *batch)."""
+    """Pieces of the cells in which the motion is monotone, (pieces of a cell, cells, *batch)."""
 
-    path: CellMotion
-    low: Array  # s at which a piece begins
-    high: Array  # s at which it ends
-    way: Array  # 1 if the position increases, else -1
+    path: CellMotion  # motion in the cells
+    low: Array  # relative time at which a piece begins, 0 to 1
+    high: Array  # relative time at which a piece ends, 0 to 1
+    way: Array  # 1 if the position increases in the piece, else -1
 
 
 def build_cell_motion(series: Array, length: Array) -> CellMotion:
-    """Return the motion with this series in powers of the time since a cell's start [periods]."""
+    """Return the motion with these coefficients of the position [m] in cells of `length` [periods]."""
     return CellMotion(series, _derivative(series), length)
 
 
 def split_at_reversals(path: CellMotion) -> MonotonePieces:
-    """Return the pieces of cells in which the motion reverses at most twice, in short ones at most once."""
+    """Divide the cells where the motion reverses: at most twice in a cell, at most once in a short cell."""
     low, high = jnp.zeros_like(path.length), jnp.ones_like(path.length)
     if len(path.position) == 2:
         return split_at(path, jnp.stack([low, high]))
@@ -46,28 +47,29 @@ def split_at_reversals(path: CellMotion) -> MonotonePieces:
     bend = find_sign_change(velocity_at, path._replace(rate=_derivative(path.rate)), low, high, high)
     begin, end = jnp.stack([low, bend]), jnp.stack([bend, high])
     early, late = find_sign_change(velocity_at, path, begin, end, end)
-    # The velocity is monotone on each piece too, so that the force of a damper vanishes at most once.
+    # The cells are divided at `bend` too: the velocity is then monotone in each piece, and the force of a
+    # damper vanishes at most once.
     return split_at(path, jnp.stack([low, early, bend, late, high]))
 
 
 def split_at(path: CellMotion, edges: Array) -> MonotonePieces:
-    """Return the pieces between relative times, (edges, cells, *batch)."""
+    """Divide each cell at the relative times `edges`, (edges, cells, *batch), into monotone pieces."""
     moved = position_at(path, edges[1:]) - position_at(path, edges[:-1])
     return MonotonePieces(path, edges[:-1], edges[1:], jnp.where(moved < 0, -1, 1).astype(moved.dtype))
 
 
 def position_at(path: CellMotion, s: Array) -> Array:
-    """Return the position [m] at the relative time s."""
+    """Return the position [m] at the relative time `s` in each cell."""
     return horner(path.position, s * path.length)
 
 
 def velocity_at(path: CellMotion, s: Array) -> Array:
-    """Return the velocity [m per period] at the relative time s."""
+    """Return the velocity [m per period] at the relative time `s` in each cell."""
     return horner(path.rate, s * path.length)
 
 
 def horner(series: Array, tau: Array) -> Array:
-    """Return the sum of `series[j] tau^j`."""
+    """Evaluate the polynomial with the coefficients `series`, ascending powers, at `tau`."""
     total = jnp.broadcast_to(series[-1], jnp.broadcast_shapes(series.shape[1:], tau.shape))
     for power in range(len(series) - 2, -1, -1):
         total = series[power] + tau * total
@@ -75,6 +77,6 @@ def horner(series: Array, tau: Array) -> Array:
 
 
 def _derivative(series):
-    """Return the series of the derivative."""
+    """Return the coefficients of a power series' derivative."""
     orders = np.arange(1, len(series)).reshape(-1, *[1] * (series.ndim - 1))
     return series[1:] * orders.astype(series.dtype)

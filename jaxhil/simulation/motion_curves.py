@@ -1,4 +1,4 @@
-"""Nominal run tick by tick, and the ideal contacts, for plots."""
+"""Curves of force and position against time for plots: runs on the rig, and the ideal contacts."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -17,38 +17,39 @@ from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.recording import LaneRecord, prepare_recording, record_lanes
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
-INTEGRATION_STEPS = 8000  # steps of the ideal contact's integration
-STORED_POINTS = 800  # number of stored points
+INTEGRATION_STEPS = 8000  # number of steps in the integration of the ideal contact
+STORED_POINTS = 800  # number of points of a curve of the ideal contact
 
-NamedCompensators = Mapping[str, tuple[str, Mapping[str, float]]]  # compensator and gains by name
+# Compensator and its gains, by name of the curve.
+NamedCompensators = Mapping[str, tuple[str, Mapping[str, float]]]
 
 
 class Curve(NamedTuple):
-    """Motion over time."""
+    """Force and position against time, on the rig or in the ideal contact."""
 
     velocity: float  # approach velocity [m/s]
-    time: np.ndarray  # [s]
+    time: np.ndarray  # time since the numerical model's first touch [s]
     force: np.ndarray  # force on the numerical model [N]
     position: np.ndarray  # position of the numerical model [m]
-    force_measured: np.ndarray | None  # [N]; None for the ideal contact
-    position_measured: np.ndarray | None  # [m]; None for the ideal contact
+    force_measured: np.ndarray | None  # reading of the force sensor [N]; None for the ideal contact
+    position_measured: np.ndarray | None  # reading of the position sensor [m]; None for the ideal contact
 
 
 class RunMotion(NamedTuple):
-    """One run of the schedule: a contact or, with two surfaces, all contacts.
+    """Curves of one run: a single contact or, with two surfaces, all contacts.
 
-    Time 0 is the first touch, extrapolated by uniform motion.
+    The time of the first touch is 0. It is extrapolated from the start of the run by uniform motion.
     """
 
-    name: str  # name of the run
+    name: str  # name of the run, for the title of its panel
     surfaces: tuple[float, ...]  # positions of the mechanism's surfaces [m]
     curves: dict[str, Curve]  # curves by name; "in space" is the ideal contact
 
 
 def compute_nominal_motion(mechanism: Mechanism, laws: NamedCompensators, seed: int = 0) -> list[RunMotion]:
-    """Return the pieces of the nominal run under each of the `laws`.
+    """Simulate the nominal contacts with each of the compensators; return the curves of each run.
 
-    The ideal contacts have the approach velocities of the last law's run.
+    The ideal contacts have the approach velocities of the last compensator's run.
     """
     runs: dict[str, list[Curve]] = {}
     lanes = list(_scenarios_by_compensator(mechanism, laws, seed))
@@ -58,12 +59,12 @@ def compute_nominal_motion(mechanism: Mechanism, laws: NamedCompensators, seed: 
 
 
 def compute_scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[RunMotion]:
-    """Return the pieces of one scenario's run, a batch of one lane; plots call it `name`."""
+    """Simulate one scenario; return the curves of each run, with `name` as the name of the rig's curve."""
     return _build_run_motions(loaded.mechanism, scenarios, _compute_run_curves(loaded, scenarios, [name]))
 
 
 def prepare_motion(mechanism: Mechanism, laws: NamedCompensators) -> None:
-    """Compile the programs of `compute_nominal_motion` for these laws."""
+    """Compile the programs that `compute_nominal_motion` needs for these compensators."""
     for _, loaded, scenarios in _scenarios_by_compensator(mechanism, laws, 0):
         prepare_recording(loaded, scenarios)
 
@@ -71,7 +72,10 @@ def prepare_motion(mechanism: Mechanism, laws: NamedCompensators) -> None:
 def _scenarios_by_compensator(
     mechanism: Mechanism, laws: NamedCompensators, seed: int
 ) -> Iterator[tuple[list[str], LoadedGains, Scenario]]:
-    """Yield for each compensator the names of its gains and the nominal scenario, a lane per name."""
+    """Yield, for each compensator, the names of its curves, their gains and the nominal scenario.
+
+    Gains and scenario have one lane for each curve.
+    """
     for compensator in dict.fromkeys(compensator for compensator, _ in laws.values()):
         gains_by_name = {name: gains for name, (law, gains) in laws.items() if law == compensator}
         phase = np.full(len(gains_by_name), mechanism.approach.phase)
@@ -82,7 +86,7 @@ def _scenarios_by_compensator(
 
 
 def _compute_run_curves(loaded: LoadedGains, scenarios: Scenario, names: list[str]) -> dict[str, list[Curve]]:
-    """Return the curves of a lane for each name; the lanes differ only in their gains."""
+    """Simulate the scenarios; return the curves of each lane's runs by the name of the lane."""
     _, recorded = record_lanes(loaded, scenarios)
     return {name: _split_runs(lane, scenarios) for name, lane in zip(names, recorded, strict=True)}
 
@@ -90,26 +94,29 @@ def _compute_run_curves(loaded: LoadedGains, scenarios: Scenario, names: list[st
 def _build_run_motions(
     mechanism: Mechanism, scenarios: Scenario, runs: dict[str, list[Curve]]
 ) -> list[RunMotion]:
-    """Return the pieces of runs, with the ideal contacts for the last run."""
+    """Combine the curves of each run with the curve of the ideal contact.
+
+    The last entry of `runs` determines the approach velocities of the ideal contacts.
+    """
     leading = list(runs.values())[-1]
     clearance = float(scenarios.clearance[0])
     two = bool(np.isfinite(clearance))
     surfaces = (0.0, -clearance) if two else (0.0,)
-    pieces = []
+    motions = []
     for number, ideal in enumerate(_ideal_curves(mechanism, scenarios, leading)):
         curves = {name: run[number] for name, run in runs.items() if number < len(run)}
         name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
-        pieces.append(RunMotion(name, surfaces, {"in space": ideal, **curves}))
-    return pieces
+        motions.append(RunMotion(name, surfaces, {"in space": ideal, **curves}))
+    return motions
 
 
 def _split_runs(lane: LaneRecord, scenarios: Scenario) -> list[Curve]:
-    """Return the curves of a lane's runs."""
+    """Divide the record of a lane into runs and return the curve of each run."""
     signals = lane.signals
     begins = np.flatnonzero(signals.age == 0)
     ends = np.append(begins[1:], len(signals.age))
     period = float(scenarios.control_period[0])
-    pieces = []
+    curves = []
     for begin, end in zip(begins, ends, strict=True):
         touch = -float(signals.position_desired[begin] / signals.velocity_desired[begin])
         part = slice(begin, end)
@@ -121,12 +128,12 @@ def _split_runs(lane: LaneRecord, scenarios: Scenario) -> list[Curve]:
             np.asarray(signals.force_measured[part]),
             np.asarray(signals.position_measured[part]),
         )
-        pieces.append(curve)
-    return pieces
+        curves.append(curve)
+    return curves
 
 
 def _ideal_curves(mechanism: Mechanism, scenarios: Scenario, curves: list[Curve]) -> list[Curve]:
-    """Return the ideal motion from 0.02 s before each contact's touch to the end of the contact's curve."""
+    """Return the curve of the ideal contact for each curve of the rig, from 0.02 s before the first touch."""
     velocity = np.array([curve.velocity for curve in curves])
     step = (np.array([curve.time[-1] for curve in curves]) + APPROACH_TIME) / INTEGRATION_STEPS
     forces, positions = cached_programs.run_cached(
@@ -157,9 +164,16 @@ def _integrate_ideal_contacts(
     velocities: Float[Array, "runs"],
     steps: Float[Array, "runs"],
 ) -> tuple[Float[Array, "runs steps"], Float[Array, "runs steps"]]:
-    """Return force [N] and position [m] of M x'' = -F by semi-implicit Euler with very small steps.
+    """Integrate M x'' = -F of the ideal contacts by semi-implicit Euler; return force [N] and position [m].
 
-    Runs begin with the contacts `firsts`. The parameters of the next contact apply after a contact has ended.
+    Args:
+        law: Contact law.
+        contacts: Parameters of the contact law for each contact.
+        clearance: Distance between two surfaces [m]; infinite for one surface.
+        mass: Equivalent mass M [kg].
+        firsts: Index of each run's first contact. When a contact ends, the parameters of the next one apply.
+        velocities: Approach velocity of each run [m/s].
+        steps: Integration step of each run [s], much shorter than a control period.
     """
     last = contacts.damping.shape[0] - 1
 

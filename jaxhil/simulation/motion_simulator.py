@@ -1,13 +1,16 @@
-"""Motion simulator x_a = G(s) e^{-s tau_p} x_d, discretised exactly from tick to tick.
+"""Exact discretisation of the motion simulator x_a = G(s) e^{-s tau_p} x_d.
 
-A transport delay commutes with a linear system. G is therefore driven by the undelayed command, whose corners
-are at the ticks. x_a at time t is its response at t - tau_p, and a sensor with delay tau_f reads the response
-at t - tau_p - tau_f. Every delay is thus the age of the response that is read. In sampling interval k, from
-t_k to t_{k+1}, the command is a straight line. The response at the fraction s of an interval is a constant
-row times (state, command at the interval's start, command at its end), from the matrix exponential of the
-system augmented by its input. There is no interpolation and no rounding to ticks.
+The order of a linear system and a transport delay can be exchanged. Here G receives the undelayed position
+command. The position x_a at time t is the response of G at the time t - tau_p. A sensor with delay tau_f
+reads the response at the time t - tau_p - tau_f.
 
-Time is in control periods here. States are w, w', ..., w^(n-1) with den(p) w = u, y = num(p) w.
+In a sampling interval, from one tick to the next, the position command is a straight line. The response at
+the fraction s of the interval is therefore a constant row vector times (state, command at the interval's
+start, command at the interval's end). The row vectors follow from the matrix exponential of the system
+augmented by its input. There is no interpolation and no rounding of delays to ticks.
+
+Time is in control periods. The state of G = num/den is (w, w', ..., w^(n-1)), where den(p) w = u, y = num(p)
+w, and p is the time derivative.
 """
 
 from typing import NamedTuple
@@ -16,37 +19,49 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 6, 13  # of the matrix exponential
+# Number of squarings, and number of terms of the Taylor series, in the matrix exponential.
+EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 6, 13
 
-# One array of the batch shape per component: a stacked state would have to be split at every tick.
+# State of the motion simulator: one array of the batch shape per component. A single array would have to be
+# split at every tick.
 SimulatorState = tuple[Array, ...]
 
 
 class SplitDelay(NamedTuple):
-    """Delay of r control periods, as whole sampling intervals to look back and a position within one."""
+    """Delay, divided into a number of whole sampling intervals and a fraction of a sampling interval."""
 
-    intervals: Int[Array, "*batch"]  # to look back from the newest one, which is interval n - 1 at tick n
-    # position in (0, 1] within it: a reading at a tick has the value just before the tick
+    intervals: Int[Array, "*batch"]  # number of intervals to look back from the newest complete interval
+    # Relative time in (0, 1] within that interval. It is 1, not 0, at a tick: readings have the value just
+    # before the tick.
     fraction: Float[Array, "*batch"]
 
 
 class Propagation(NamedTuple):
-    """Exact discrete motion simulator; rows act on (state, command at start, command at end)."""
+    """Discretised motion simulator as row vectors.
 
-    transition: Float[Array, "order columns *batch"]  # rows of the state one period later
-    position: Float[Array, "columns *batch"]  # row at the force sensor's sampling instant [m]
-    velocity: Float[Array, "columns *batch"]  # row there [m/s]
-    # row at the position sensor's sampling instant [m]; None if unused
+    Except for the last two fields, rows are multiplied by (state, command at the interval's start, command at
+    the interval's end) of a sampling interval.
+    """
+
+    transition: Float[Array, "order columns *batch"]  # rows that give the state one period later
+    position: Float[Array, "columns *batch"]  # row that gives the position when the force is sampled [m]
+    velocity: Float[Array, "columns *batch"]  # row that gives the velocity when the force is sampled [m/s]
+    # row that gives the position when the position sensor samples it [m]; None if unused
     measured_position: Float[Array, "columns *batch"] | None
-    # rows of position and velocity at the interval's start (right limit); None unless requested
+    # rows that give position and velocity at the interval's start (right limit); None unless requested
     start: tuple[Array, Array] | None
-    end: tuple[Array, Array] | None  # rows at its end (left limit); None unless requested
+    # rows that give position and velocity at the interval's end (left limit); None unless requested
+    end: tuple[Array, Array] | None
     steady_command: Float[Array, "order *batch"]  # steady state per unit of the command
-    steady_velocity: Float[Array, "order *batch"]  # steady state per growth of the command in a period
+    # steady state per unit of the command's increase in a control period
+    steady_velocity: Float[Array, "order *batch"]
 
 
 def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> SplitDelay:
-    """Return whole intervals and fraction of `delay` [s]; multiples of the period are recognised to 1e-9."""
+    """Divide a delay [s] into whole sampling intervals and a fraction.
+
+    A delay within 1e-9 control periods of a multiple of the control period counts as this multiple.
+    """
     periods = delay / control_period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
     return SplitDelay(whole.astype(jnp.int32), 1 - (periods - whole))
@@ -61,11 +76,21 @@ def discretise(
     hold: str,
     ends: bool = False,
 ) -> Propagation:
-    """Discretise num(s)/den(s) exactly (descending powers, strictly proper; order 0 is ideal).
+    """Discretise the transfer function num(s)/den(s) of the motion simulator exactly.
 
-    With z' = A z + B u in periods, z(s) = E(s) (z, u(0), u(1) - u(0)), where E(s) is the exponential of s
-    [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). Derivatives pass to every parameter. `ends` requests
-    the rows at the interval's start and end.
+    With time in control periods, the state z follows z' = A z + B u. At the fraction s of an interval it is
+    z(s) = E(s) (z(0), u(0), u(1) - u(0)). Here E(s) consists of the first rows of the matrix exponential of
+    s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with respect to every
+    numeric argument.
+
+    Args:
+        numerator: Coefficients of num(s), descending powers; the transfer function is strictly proper.
+        denominator: Coefficients of den(s), descending powers; of order 0 for an ideal motion simulator.
+        control_period: Control period [s].
+        force_fraction: Fraction of the interval at which the force is sampled.
+        position_fraction: Fraction of the interval at which the position is sampled; None if unused.
+        hold: Hold of the position command, "linear" or "zoh" (zero-order hold).
+        ends: Whether to return the rows for the interval's start and end too.
     """
     order = denominator.shape[0] - 1
     if order == 0:
@@ -81,7 +106,7 @@ def discretise(
     fractions = jnp.stack(instants)
     # The axes are row, column, instant in the interval, batch.
     rows = matrix_exponential(generator[:, :, None] * fractions[None, None], fractions)
-    # This changes columns for (z, u(0), u(1) - u(0)) into columns for (z, u(0), u(1)).
+    # Convert rows that multiply (z, u(0), u(1) - u(0)) into rows that multiply (z, u(0), u(1)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
     state = rows[:order]
 
@@ -112,9 +137,9 @@ def generator_rows(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "order order_plus_2 *batch"], list[Array]]:
-    """Return the rows of (A, B, 0), with time in periods, and the output weights of the state.
+    """Return the rows (A, B, 0) of the generator in `discretise`, and the output weights.
 
-    The position is the sum of weights times states; the order is at least 1.
+    The position is the sum of output weights times state components. The order must be at least 1.
     """
     order = denominator.shape[0] - 1
     system, output = _companion(numerator, denominator, control_period)
@@ -127,28 +152,30 @@ def generator_rows(
 def matrix_exponential(
     upper: Float[Array, "order order_plus_2 *batch"], ramp: Float[Array, "*batch"]
 ) -> Float[Array, "order_plus_1 order_plus_2 *batch"]:
-    """Return the first order + 1 rows of the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]].
+    """Return the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]], without its last row (0, 0, 1).
 
-    `upper` are its first rows (A, B, 0), and `ramp` is r. Scaling, Taylor series and squaring give rounding
-    accuracy for norms up to 64. The last rows, (0, 1, r) and (0, 0, 1), are not computed. Matrix axes come
-    first, so that every product is a few vector operations over the batch; a library call per lane costs more
-    than the whole contact.
+    The exponential is computed by scaling, Taylor series and squaring, and is accurate to rounding for norms
+    up to 64. The matrix axes come first: every matrix product then takes a few vector operations over the
+    batch. A library call for every lane would take longer than the simulation of a contact.
+
+    Args:
+        upper: First rows (A, B, 0) of the matrix.
+        ramp: Element r of the matrix.
     """
     order, size = upper.shape[:2]
     units = jnp.eye(size, dtype=upper.dtype).reshape(size, size, *[1] * ramp.ndim)
     scaled = upper / 2**EXPONENTIAL_SQUARINGS
 
     def ramp_row(ramp):
-        """Return the row (0, 1, r)."""
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return the upper rows of a product of two such matrices, or of their powers."""
+        """Return the first rows of the product of two matrices of this form; `ramp` is that of `right`."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
 
-    # The loops are not unrolled: the compiler would fuse the products and compute them repeatedly.
+    # The loops are not unrolled, because XLA would fuse the products and compute each product repeatedly.
     def horner(step, carry):
         terms = jnp.asarray(EXPONENTIAL_TERMS - step, ramp.dtype)
         return units[:order] + product(scaled, *carry) / terms, ramp / 2**EXPONENTIAL_SQUARINGS / terms
@@ -164,12 +191,12 @@ def matrix_exponential(
 
 
 def advance_state(transition: Array, state: SimulatorState, start: Array, end: Array) -> SimulatorState:
-    """Return the state one period later."""
+    """Return the motion simulator's state one control period later."""
     return tuple(apply_row(transition[i], state, start, end) for i in range(len(state)))
 
 
 def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Array:
-    """Return a row times (state, command at the interval's start, command at its end)."""
+    """Multiply a row by (state, command at the interval's start, command at the interval's end)."""
     total = row[-2] * start + row[-1] * end
     for i, component in enumerate(state):
         total = total + row[i] * component
@@ -179,7 +206,7 @@ def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Ar
 def read_measured_position(
     plant: Propagation, state: SimulatorState, start: Array, end: Array
 ) -> Array | None:
-    """Return the position [m] at its sensor's sampling instant; None if unused."""
+    """Return the position [m] when the position sensor samples it; None if unused."""
     return None if plant.measured_position is None else apply_row(plant.measured_position, state, start, end)
 
 
@@ -188,9 +215,9 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """Return the row of the time derivative [1/s] of a row's result within the sampling interval.
+    """Return the row that gives the time derivative [1/s] of what `row` gives in a sampling interval.
 
-    It uses d/ds E(s) = E(s) G, where G is the generator of `discretise`.
+    The derivation uses d/ds E(s) = E(s) G, where G is the generator in `discretise`.
     """
     *state, start, end = row
     zero = jnp.zeros_like(start)
@@ -205,13 +232,13 @@ def rate_row(
 
 
 def steady_state(plant: Propagation, command: Array, step: Array) -> SimulatorState:
-    """Return the state in uniform motion: drive input `command`, which grows by `step` per period."""
+    """Return the steady state while the command is `command` [m] and grows by `step` [m] per period."""
     order = plant.steady_command.shape[0]
     return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
 
 
 def _ideal_propagation(control_period, force_fraction, position_fraction, hold, ends):
-    """Return the propagation of an ideal motion simulator, which follows its command exactly."""
+    """Return the rows for an ideal motion simulator, whose position equals the command."""
 
     def position(fraction):
         return jnp.stack([1 - fraction, fraction])
@@ -233,7 +260,7 @@ def _ideal_propagation(control_period, force_fraction, position_fraction, hold, 
 
 
 def _companion(numerator, denominator, control_period):
-    """Return rows of A (the last has the coefficients) and output weights, with time in periods."""
+    """Return the companion matrix A as a list of rows, and the output weights; time is in periods."""
     order = denominator.shape[0] - 1
     powers = [control_period**i for i in range(order + 1)]
     zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
@@ -244,21 +271,22 @@ def _companion(numerator, denominator, control_period):
 
 
 def _last_row(denominator, control_period):
-    """Return the last row of A."""
+    """Return the last row of the companion matrix A, which contains the coefficients of den(s)."""
     order = denominator.shape[0] - 1
     return [-denominator[order - i] * control_period ** (order - i) / denominator[0] for i in range(order)]
 
 
 def _steady_velocity(system, transition, steady_command, hold):
-    """Return the steady state per growth of the command in a period."""
+    """Return the steady state per unit of the command's increase in a control period."""
     order = steady_command.shape[0]
     if hold == "linear":
-        # The ramp response is w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.
+        # The steady response to a ramp u is w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.
         constant = -system[order - 1][0]
         linear = -system[order - 1][1] if order > 1 else jnp.ones_like(constant)
         steady = jnp.zeros_like(steady_command).at[0].set(-linear / constant**2)
         return steady.at[1].set(1 / constant) if order > 1 else steady
-    # For a staircase, z(k+1) = Ad z(k) + Bd u(k+1) with z(k) = alpha u(k+1) + beta step.
+    # For a command with steps at the ticks, insert z(k) = alpha u(k+1) + beta step into
+    # z(k+1) = Ad z(k) + Bd u(k+1) and solve for beta.
     identity = jnp.eye(order, dtype=steady_command.dtype)
     batch_first = jnp.moveaxis(transition[:, :order], (0, 1), (-2, -1))
     right = jnp.moveaxis(steady_command, 0, -1)[..., None]
@@ -269,7 +297,7 @@ def _steady_velocity(system, transition, steady_command, hold):
 
 
 def _weighted_sum(weights, rows):
-    """Return sum_i weights_i rows_i; rows are (columns, *batch)."""
+    """Return the weighted sum of rows, (columns, *batch)."""
     total = weights[0][None] * rows[0]
     for weight, row in zip(weights[1:], rows[1:], strict=True):
         total = total + weight[None] * row
@@ -277,7 +305,7 @@ def _weighted_sum(weights, rows):
 
 
 def _matrix_product(left, right):
-    """Return the matrix product."""
+    """Multiply two matrices whose axes come before the batch axes."""
     total = left[:, 0, None] * right[None, 0]
     for k in range(1, left.shape[0]):
         total = total + left[:, k, None] * right[None, k]

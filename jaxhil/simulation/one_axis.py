@@ -1,4 +1,4 @@
-"""Model of a rig that moves along one axis."""
+"""Simulation of rigs with one axis, as an implementation of `RigModel`."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 @dataclasses.dataclass(frozen=True)
 class OneAxis(RigModel):
-    """Model of a rig along one axis: its runs are contacts, their error is e - e*."""
+    """Rig with one axis: a run is one contact, and its error is the restitution error e - e*."""
 
     axes: ClassVar[int] = 1
     run_name: ClassVar[str] = "contact"
@@ -30,28 +30,28 @@ class OneAxis(RigModel):
     def scenarios(
         self, mechanism: Mechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
     ) -> Scenario:
-        """Return scenarios; see `jaxhil.simulation.scenario.build_scenarios`."""
+        """Return scenarios of a mechanism; see `jaxhil.simulation.scenario.build_scenarios`."""
         return build_scenarios(mechanism, draws, seed, first)
 
     def loop(self, mechanism: Mechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Return the loop; `parts` are the options of `jaxhil.simulation.loop_construction.build_loop`."""
+        """Return the loop that runs all these scenarios; `parts` are the options of `build_loop`."""
         return build_loop(mechanism, compensator, scenarios, **parts)
 
     def runs(self, mechanism: Mechanism) -> int:
-        """Return the number of contacts of a scenario."""
+        """Return the number of contacts in a scenario of this mechanism."""
         return mechanism.approach.contacts
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
-        """Run the contacts of a batch and compare them with the ideal ones."""
+        """Run the contacts of a batch of scenarios and compare them with the ideal contacts."""
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return scenarios in which the `idle` lanes have no contact."""
+        """Return the scenarios without contacts in the `idle` lanes, which only fill a tile."""
         contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return a rough duration [s]: half a period sqrt(M/k) per contact, used only for sorting."""
+        """Return the sum of sqrt(M/k) [s] over a scenario's contacts, used only for sorting lanes."""
         stiffness = np.asarray(scenarios.contact.stiffness)
         while stiffness.ndim > 2:
             stiffness = stiffness[:, 0]
@@ -60,7 +60,10 @@ class OneAxis(RigModel):
         return np.sum(np.where(slots, periods, 0), axis=0)
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return a number that differs if a delay's whole periods differ, used only for sorting."""
+        """Return a number per scenario by which lanes with equal delays are sorted together.
+
+        Two scenarios have different numbers if one of their delays differs in its whole control periods.
+        """
         simulator = np.asarray(scenarios.simulator.delay)
         period = np.asarray(scenarios.control_period)
         force, position = (
@@ -86,17 +89,17 @@ class OneAxis(RigModel):
         return loop.compensator.name
 
     def prepared(self, loop: Loop, scenarios: Scenario) -> RigConstants:
-        """Return the constants of a run, which do not depend on the gains."""
+        """Compute the constants of a run, which do not depend on the gains, as an argument of `outcome`."""
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Return the outcome of a result of `prepared`; differentiable with respect to the gains."""
+        """Run what `prepared` returned; the outcome is differentiable with respect to the gains."""
         if loop.compensator.is_large:
             rig = _separate_loops(rig)
         return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))
 
     def noise_amplification(self, loop: Loop, gains: Gains, rig: RigConstants) -> Float[Array, "*batch"]:
-        """Return the compensator's amplification of the force sensor's noise [1]."""
+        """Return the factor [1] by which the compensator amplifies force sensor noise."""
         return loop.compensator.noise_amplification(gains, rig.constants)
 
 
@@ -105,10 +108,11 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _separate_loops(rig: RigConstants) -> RigConstants:
-    """Return an equal rig for which XLA compiles loops around the runs separately from them.
+    """Return constants with equal values for which XLA compiles the loop of the runs as a separate function.
 
-    XLA compiles the outermost loop without a sort, with all loops in it, as one function, and LLVM's time for
-    a function grows with the square of its length. The sort of two numbers here keeps outer loops separate.
+    XLA compiles nested loops as one function, up to the outermost loop that contains no sort. The time that
+    LLVM needs for a function grows with the square of its length. This function sorts two numbers, so that
+    loops around the runs are compiled separately.
     """
     contacts = rig.scenario.contacts
     most = jnp.max(contacts)

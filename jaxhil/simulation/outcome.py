@@ -1,4 +1,4 @@
-"""Outcome of runs: their metrics beside those of the ideal contact."""
+"""Outcome of runs: metrics of the contacts on the rig, compared with the ideal contacts."""
 
 from typing import Any, NamedTuple
 
@@ -14,36 +14,38 @@ from jaxhil.simulation.scenario import Scenario
 
 
 class Outcome(NamedTuple):
-    """Metrics of runs beside those of the ideal contact, per contact, (slots, *batch)."""
+    """Metrics of the contacts on the rig and of the ideal contacts; arrays of shape (contacts, *batch).
 
-    metrics: Metrics  # metrics of the run
-    # e* of the ideal contact, entered at the same speed [1]
-    reference_restitution: Float[Array, "slots *batch"]
+    The ideal contact is the contact without any delay at the same approach speed.
+    """
+
+    metrics: Metrics  # metrics of the contacts on the rig
+    reference_restitution: Float[Array, "slots *batch"]  # restitution e* of the ideal contact [1]
     reference_peak_force: Float[Array, "slots *batch"]  # peak force of the ideal contact [N]
     # duration of the ideal contact [s]; infinite if the bodies never separate
     reference_duration: Float[Array, "slots *batch"]
-    error: Float[Array, "slots *batch"]  # e - e* [1]
-    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| over the ideal contact's peak force [1]
-    # excess variation of F_c (`Metrics`) over the ideal contact's peak force [1]
+    error: Float[Array, "slots *batch"]  # restitution error e - e* [1]
+    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| divided by the ideal contact's peak force [1]
+    # excess variation of F_c (see `Metrics`) divided by the ideal contact's peak force [1]
     chatter: Float[Array, "slots *batch"]
     wanted: Bool[Array, "slots *batch"]  # whether the scenario has this contact
-    good: Bool[Array, "slots *batch"]  # whether it was reached and ended well
-    # whether its real force or its duration violates the bounds of `contact_bounds`
+    good: Bool[Array, "slots *batch"]  # whether the contact was reached and ended with the status `OK`
+    # whether peak force or duration of the real contact violates the bounds in `contact_bounds`
     unlike: Bool[Array, "slots *batch"]
 
     @property
     def peak_force_ratio(self) -> Any:
-        """Largest real contact force over the ideal contact's peak force [1]."""
+        """Largest real contact force divided by the ideal contact's peak force [1]."""
         return self.metrics.peak_force / self.reference_peak_force
 
     @property
     def duration_ratio(self) -> Any:
-        """Time with a real contact force over the ideal contact's duration [1]."""
+        """Duration of the real contact force divided by the ideal contact's duration [1]."""
         return self.metrics.duration / self.reference_duration
 
 
 def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outcome:
-    """Compare a run with the ideal contacts, each with the approach velocity that it had on the rig."""
+    """Compare contacts on the rig with ideal contacts of the same approach speed."""
     slots = metrics.restitution.shape[0]
     number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
         slots, *[1] * (metrics.restitution.ndim - 1)
@@ -82,7 +84,7 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
 
 
 def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
-    """Return contact parameters with the slots as part of the batch: (segments, slots, *batch)."""
+    """Move the axis of contacts into the batch axes: segments come first, (segments, contacts, *batch)."""
     nested = contact.stiffness.ndim > contact.damping.ndim
     return contact._replace(
         stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,

@@ -1,7 +1,7 @@
-"""Plausibility of a mechanism file: its ideal contacts compared with the abilities of the rig.
+"""Plausibility of a mechanism file: its ideal contacts compared with the capabilities of the rig.
 
-The metrics are those of `ContactLaw.reference`, in closed form if the law has one; no tick is run. They give
-warnings about implausible numbers, and the number of ticks of a run.
+No run is simulated. The ideal contacts are computed by `ContactLaw.reference`, in closed form if the contact
+law has one. They show which numbers of the file are implausible, and how many ticks a run will take.
 """
 
 import itertools
@@ -23,43 +23,44 @@ from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, MotionSimulatorBatch, Scenario, build_scenarios
 
-MAX_CONTACT_TICKS = 1e7  # limit on the ticks of a contact
-MAX_RUN_TICKS = 1e9  # limit on the ticks of a run, which are counted in 32 bits
+MAX_CONTACT_TICKS = 1e7  # greatest number of ticks of a contact, including its approach
+MAX_RUN_TICKS = 1e9  # greatest number of ticks of a run; ticks are counted in 32 bits
 
-PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; plausible contact frequencies
-MAX_FREQUENCY_RATIO = 0.1  # greatest plausible contact frequency, over the control rate
-MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; greatest plausible approach velocity
-MAX_LISTED_FREQUENCIES = 4  # greatest number of contact frequencies in the line; for more, only their range
+PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
+MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
+MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
+MAX_LISTED_FREQUENCIES = 4  # if there are more contact frequencies, a summary contains only their range
 
-_TAIL_PROBABILITY = 1e-9  # share of draws that are ignored at either end of a distribution
-# Prefixes of keys that determine the number of ticks, the drives' speeds, and the motion simulator's poles.
+_TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at either end of a distribution
+# Prefixes of the keys that determine the number of ticks, the speed of the drives, and the motion simulator's
+# poles.
 _TICK_KEYS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
 _SPEED_KEYS = ("approach.velocity", "rig.simulator.velocity_limit")
 _POLE_KEYS = ("rig.simulator.", "rig.control_period")
 
 
 class ContactSummary(NamedTuple):
-    """Ideal contact, entered at the velocity of the first approach."""
+    """Metrics of an ideal contact with the velocity of the first approach."""
 
-    number: int  # index of the first contact of the schedule with these metrics, from 1
-    frequency: float  # sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws [Hz]
-    duration: float  # [s]; infinite if the bodies do not separate
-    peak_force: float  # [N]
+    number: int  # number of the first scheduled contact with these metrics, from 1
+    frequency: float  # contact frequency [Hz]: sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws
+    duration: float  # duration [s]; infinite if the bodies do not separate
+    peak_force: float  # peak force [N]
 
 
 class MechanismSummary(NamedTuple):
-    """Summary of a nominal mechanism."""
+    """Summary of a mechanism with its nominal numbers."""
 
-    equivalent_mass: float  # [kg]
-    contacts: tuple[ContactSummary, ...]  # distinct contacts of the schedule
-    control_rate: float  # [Hz]
+    equivalent_mass: float  # equivalent mass of both bodies [kg]
+    contacts: tuple[ContactSummary, ...]  # scheduled contacts, those with equal metrics only once
+    control_rate: float  # control rate [Hz]
     simulator_bandwidth: float  # bandwidth of the motion simulator [Hz]; infinite for an ideal one
-    force_range: float  # range of the force sensor [N]; infinite for none
+    force_range: float  # range of the force sensor [N]; infinite if unlimited
     duration: float  # approximate duration of the run [s]
-    warnings: tuple[str, ...]  # implausible numbers: key, found value, expected value
+    warnings: tuple[str, ...]  # one text per implausible number: key, found value, expected value
 
     def line(self, name: str) -> str:
-        """Return the summary in one line, without the warnings."""
+        """Return the summary as one line of text that begins with `name`, without the warnings."""
         frequencies = [contact.frequency for contact in self.contacts]
         fastest = max(frequencies)
         rates = (
@@ -81,7 +82,7 @@ class MechanismSummary(NamedTuple):
 
 
 def summarise_mechanism(mechanism: Mechanism) -> MechanismSummary:
-    """Return the summary of a valid mechanism."""
+    """Compute the summary of a mechanism from its nominal numbers."""
     with jax_context():
         scenarios = build_scenarios(mechanism)
         reference = _compute_ideal_contacts(mechanism, scenarios)
@@ -99,11 +100,15 @@ def summarise_mechanism(mechanism: Mechanism) -> MechanismSummary:
 
 
 def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = False) -> None:
-    """Raise `InputError` if a run cannot be computed, nominally or, with `drawn`, for any draw.
+    """Raise `InputError` if a run of the mechanism cannot be simulated.
 
-    A contact may take at most 1e7 ticks, its approach included, and a run at most 1e9. No pole of the motion
-    simulator may exceed `MAX_POLE`, and the drives must be able to follow the first approach. An error
-    calls the mechanism `label`.
+    A contact with its approach may take at most 1e7 ticks, and a run at most 1e9. No pole of the motion
+    simulator may exceed `MAX_POLE`. The drives must be able to follow the first approach.
+
+    Args:
+        mechanism: Mechanism.
+        label: Name of the mechanism in messages; None for the mechanism's own name.
+        drawn: Whether to check all draws of the uncertain parameters, not only the nominal run.
     """
     name = label or mechanism.name
     lanes = build_scenarios(mechanism, _extreme_draws(mechanism, _POLE_KEYS) if drawn else None)
@@ -117,7 +122,7 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
 
 
 def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
-    """Raise `InputError` if an approach is faster than the drives' velocity limit."""
+    """Raise `InputError` if the approach velocity of a scenario exceeds the drives' velocity limit."""
     limits = scenarios.simulator.velocity_limit
     lane = int(np.argmax(scenarios.velocity - limits))
     if limits[lane] < scenarios.velocity[lane]:
@@ -128,9 +133,12 @@ def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
 
 
 def check_poles(name: str, denominator: Any, control_period: Any) -> None:
-    """Raise `InputError` if a pole of a motion simulator exceeds `MAX_POLE`.
+    """Raise `InputError` if a pole of the motion simulator exceeds `MAX_POLE` [rad per control period].
 
-    `denominator` is (order + 1, lanes), `control_period` (lanes,) [s].
+    Args:
+        name: Name of the mechanism in the message.
+        denominator: Denominators of the transfer functions, descending powers of s, (order + 1, lanes).
+        control_period: Control periods [s], (lanes,).
     """
     for lane, period in enumerate(control_period):
         coefficients = np.asarray(denominator)[:, lane]
@@ -144,16 +152,16 @@ def check_poles(name: str, denominator: Any, control_period: Any) -> None:
 
 
 def compute_bandwidth(simulator: MotionSimulatorBatch) -> float:
-    """Return the lowest frequency [Hz] at which the gain of the first lane's G is 1/sqrt(2).
+    """Return the bandwidth [Hz] of the first lane: the lowest frequency with a gain of 1/sqrt(2).
 
-    It is infinite for an ideal motion simulator, and NaN if it cannot be computed.
+    The bandwidth is infinite for an ideal motion simulator, and NaN if it cannot be computed.
     """
     numerator, denominator = (np.asarray(part, float)[:, 0] for part in simulator[:2])
     order = len(denominator) - 1
     if order == 0:
         return math.inf
     with np.errstate(all="ignore"):
-        # Dividing by the poles' mean frequency gives coefficients of similar size.
+        # In units of the poles' geometric mean, all coefficients have similar magnitudes.
         unit = abs(denominator[-1] / denominator[0]) ** (1 / order)
         powers = unit ** np.arange(order, -1, -1.0) / denominator[-1]
         twice, once = 2 * _squared(numerator * powers[1:]), _squared(denominator * powers)
@@ -166,24 +174,25 @@ def compute_bandwidth(simulator: MotionSimulatorBatch) -> float:
 
 
 def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
-    """Raise `InputError` if a contact or a run takes too many ticks."""
+    """Raise `InputError` if a contact exceeds `MAX_CONTACT_TICKS` or a run exceeds `MAX_RUN_TICKS`."""
     contacts = mechanism.approach.contacts
     allowed = min(MAX_CONTACT_TICKS, MAX_RUN_TICKS / contacts)
-    # This upper bound usually suffices, without computing the contacts.
+    # This upper bound on the duration is usually small enough; then the contacts need not be computed.
     longest = APPROACH_TIME + scenarios.control_period + 2 * MAX_CONTACT_DURATION + _longest_wait(scenarios)
     if np.all(longest <= allowed * scenarios.control_period):
         return
     with jax_context():
-        way, lasts = _estimate_durations(scenarios, _compute_ideal_contacts(mechanism, scenarios))
+        reference = _compute_ideal_contacts(mechanism, scenarios)
+        approach_time, contact_time = _estimate_durations(scenarios, reference)
     with np.errstate(all="ignore"):
-        ticks = (way + lasts) / scenarios.control_period
+        ticks = (approach_time + contact_time) / scenarios.control_period
     slot, lane = np.unravel_index(np.argmax(ticks), ticks.shape)
     if ticks[slot, lane] <= MAX_CONTACT_TICKS and np.sum(ticks, axis=0).max() <= MAX_RUN_TICKS:
         return
     found = f"rig.control_period: found {scenarios.control_period[lane]:g} s"
-    if way[slot, lane] > MAX_CONTACT_DURATION:
+    if approach_time[slot, lane] > MAX_CONTACT_DURATION:
         found = f"contact.clearance: found {scenarios.clearance[lane]:g} m"
-    seconds, most = (way + lasts)[slot, lane], f"{MAX_CONTACT_TICKS:.0e} ticks a contact"
+    seconds, most = (approach_time + contact_time)[slot, lane], f"{MAX_CONTACT_TICKS:.0e} ticks a contact"
     raise InputError(
         f"{name}: {found}, expected at most {most} and {MAX_RUN_TICKS:.0e} a run: "
         f"contact {slot + 1} takes about {seconds:.3g} s, {ticks[slot, lane]:.2g} ticks"
@@ -191,14 +200,14 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
 
 
 def _squared(polynomial: np.ndarray) -> np.ndarray:
-    """Return |p(jw)|^2 as a polynomial in w^2, descending powers."""
+    """Return the coefficients of |p(jw)|^2 as a polynomial in w^2, descending powers, from those of p."""
     degrees = np.arange(len(polynomial) - 1, -1, -1)
     product = np.convolve(polynomial, polynomial * (-1.0) ** degrees)[::2]
     return product * (-1.0) ** degrees
 
 
 def _compute_ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> IdealContact:
-    """Return the ideal contacts, (contacts, lanes), each entered at the first approach's velocity."""
+    """Return the ideal contacts, (contacts, lanes), all with the velocity of the first approach."""
     shape = scenarios.phase.shape
     mass, velocity = (np.broadcast_to(x, shape) for x in (scenarios.equivalent_mass, scenarios.velocity))
     law = find_contact_law(mechanism.contact.law).simulated
@@ -210,12 +219,12 @@ def _compute_ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> IdealC
 def _compute_reference(
     law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any
 ) -> IdealContact:
-    """Return the ideal contacts of a law, (slots, lanes)."""
+    """Return the ideal contacts of a contact law, (contacts, lanes); compiled by `run_cached`."""
     return law.reference(parameters_by_slot(parameters), mass, velocity)
 
 
 def _find_distinct_contacts(mechanism: Mechanism, reference: IdealContact) -> tuple[ContactSummary, ...]:
-    """Return the first lane's distinct contacts, in the order of the schedule."""
+    """Return the contacts of the first lane in the order of the schedule, those with equal metrics once."""
     durations = np.nan_to_num(reference.duration[:, 0], nan=math.inf, posinf=math.inf)
     contacts: dict[tuple[float, ...], ContactSummary] = {}
     for slot, duration in enumerate(durations):
@@ -224,48 +233,51 @@ def _find_distinct_contacts(mechanism: Mechanism, reference: IdealContact) -> tu
             entries: Any = mechanism.contact.stiffness
             stiffness = entries[min(slot, len(entries) - 1)]
             frequency = math.sqrt(stiffness / mechanism.bodies.mass) / (2 * math.pi)
-        figures = float(frequency), float(duration), float(reference.peak_force[slot, 0])
-        contacts.setdefault(figures, ContactSummary(slot + 1, *figures))
+        metrics = float(frequency), float(duration), float(reference.peak_force[slot, 0])
+        contacts.setdefault(metrics, ContactSummary(slot + 1, *metrics))
     return tuple(contacts.values())
 
 
 def _estimate_durations(scenarios: Scenario, reference: IdealContact) -> tuple[np.ndarray, np.ndarray]:
-    """Return approximate durations [s], (contacts, lanes), of the way to each contact and of the contact.
+    """Return approximate durations [s] of the approach to each contact and of each contact.
 
-    The contact's duration includes the wait for its end.
+    Both arrays have the shape (contacts, lanes). The duration of a contact includes the time until the
+    simulation detects that the contact has ended.
     """
     contacts = len(reference.duration)
     sensor, simulator, velocity = scenarios.force_sensor, scenarios.simulator, scenarios.velocity
     wait = simulator.delay + sensor.delay + 20 * sensor.time_constant + 2 * scenarios.control_period
     duration = np.nan_to_num(reference.duration, nan=math.inf, posinf=math.inf)
-    way = APPROACH_TIME + scenarios.phase[:contacts] * scenarios.control_period
+    approach_time = APPROACH_TIME + scenarios.phase[:contacts] * scenarios.control_period
     with np.errstate(all="ignore"):
-        way = way + np.clip(
+        approach_time = approach_time + np.clip(
             np.abs(scenarios.contact_plane) / velocity, 0, MAX_CONTACT_DURATION + _longest_wait(scenarios)
         )
-        left = np.cumprod(np.nan_to_num(reference.restitution, nan=1.0), axis=0)
-        crossing = scenarios.clearance / (velocity * np.concatenate([np.ones_like(left[:1]), left[:-1]]))
-        flight = np.minimum(np.nan_to_num(crossing, nan=math.inf, posinf=math.inf), _longest_wait(scenarios))
+        speed_ratio = np.cumprod(np.nan_to_num(reference.restitution, nan=1.0), axis=0)
+        speed_ratio = np.concatenate([np.ones_like(speed_ratio[:1]), speed_ratio[:-1]])
+        crossing_time = scenarios.clearance / (velocity * speed_ratio)
+        crossing_time = np.nan_to_num(crossing_time, nan=math.inf, posinf=math.inf)
+        flight = np.minimum(crossing_time, _longest_wait(scenarios))
     later = np.arange(contacts)[:, None] > 0
-    way = np.where(later & np.isfinite(scenarios.clearance), flight, way)
-    return way, np.minimum(duration + wait, MAX_CONTACT_DURATION)
+    approach_time = np.where(later & np.isfinite(scenarios.clearance), flight, approach_time)
+    return approach_time, np.minimum(duration + wait, MAX_CONTACT_DURATION)
 
 
 def _longest_wait(scenarios: Scenario) -> np.ndarray:
-    """Return the longest wait [s] for a touch.
+    """Return the longest time [s] that the simulation waits for a contact to begin.
 
-    With two surfaces this is the wait for the next touch; with one, the wait in excess of a contact's limit.
+    With one surface, this is the time in addition to `MAX_CONTACT_DURATION`.
     """
     with np.errstate(all="ignore"):
-        crossing = 10 * scenarios.clearance / scenarios.velocity
+        crossing_time = 10 * scenarios.clearance / scenarios.velocity
         nearer = 10 * np.maximum(-scenarios.contact_plane, 0.0) / scenarios.velocity
-    return np.where(np.isfinite(scenarios.clearance), MAX_CONTACT_DURATION + crossing, nearer)
+    return np.where(np.isfinite(scenarios.clearance), MAX_CONTACT_DURATION + crossing_time, nearer)
 
 
 def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return draws with every uncertain number at either end of its distribution, in all combinations.
+    """Return draws at the corners of the uncertain range: all combinations of extreme values.
 
-    Only numbers whose paths begin with one of the prefixes are varied.
+    Parameters whose path begins with none of the prefixes have the median of their distribution.
     """
     columns = count_dimensions(mechanism)
     paths = [path for path in columns if path.startswith(prefixes)]
@@ -280,7 +292,7 @@ def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str,
 
 
 def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -> list[str]:
-    """Return warnings about implausible numbers."""
+    """Return one warning for each implausible number of the mechanism."""
     rig, contact, warnings = mechanism.rig, mechanism.contact, []
     fastest = max(contacts, key=lambda item: item.frequency)
     slowest = min(contacts, key=lambda item: item.frequency)
@@ -301,7 +313,7 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
             f"approach.velocity: found {velocity}, expected at most {MAX_PLAUSIBLE_VELOCITY:g} m/s"
         )
     if strongest.peak_force > rig.force_sensor.range:
-        peak = f"the {strongest.peak_force:.3g} N of contact {strongest.number} in space"
+        peak = f"the {strongest.peak_force:.3g} N of the ideal contact {strongest.number}"
         warnings.append(
             f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected beyond {peak}"
         )
@@ -314,16 +326,16 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
 
 
 def _format_frequency(contact: ContactSummary) -> str:
-    """Return the beginning of a warning about a contact's frequency."""
+    """Return the first part of a warning about a contact frequency: key and found value."""
     frequency = f"a contact frequency of {contact.frequency:.3g} Hz (contact {contact.number})"
     return f"contact.stiffness: found {frequency}"
 
 
 def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
-    """Return a warning if readings arrive after the shortest contact is over."""
+    """Return a list with at most one warning, that a delay exceeds the duration of the shortest contact."""
     rig = mechanism.rig
     force = rig.force_sensor.delay + rig.force_sensor.time_constant
-    lasts = f"less than contact {shortest.number} lasts, {shortest.duration:.3g} s"
+    allowed = f"less than contact {shortest.number} lasts, {shortest.duration:.3g} s"
     for key, sensor_delay, suffix in (
         ("simulator", 0.0, ""),
         ("force_sensor", force, " with its lag and the motion simulator's delay"),
@@ -331,18 +343,18 @@ def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
     ):
         delay = rig.simulator.delay + sensor_delay
         if delay > shortest.duration:
-            return [f"rig.{key}.delay: found {delay:.3g} s{suffix}, expected {lasts}"]
+            return [f"rig.{key}.delay: found {delay:.3g} s{suffix}, expected {allowed}"]
     return []
 
 
 def _format_ratio(value: float, whole: float) -> str:
-    """Return `value` as a fraction of `whole`, as text."""
-    share = value / whole
-    return f"1/{1 / share:.0f}" if 0 < share < 0.1 else f"{share:.2g}"
+    """Return value / whole as text, as "1/n" if less than 0.1."""
+    ratio = value / whole
+    return f"1/{1 / ratio:.0f}" if 0 < ratio < 0.1 else f"{ratio:.2g}"
 
 
 def _format_frequencies(frequencies: list[float]) -> str:
-    """Return the frequencies, or their range, as text."""
+    """Return frequencies as text: a list, or lowest and highest if there are many."""
     texts = list(dict.fromkeys(f"{frequency:.3g}" for frequency in frequencies))
     if len(texts) > MAX_LISTED_FREQUENCIES:
         return f"{min(frequencies):.3g} to {max(frequencies):.3g}"

@@ -1,8 +1,11 @@
-"""Probe of a run beside its contact: a push on the hardware, and the reference trajectory.
+"""Probe: an extra push on the hardware, and a reference trajectory, which test a compensator.
 
-A push that no model contains shows whether a compensator is transparent: whether events on the hardware reach
-the numerical model. The motion in the ideal contact shows how far the model deviates from it. The time of the
-push counts from the hardware's first touch, that of the trajectory from the numerical model's first touch.
+A push that no model contains shows whether a compensator is transparent, that is, whether events on the
+hardware reach the numerical model. The reference trajectory is the motion in the ideal contact; the numerical
+model should follow it.
+
+The time of the push counts from the hardware's first touch. The time of the reference trajectory counts from
+the numerical model's first touch.
 """
 
 from typing import NamedTuple
@@ -12,14 +15,18 @@ from jaxtyping import Array, Bool, Float
 
 
 class Push(NamedTuple):
-    """Force p(t) = size sin(pi (t - centre + width/2)/width) while the sine is positive, else 0."""
+    """Push on the hardware with the shape of a half-sine.
 
-    size: Float[Array, "*batch"]  # against the penetration [N]
-    centre: Float[Array, "*batch"]  # time since the hardware's first touch [s]
-    width: Float[Array, "*batch"]  # [s]
+    The force is p(t) = size sin(pi s/width) for 0 < s < width, else 0. Here t is the time since the
+    hardware's first touch, and s = t - centre + width/2.
+    """
+
+    size: Float[Array, "*batch"]  # largest force, positive against the penetration [N]
+    centre: Float[Array, "*batch"]  # time of the largest force since the hardware's first touch [s]
+    width: Float[Array, "*batch"]  # duration [s]
 
     def force(self, time: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Return p [N] at a time [s] since the first touch."""
+        """Return the force of the push [N] at a time [s] since the hardware's first touch."""
         since = time - self.centre + self.width / 2
         inside = (since > 0) & (since < self.width)
         phase = jnp.where(inside, since, 0) * (jnp.pi / self.width)
@@ -28,10 +35,15 @@ class Push(NamedTuple):
     def lagged(
         self, time: Float[Array, "*batch"], time_constant: Float[Array, "*batch"]
     ) -> Float[Array, "*batch"]:
-        """Return the push as read by a sensor with a first-order lag [s]: 1/(1 + s tau_s) applied to p.
+        """Return the push [N] as a sensor with a first-order lag reads it.
 
-        With w = pi/width and s the time since the push began, the closed form is size/(1 + (w tau)^2) (sin ws
-        - w tau cos ws + w tau exp(-s/tau)) until the push ends, then exponential decay.
+        Until the push ends, the reading is size/(1 + (w tau)^2) (sin ws - w tau cos ws + w tau exp(-s/tau)),
+        where w = pi/width, tau is the time constant, and s is the time since the push began. Then the reading
+        decays exponentially.
+
+        Args:
+            time: Time since the hardware's first touch [s].
+            time_constant: Time constant of the lag [s]; 0 for a sensor without lag.
         """
         lags = time_constant > 0
         lag = jnp.where(lags, time_constant, 1)
@@ -41,39 +53,39 @@ class Push(NamedTuple):
         rate = jnp.pi / self.width
         late = rate * lag
         swing = jnp.sin(rate * within) - late * jnp.cos(rate * within) + late * jnp.exp(-within / lag)
-        left = jnp.exp(-jnp.where(since > self.width, since - self.width, 0) / lag)
-        reading = self.size / (1 + late**2) * jnp.where(begun, swing * left, 0)
+        decay = jnp.exp(-jnp.where(since > self.width, since - self.width, 0) / lag)
+        reading = self.size / (1 + late**2) * jnp.where(begun, swing * decay, 0)
         return jnp.where(lags, reading, self.force(time))
 
 
 class Probe(NamedTuple):
-    """Probe of each contact of a run."""
+    """Push on the hardware, and reference trajectory, for each contact."""
 
-    push: Push  # push on the hardware, leaves (slots, *batch)
-    # penetration of the ideal contact [m] at evenly spaced times from its first touch to `span`
+    push: Push  # push on the hardware, (contacts, *batch)
+    # penetration in the ideal contact [m] at evenly spaced times, from 0 to `span` after the first touch
     depth: Float[Array, "slots samples *batch"]
-    span: Float[Array, "slots *batch"]  # duration of the comparison [s]
+    span: Float[Array, "slots *batch"]  # duration of the reference trajectory [s]
 
 
 class FirstContact(NamedTuple):
     """First touch of the hardware in the current contact."""
 
-    made: Bool[Array, "*batch"]  # whether there was one
-    time: Float[Array, "*batch"]  # time of the touch, in periods of the run
+    made: Bool[Array, "*batch"]  # whether the hardware has touched a surface
+    time: Float[Array, "*batch"]  # time of the first touch since the start of the run [control periods]
     side: Float[Array, "*batch"]  # side of the surface, 1 or -1
 
 
 class Deviation(NamedTuple):
-    """Deviation of the numerical model from the ideal contact."""
+    """Sum of the squared deviations of the numerical model's penetration from the reference trajectory."""
 
-    entered: Bool[Array, "*batch"]  # whether the numerical model has entered the contact
-    time: Float[Array, "*batch"]  # time of the onset, in periods of the run
-    squares: Float[Array, "*batch"]  # sum of the squared deviations of its penetration [m^2]
-    count: Float[Array, "*batch"]  # number of these deviations
+    entered: Bool[Array, "*batch"]  # whether the numerical model has touched the surface
+    time: Float[Array, "*batch"]  # time of this first touch since the start of the run [control periods]
+    squares: Float[Array, "*batch"]  # sum of the squared deviations at all ticks [m^2]
+    count: Float[Array, "*batch"]  # number of ticks in this sum
 
 
 def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
-    """Return the state before the first touch."""
+    """Return the record before the hardware's first touch, in the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
@@ -81,10 +93,17 @@ def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
 def update_first_contact(
     first_contact: FirstContact, depth: Array, rate: Array, side: Array, now: Array, period: Array
 ) -> FirstContact:
-    """Update the hardware's first touch with a sample.
+    """Return the record of the first touch, updated with a sample of the hardware's motion.
 
-    At `now` [periods] the hardware is `depth` [m] beyond the surface on `side` and moves inward at `rate`
-    [m/s]. The time of the touch is extrapolated by uniform motion.
+    The time of the touch is extrapolated from the sample by uniform motion.
+
+    Args:
+        first_contact: Record up to the previous sample.
+        depth: Penetration [m].
+        rate: Penetration rate [m/s].
+        side: Side of the surface, 1 or -1.
+        now: Time since the start of the run [control periods].
+        period: Control period [s].
     """
     first = ~first_contact.made & (depth > 0)
     return FirstContact(
@@ -95,7 +114,7 @@ def update_first_contact(
 
 
 def initial_deviation(like: Float[Array, "*batch"]) -> Deviation:
-    """Return the state before the numerical model touches."""
+    """Return the deviation before the numerical model's first touch, in the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 
@@ -110,9 +129,17 @@ def update_deviation(
     period: Array,
     lasts: Array,
 ) -> Deviation:
-    """Compare the numerical model with the reference trajectory while the contact `lasts`.
+    """Return the deviation, updated with the numerical model's motion at the current tick.
 
-    At `now` [periods] the model has penetrated by `depth` [m] and moves inward at `rate` [m/s].
+    Args:
+        deviation: Deviation up to the previous tick.
+        reference: Penetration of the reference trajectory at evenly spaced times [m].
+        span: Duration of the reference trajectory [s].
+        depth: Penetration of the numerical model [m].
+        rate: Penetration rate of the numerical model [m/s].
+        now: Time since the start of the run [control periods].
+        period: Control period [s].
+        lasts: Whether the contact has not yet ended; after its end nothing is added.
     """
     first = ~deviation.entered & (depth > 0)
     entered = deviation.entered | first
@@ -121,28 +148,28 @@ def update_deviation(
     samples = len(reference)
     position = jnp.clip(since / span, 0, 1) * (samples - 1)
     before = jnp.clip(jnp.floor(position), 0, samples - 2)
-    share = position - before
+    fraction = position - before
     index = before.astype(jnp.int32)[None]
-    left = jnp.take_along_axis(reference, index, axis=0, mode="promise_in_bounds")[0]
-    right = jnp.take_along_axis(reference, index + 1, axis=0, mode="promise_in_bounds")[0]
-    off = depth - (left + share * (right - left))
-    counts = entered & lasts & (since <= span)
+    before_value = jnp.take_along_axis(reference, index, axis=0, mode="promise_in_bounds")[0]
+    after_value = jnp.take_along_axis(reference, index + 1, axis=0, mode="promise_in_bounds")[0]
+    difference = depth - (before_value + fraction * (after_value - before_value))
+    is_counted = entered & lasts & (since <= span)
     return Deviation(
         entered,
         begin,
-        deviation.squares + jnp.where(counts, off**2, 0),
-        deviation.count + jnp.where(counts, 1, 0).astype(off.dtype),
+        deviation.squares + jnp.where(is_counted, difference**2, 0),
+        deviation.count + jnp.where(is_counted, 1, 0).astype(difference.dtype),
     )
 
 
 def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
-    """Return the root mean square of the penetration's deviation [m]; 0 if nothing was compared."""
+    """Return the root mean square of the deviation [m]; 0 before the first touch."""
     mean = deviation.squares / jnp.maximum(deviation.count, 1)
     return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
 
 
 def _periods_since_touch(depth, rate, period):
-    """Return the periods since a uniform motion reached the surface, at most one."""
+    """Return the time since uniform motion reached the surface, 0 to 1 [control periods]."""
     stride = rate * period
     inward = stride > 0
     return jnp.where(inward, jnp.clip(depth / jnp.where(inward, stride, 1), 0, 1), 0)

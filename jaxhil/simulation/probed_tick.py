@@ -1,4 +1,4 @@
-"""Tick of a probed run: the push on the hardware, and the comparison with the ideal contact."""
+"""Probe within a tick: push on the hardware, and deviation of the numerical model from the ideal contact."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -22,10 +22,17 @@ def apply_probe(
     contact: IntervalContact,
     watch: Watch,
 ) -> tuple[LoopState, IntervalContact, Watch]:
-    """Return state, contact and watch of a tick, including the probe.
+    """Add the effects of the probe to the state, the contact and the watch of a tick.
 
-    `sample` is the motion at the force's sampling instant; `over` says whether the contact ended before this
-    tick.
+    Args:
+        rig: Constants of the run.
+        probe: Probe of the current contact.
+        state: State of the loop.
+        over: Whether the contact ended before this tick.
+        signals: Inputs of the compensator at this tick.
+        sample: Motion of the hardware when the force is sampled.
+        contact: Real contact in the sampling interval.
+        watch: Record of the current contact.
     """
     first_contact, contact = apply_push(rig, probe, state.first_contact, signals.age, sample, contact)
     watch = update_model_deviation(rig.constants, probe, over, signals, watch)
@@ -40,7 +47,7 @@ def apply_push(
     sample: MotionSample,
     contact: IntervalContact,
 ) -> tuple[FirstContact, IntervalContact]:
-    """Push the hardware according to the time since its first touch; the force sensor reads the push too."""
+    """Add the push to the force on the hardware and to the reading of the force sensor."""
     assert first_contact is not None
     scenario, period = rig.scenario, rig.constants.control_period
     signed = deflection(sample.position, scenario.clearance)
@@ -58,7 +65,7 @@ def apply_push(
 def update_model_deviation(
     constants: KnownConstants, probe: Probe, over: Array, signals: Signals, watch: Watch
 ) -> Watch:
-    """Compare x_d with the ideal contact, until the contact is `over`."""
+    """Add the deviation of x_d from the ideal contact at this tick, unless the contact is `over`."""
     assert watch.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
     if watch.side is not None:

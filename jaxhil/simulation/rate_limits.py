@@ -1,4 +1,4 @@
-"""Velocity and acceleration limits of the motion simulator, as rate limits on its command."""
+"""Velocity and acceleration limits of the motion simulator, applied to its position command."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -13,15 +13,25 @@ def limit_command(
     velocity_limit: Array,
     acceleration_limit: Array,
 ) -> tuple[Array, Array]:
-    """Return the limited command c(n+1) [m] and its step c(n+1) - c(n) [m].
+    """Return the limited position command c(n+1) [m] and its step c(n+1) - c(n) [m].
 
-    `wanted` and `wanted_before` are the commands without limits for n + 1 and n [m], `previous` is c(n),
-    `previous_step` is c(n) - c(n-1).
+    The velocity limit v_max restricts the step to v_max T. The acceleration limit a_max restricts the change
+    of the step to q = a_max T^2.
 
-    Velocity limit: |c(n+1) - c(n)| <= v_max T. Acceleration limit: the step changes by at most q = a_max T^2,
-    and does not overshoot a command in uniform motion. If the output is b behind, the step s is the longest
-    one from which m more steps, each shorter by q, reach the command with zero closing speed: b = (m + 1) s -
-    q m (m + 1)/2. If neither limit is active beyond rounding, c(n+1) is exactly the command without limits.
+    The limited command follows the unlimited command without overshoot if the latter moves uniformly. If the
+    limited command is a distance b behind, the closing step s is the largest step from which m further steps,
+    each shorter by q, close the distance: b = (m + 1) s - q m (m + 1)/2.
+
+    If no limit is active, apart from rounding, c(n+1) equals the unlimited command exactly.
+
+    Args:
+        wanted: Unlimited command for tick n + 1 [m].
+        wanted_before: Unlimited command for tick n [m].
+        previous: Limited command c(n) [m].
+        previous_step: Last step of the limited command, c(n) - c(n-1) [m].
+        control_period: Control period T [s].
+        velocity_limit: Velocity limit v_max [m/s]; infinite if there is none.
+        acceleration_limit: Acceleration limit a_max [m/s^2]; infinite if there is none.
     """
     largest = velocity_limit * control_period
     change = acceleration_limit * control_period**2

@@ -1,6 +1,7 @@
-"""Recording of the loop tick by tick: the controller's readings and commands in every lane of a batch.
+"""Recording of the compensator's readings and commands at every tick, for each lane of a batch.
 
-Plots and time series of a run, test vectors of a bundle for the rig, and replays of verification use it.
+Uses of these records: plots and time series of a run, test vectors in a bundle for the rig, and the replay of
+a run by the rig's controller during verification.
 """
 
 from collections.abc import Mapping
@@ -24,26 +25,29 @@ from jaxhil.simulation.rollout import begin_next_contacts, run_segment, segment_
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tick import RunState, Tick
 
-TICKS_PER_CALL = 512  # ticks per call of the compiled program
+TICKS_PER_CALL = 512  # number of ticks that one call of the compiled program simulates
 
 
 class LaneRecord(NamedTuple):
-    """Readings and commands of the controller in one lane, (ticks,), until the end of its last contact."""
+    """Readings and commands of the compensator in one lane, up to the end of the last contact.
 
-    signals: Signals  # readings of the controller
-    command: np.ndarray | Array  # F_c [N]
-    # stiffness [N/m] and damping [N s/m], if the controller identifies them
+    Arrays have the shape (ticks,).
+    """
+
+    signals: Signals  # inputs of the compensator
+    command: np.ndarray | Array  # force command F_c [N]
+    # estimates of stiffness [N/m] and damping [N s/m]; None if the compensator identifies neither
     identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
-    # whether the loop sets F_c = 0 at the first tick of a run: before t = 0 there is no force, although a
-    # noisy or biased sensor reads one
+    # Whether the loop sets F_c = 0 at the first tick of a run. There is no force before a run, although a
+    # sensor with noise or bias reads one.
     zeroed: bool
-    # position command [m] from the numerical model's motion after each tick
+    # position command at the end of each tick [m]
     sent: np.ndarray | Array | None = None
-    contact: np.ndarray | Array | None = None  # index of the contact of each tick
+    contact: np.ndarray | Array | None = None  # index of the current or next contact, from 0
 
 
 def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
-    """Return `number` >= 1 lanes: the nominal run, then draws of the mechanism's uncertain numbers."""
+    """Return `number` scenarios: the nominal scenario first, then draws of the uncertain parameters."""
     draws = {}
     for path, drawn in draw(mechanism, number - 1, seed).items():
         nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
@@ -52,10 +56,10 @@ def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
 
 
 def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[LaneRecord]]:
-    """Run the loop until every lane is done; return metrics (slots, lanes), and each lane's record.
+    """Run all scenarios; return the metrics, (contacts, lanes), and the record of each lane.
 
-    Free flight between two surfaces is not skipped, since the rig does not skip it either. A record ends
-    before its first number that is not finite.
+    Free flight is simulated, not skipped, so that the records have the same ticks as the rig. A record ends
+    before the first tick with a number that is not finite.
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
     metrics, ticks = record_ticks(loop, loaded.gains, batch)
@@ -67,7 +71,7 @@ def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[La
 
 
 def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple[Metrics, Tick]:
-    """Run the loop until every lane is done; return metrics (slots, lanes) and all ticks (ticks, lanes)."""
+    """Run all scenarios; return the metrics, (contacts, lanes), and all ticks, (ticks, lanes)."""
     arrays = convert_gains(gains)
     rig, run = start_batch(loop, arrays, batch)
     chunks = []
@@ -78,25 +82,25 @@ def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple
 
 
 def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
-    """Compile the programs of `record_lanes` for these arguments."""
+    """Compile the programs that `record_lanes` needs for these arguments."""
     loop, gains = build_loop(loaded.mechanism, loaded.compensator, batch), convert_gains(loaded.gains)
     rig, run = start_batch(loop, gains, batch)
     cached_programs.compile_cached(_record_segment, loop, rig, gains, run)
 
 
 def start_batch(loop: Loop, gains: Gains, batch: Scenario) -> tuple[RigConstants, RunState]:
-    """Return the constants and the state of a batch of scenarios before the first tick."""
+    """Return constants and initial state of the loop for a batch of scenarios, from a cached program."""
     return cached_programs.run_cached(_start_loop, loop, gains, batch)
 
 
 def convert_gains(gains: Mapping[str, Any]) -> Gains:
-    """Return gains as JAX arrays."""
+    """Convert gains to JAX arrays."""
     return {name: jnp.asarray(value) for name, value in gains.items()}
 
 
 def _build_lane_record(ticks: Tick, zeroed: bool) -> LaneRecord:
-    """Return the record of one lane."""
-    # A pause between two contacts is part of the record; ticks after the last active one are not.
+    """Return the record of one lane, without the ticks after its last contact."""
+    # A lane may be inactive between two contacts; only the ticks after its last active tick are removed.
     end = int(np.max(np.nonzero(ticks.active)[0], initial=-1)) + 1
     numbers = [*ticks.signals, ticks.command, ticks.sent, *(ticks.identified or ())]
     finite = np.all(np.isfinite(np.stack(numbers)[:, :end]), axis=0)
@@ -106,13 +110,13 @@ def _build_lane_record(ticks: Tick, zeroed: bool) -> LaneRecord:
 
 
 def _start_loop(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
-    """Return the constants and the state before the first tick."""
+    """Return constants and initial state of the loop."""
     rig = build_rig_constants(loop, scenario)
     return rig, start_rollout(loop, rig, gains, skip_flight=False)
 
 
 def _record_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> tuple[RunState, Tick]:
-    """Run and record `TICKS_PER_CALL` ticks."""
+    """Simulate and record `TICKS_PER_CALL` ticks."""
 
     def body(run, _):
         run, ticks = run_segment(loop, rig, gains, run, record=True)

@@ -1,8 +1,8 @@
-"""Registration of a user's compensator or contact law under its name.
+"""Registration of user-defined compensators and contact laws.
 
-A law is one object whose class may be defined anywhere. After its registration it is equivalent to a built-in
-law: its name in mechanism files, gain files and function arguments refers to this object. Registration is per
-process.
+A compensator or contact law (here: a law) is an object of a class that may be defined in any module. After
+registration, the name of the law can be used in mechanism files, gain files and function arguments like the
+name of a built-in law. A registration applies to the current process only.
 """
 
 import inspect
@@ -24,17 +24,21 @@ _RUNTIME_METHODS = ("step", "reset", "position_command", "next_contact")
 
 
 def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None:
-    """Register a compensator or a contact law under its `name` for simulation, tuning and gain files.
+    """Register a compensator or a contact law under its `name` in this process.
 
-    `runtime` is the compensator's class for the rig, in plain Python, with gains of the same names and units
-    (`jaxhil.rig.registry.Compensator`); the export of a controller needs it. The law's own class may be
-    defined and registered again, as in a notebook's cell that runs twice; the name of another law is
-    rejected.
+    The same class may be defined and registered again, for example by a notebook cell that runs twice. The
+    new object then replaces the old one.
 
-    Raise `InputError` if the object is not an instance of a law, if its name is taken or not a word of
-    letters, digits and underscores, if the law contains arrays, if gains have no unit or have bounds that do
-    not enclose the nominal value (evaluated on the default mechanism), or if the runtime class does not fit
-    the law.
+    Args:
+        law: Compensator or contact law. Simulation, tuning and gain files can then use its name.
+        runtime: Class of the compensator for the rig, in plain Python, with gains of the same names and units
+            (see `jaxhil.rig.registry.Compensator`). It is needed to export a controller.
+
+    Raises:
+        InputError: `law` is not an instance of `Compensator` or `ContactLaw`; its name belongs to another law
+            or is not a word of letters, digits and underscores; it contains arrays; a gain has no unit, or
+            its nominal value for the default mechanism is out of its bounds; or `runtime` lacks a method or
+            has other gains.
 
     Example:
         >>> import jaxhil
@@ -61,19 +65,19 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
             RUNTIME_COMPENSATORS.pop(law.name, None)
     elif runtime is not None:
         raise _make_error(
-            law, "runtime", format_value(runtime), "none: a contact law runs in the simulation alone"
+            law, "runtime", format_value(runtime), "none: contact laws run in the simulation only"
         )
     elif unknown := [key.name for key in law.keys or () if key not in CONTACT_KEYS.values()]:
-        raise _make_error(law, "keys", unknown[0], f"keys that files have: {', '.join(CONTACT_KEYS)}")
+        raise _make_error(law, "keys", unknown[0], f"keys of mechanism files: {', '.join(CONTACT_KEYS)}")
     table[law.name] = law
 
 
 def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
-    """Raise `InputError` if a law's name is invalid or belongs to another law."""
+    """Raise `InputError` if the name of a law is invalid or belongs to another law in `table`."""
     name = getattr(law, "name", None)
     if not isinstance(name, str) or not _NAME_PATTERN.fullmatch(name):
         where = f"register: {type(law).__name__}.name"
-        allowed = "a word of letters, digits and underscores, as `name: ClassVar[str] = ...` gives it"
+        allowed = "a word of letters, digits and underscores, defined by `name: ClassVar[str] = ...`"
         raise InputError(f"{where}: found {format_value(name or None)}, expected {allowed}")
     if name in table:
         home, other_home = ((type(x).__module__, type(x).__qualname__) for x in (law, table[name]))
@@ -82,19 +86,19 @@ def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
-    """Raise `InputError` unless a law is hashable and equal to itself, as compiled programs require."""
+    """Raise `InputError` if a law cannot be a static argument: not hashable, or not equal to itself."""
     try:
         hash(law)
         is_equal = bool(law == law)
     except Exception:
         is_equal = False
     if not is_equal:
-        allowed = "plain numbers, texts and tuples: a law holds no arrays"
-        raise _make_error(law, "fields", "what cannot be hashed", allowed)
+        allowed = "only numbers, texts and tuples, no arrays"
+        raise _make_error(law, "fields", "a value that is not hashable", allowed)
 
 
 def _check_gains(law: Compensator) -> None:
-    """Raise `InputError` if names, units or bounds of the gains are invalid."""
+    """Raise `InputError` if name, unit or bounds of a compensator's gain are invalid."""
     gains = getattr(law, "gains", None)
     if not isinstance(gains, tuple) or not all(isinstance(gain, Gain) for gain in gains):
         raise _make_error(law, "gains", format_value(gains), "a tuple of jaxhil.Gain")
@@ -106,7 +110,10 @@ def _check_gains(law: Compensator) -> None:
             or names.count(gain.name) > 1
         ):
             raise _make_error(
-                law, "gains", format_value(gain.name), "a word of letters, digits and underscores, once"
+                law,
+                "gains",
+                format_value(gain.name),
+                "a word of letters, digits and underscores that no other gain has",
             )
         if not isinstance(gain.unit, str) or not gain.unit:
             raise _make_error(
@@ -116,7 +123,7 @@ def _check_gains(law: Compensator) -> None:
 
 
 def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
-    """Raise `InputError` unless lower <= nominal <= upper, all finite."""
+    """Raise `InputError` unless lower <= nominal <= upper holds for a gain with finite bounds."""
     values = {}
     for part in ("lower", "nominal", "upper"):
         try:
@@ -132,10 +139,10 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
-    """Raise `InputError` if the runtime class lacks a method or has other gains than the law."""
+    """Raise `InputError` if a class for the rig lacks a method or has other gains than the compensator."""
     if not inspect.isclass(runtime):
         raise _make_error(
-            law, "runtime", format_value(runtime), "a class, as of jaxhil.rig.registry.Compensator"
+            law, "runtime", format_value(runtime), "a class like jaxhil.rig.registry.Compensator"
         )
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
@@ -151,15 +158,18 @@ def _check_runtime(law: Compensator, runtime: object) -> None:
     law_units = {gain.name: gain.unit for gain in law.gains}
     if units != law_units:
         raise _make_error(
-            law, "runtime.gains", _format_units(units), f"{_format_units(law_units)}, as the law has them"
+            law,
+            "runtime.gains",
+            _format_units(units),
+            f"{_format_units(law_units)}, the gains of the compensator",
         )
 
 
 def _format_units(gains: dict[str, Any]) -> str:
-    """Return names and units of gains as text."""
+    """Return names and units of gains as text, such as "lead [s], weight [1]"."""
     return to_one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
 
 
-def _make_error(law: Compensator | ContactLaw, what: str, found: str, allowed: str) -> InputError:
-    """Return the error for a part of a law."""
-    return InputError(f"register {law.name}: {what}: found {found}, expected {allowed}")
+def _make_error(law: Compensator | ContactLaw, part: str, found: str, allowed: str) -> InputError:
+    """Return the error with the message "register NAME: PART: found ..., expected ..."."""
+    return InputError(f"register {law.name}: {part}: found {found}, expected {allowed}")

@@ -1,8 +1,9 @@
-"""Rollout of a batch of scenarios through the loop, from the first approach until the last contact is over.
+"""Rollout: simulation of a batch of scenarios, from the first approach to the end of the last contact.
 
-Ticks run in short segments ("stretches"). Between segments, finished contacts are written to the metrics, the
-next ones begin, and uneventful free flight is skipped. The program ends with its slowest lane; there is no
-fixed horizon. Forward-mode derivatives pass through to every array leaf.
+The simulation runs segments of a few ticks. Between two segments, the metrics of finished contacts are
+stored, the next contacts begin, and free flight without events is skipped. The simulation ends when the
+slowest scenario has ended; there is no fixed horizon. Results are differentiable in forward mode with respect
+to every array.
 """
 
 import jax
@@ -24,50 +25,65 @@ from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, build_end_conditions, f
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
-    """Return the metrics (slots, *batch) of every contact of every lane.
+    """Simulate all contacts of all scenarios and return their metrics, (contacts, *batch).
 
-    `gains` are scalars or of the batch shape. Use lanes for several gains, not `jax.vmap`, which would give
-    each lane its own loop condition and ring pointer.
+    To compare several gains, repeat the scenarios in the batch. Do not use `jax.vmap`: the loop over ticks
+    and the positions in the delay lines would no longer be common to all lanes, which is slower.
+
+    Args:
+        loop: Loop that runs the scenarios.
+        gains: Gains by name [SI units], scalars or arrays of the batch shape.
+        scenario: Scenarios.
     """
     rig = build_rig_constants(loop, scenario, measured=loop.compensator.reads_position)
     return run_contacts(loop, gains, rig)
 
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
-    """Return the metrics as `rollout` does, with constants computed before, for many gains."""
+    """Simulate all contacts as `rollout` does, with constants that were computed before."""
     return run_until_done(loop, gains, rig).metrics
 
 
 def run_until_done(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
-    """Return the state after all lanes are done."""
+    """Simulate until the last contact of every lane has ended, and return the final state."""
 
     def body(run):
         run, _ = run_segment(loop, rig, gains, run, record=False)
         if loop.is_two_sided:
             return begin_next_contacts(loop, rig, gains, run)
-        # Most segments end no contact, since lanes of a tile end theirs at about the same time. The rings,
-        # which `begin_next_contacts` does not change, stay outside the branch and are not copied.
+        # Contacts of a tile end at about the same time. Most segments therefore end no contact and need not
+        # call `begin_next_contacts`. The delay lines do not change in this call. They stay outside the branch
+        # and are therefore not copied.
         rings = run.state.sensed.rings
-        light = run._replace(state=run.state._replace(sensed=run.state.sensed._replace(rings=None)))
-        light = lax.cond(
+        run_without_rings = run._replace(
+            state=run.state._replace(sensed=run.state.sensed._replace(rings=None))
+        )
+        run_without_rings = lax.cond(
             jnp.any(_finished_lanes(rig, run)),
             lambda run: begin_next_contacts(loop, rig, gains, run),
             lambda run: run,
-            light,
+            run_without_rings,
         )
-        return light._replace(state=light.state._replace(sensed=light.state.sensed._replace(rings=rings)))
+        return run_without_rings._replace(
+            state=run_without_rings.state._replace(
+                sensed=run_without_rings.state.sensed._replace(rings=rings)
+            )
+        )
 
     run = start_rollout(loop, rig, gains)
     return lax.while_loop(lambda run: jnp.any(run.active), body, run)
 
 
 def segment_length(loop: Loop) -> int:
-    """Return the ticks per segment: 1 between two surfaces, where the next contact may begin at once."""
+    """Return the number of ticks in a segment.
+
+    It is 1 for two surfaces, because the next contact may begin in the next tick.
+    """
     return 1 if loop.is_two_sided else 16
 
 
 def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
-    """Return all lanes on their first approach, or at its end if nothing happens on it."""
+    """Return the initial state of the first approach; with `skip_flight`, skip flight without events."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
     index = jnp.zeros(like.shape, jnp.int32)
@@ -83,7 +99,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         sensed=SensorState(
             rings=_build_rings(loop, ring, measured, order),
             last=no_contact(like),
-            touched=zeros if loop.has_cells else None,
+            contact_time=zeros if loop.has_cells else None,
             lagged=zeros,
             first_position=zeros if measured else None,
         ),
@@ -94,7 +110,8 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         onset_tick=index,
         first_contact=initial_first_contact(zeros) if loop.probed else None,
     )
-    # Rings are read up to one ring back: with this first tick no index is negative.
+    # Delay lines are read up to their whole length back. With this number of the first tick, no index is
+    # negative.
     tick = jnp.array(loop.first_tick, jnp.int32)
     phase = _select_entry(scenario.phase, _select_slot(rig, index))
     state, skipped = begin_approach(loop, rig, gains, state, phase, like, tick, skip_flight)
@@ -113,7 +130,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
 def run_segment(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, record: bool
 ) -> tuple[RunState, Tick | None]:
-    """Run one segment of ticks; `record` returns the ticks too."""
+    """Simulate one segment; return the new state, and the record of every tick if `record` is set."""
     prepared = prepare_segment(loop, rig, gains, run)
 
     def body(carry, noise):
@@ -128,7 +145,7 @@ def run_segment(
 
 
 def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> SegmentConstants:
-    """Return the values that the ticks of a segment share."""
+    """Compute the values that do not change during a segment."""
     return SegmentConstants(
         gains=gains,
         rules=build_end_conditions(rig.scenario),
@@ -138,7 +155,7 @@ def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) 
 
 
 def draw_segment_noise(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> SensorNoise:
-    """Return the sensors' noise, (ticks, *batch), of the next ticks of a segment."""
+    """Return the sensors' noise at the ticks of the next segment, (ticks, *batch)."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.onset_tick[None]
     return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
@@ -147,7 +164,7 @@ def draw_segment_noise(loop: Loop, rig: RigConstants, run: RunState, ticks: int)
 def begin_next_contacts(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
 ) -> RunState:
-    """Write finished contacts to the metrics, begin the next ones, and skip free flight."""
+    """Store the metrics of finished contacts, begin the next contacts, and skip free flight."""
     watch, state, scenario = run.watch, run.state, rig.scenario
     status = determine_status(scenario, watch, run.tick - state.onset_tick)
     over = _finished_lanes(rig, run)
@@ -158,22 +175,24 @@ def begin_next_contacts(
     index = run.index + over.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:
-        # A run cannot begin with a motion that the drives cannot follow.
+        # The next run would begin with a rebound speed that the drives cannot follow.
         ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
     active = run.active & ~(over & ends)
     blank = fresh_watch(loop, watch.approach)
     entry = _select_entry(scenario.contact, _select_slot(rig, index))
     if watch.command is not None:
-        left = jnp.maximum(COMMAND_DECAY_RATIO * watch.peak_command, watch.command)
-        # A force that acts already begins the next contact at once; it approaches at the rebound's speed.
+        remaining_command = jnp.maximum(COMMAND_DECAY_RATIO * watch.peak_command, watch.command)
+        # If a force still acts, the next contact begins at once. Its approach speed is the rebound speed of
+        # the contact that has just ended.
         unchanged = {
             "approach": watch.rebound,
-            "quiet": watch.quiet,
-            "recent": watch.recent,
+            "force_free_ticks": watch.force_free_ticks,
+            "recent_forces": watch.recent_forces,
             "command": watch.command,
         }
-        watch = _select_lanes(over, blank._replace(left=left, **unchanged), watch)
-        # A damped contact may end during penetration; its law's parameters apply until the mechanism is free.
+        watch = _select_lanes(over, blank._replace(remaining_command=remaining_command, **unchanged), watch)
+        # A damped contact may end before the penetration does. The parameters of this contact apply until the
+        # mechanism has left the surface.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=_select_lanes(free, entry, state.parameters))
         if state.first_contact is not None:
@@ -196,45 +215,48 @@ def begin_next_contacts(
 
 
 def _changing_parts(run):
-    """Return the parts of the state that change from tick to tick."""
+    """Return the parts of the state that change within a segment."""
     return run.state, run.watch, run.tick
 
 
-def _replace_changing_parts(run, evolving):
-    """Return the state with these parts replaced."""
-    state, watch, now = evolving
+def _replace_changing_parts(run, parts):
+    """Return the state with the parts of `_changing_parts` replaced."""
+    state, watch, now = parts
     return run._replace(state=state, watch=watch, tick=now)
 
 
 def _build_rings(loop, ring, measured, order):
-    """Return empty delay lines of the signals that the loop has."""
+    """Return the initial delay lines, only for signals that the loop uses; `ring` is filled with 0."""
     interval = None
     if loop.is_two_sided:
         motion = MotionSample(ring, ring)
         ends = motion if loop.follows_intervals and not loop.has_cells else None
-        course = IntervalInputs((ring,) * order, ring, ring, ring) if loop.has_cells else None
-        interval = SamplingInterval(motion, ends, ends, course)
+        inputs = IntervalInputs((ring,) * order, ring, ring, ring) if loop.has_cells else None
+        interval = SamplingInterval(motion, ends, ends, inputs)
     plant_signals = PlantSignals(
         force=ring,
-        works=(ring, ring) if loop.energies else None,
+        work=(ring, ring) if loop.energies else None,
         peak=ring if loop.has_corners or loop.has_cells else None,
-        touched=ring if loop.has_cells else None,
+        contact_time=ring if loop.has_cells else None,
     )
     reading = ring if loop.has_lag else None
     return Rings(plant_signals, reading, ring if measured else None, interval)
 
 
 def _finished_lanes(rig, run):
-    """Return the lanes whose contact is over or has failed."""
+    """Return whether the current contact of each lane has ended or failed."""
     status = determine_status(rig.scenario, run.watch, run.tick - run.state.onset_tick)
     return (run.watch.over | (status != OK)) & run.active
 
 
 def _restart(loop, gains, state, entered, begins, fresh):
-    """Replace the state by the entered run where it `begins`; rings and the law's parameters stay."""
+    """Return the state in which a run starts (`entered`) in lanes where it `begins`, else the old state.
+
+    Delay lines and parameters of the contact law do not change.
+    """
     sensed_at_entry = state.sensed._replace(
         last=entered.sensed.last,
-        touched=entered.sensed.touched,
+        contact_time=entered.sensed.contact_time,
         lagged=entered.sensed.lagged,
         first_position=entered.sensed.first_position,
     )
@@ -245,7 +267,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
     )
     sensed = sensed_at_entry._replace(
         last=_select_lanes(begins, sensed_at_entry.last, state.sensed.last),
-        touched=_select_lanes(begins, sensed_at_entry.touched, state.sensed.touched),
+        contact_time=_select_lanes(begins, sensed_at_entry.contact_time, state.sensed.contact_time),
         lagged=jnp.where(begins, sensed_at_entry.lagged, state.sensed.lagged),
         first_position=_select_lanes(begins, sensed_at_entry.first_position, state.sensed.first_position),
     )
@@ -257,12 +279,12 @@ def _restart(loop, gains, state, entered, begins, fresh):
 
 
 def _select_slot(rig, index):
-    """Return the slot of a contact; the last slot for contacts beyond the last one."""
+    """Return the index of a contact, limited to the last entry of arrays with one entry per contact."""
     return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 
 def _select_entry(table, index):
-    """Return entry `index` (per lane) of the leading axis of every leaf."""
+    """Select one entry of the leading axis of every array; `index` has one value per lane."""
 
     def pick(leaf):
         indices = jnp.broadcast_to(index, leaf.shape[1:])[None]
@@ -272,5 +294,5 @@ def _select_entry(table, index):
 
 
 def _select_lanes(condition, when_true, when_false):
-    """Select leaf by leaf; the condition is of the batch shape."""
+    """Apply `jnp.where` to every array of two pytrees; the condition has the batch shape."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -1,7 +1,8 @@
-"""Roots of smooth functions within brackets at whose ends the signs differ, and their derivatives.
+"""Bracketed root finding for batches of smooth functions, differentiable in forward mode.
 
-Newton's method within the bracket iterates until every lane has its root. Forward-mode derivatives use the
-implicit function theorem, not the iteration.
+A bracket [low, high] contains a root if the function has different signs at its ends. Newton's method with
+bisection iterates until it has converged in every lane of the batch. Derivatives follow from the implicit
+function theorem, not from the iteration.
 """
 
 from collections.abc import Callable
@@ -12,14 +13,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-MAX_BISECTIONS = 60  # bisections that give rounding accuracy for any function
-ARGUMENT_TOLERANCE = 1e-9  # tolerance of the argument, which is of order 1
+MAX_BISECTIONS = 60  # number of bisections after which any bracket is shorter than the rounding error
+# Amount by which a Newton step may leave the bracket, for arguments of order 1 [1].
+ARGUMENT_TOLERANCE = 1e-9
 
-RootFunction = Callable[[Any, Array], Array]  # function of data and an argument
+RootFunction = Callable[[Any, Array], Array]  # maps (data, argument) to the function value
 
 
 def find_positive_part(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the part of [low, high] on which a function is positive, if it changes sign at most once."""
+    """Return the subinterval of [low, high] in which a function is positive; it may change sign only once."""
     root, at_low, at_high = _find_root(function, data, low, high)
     begin = jnp.where(at_low > 0, low, jnp.where(at_high > 0, root, low))
     end = jnp.where(at_high > 0, high, jnp.where(at_low > 0, root, low))
@@ -31,7 +33,8 @@ def find_sign_change(
 ) -> Array:
     """Return the argument in [low, high] at which a function changes sign.
 
-    Without a change of sign, return `positive`, or `negative` if this is given and the function is negative.
+    If the function is positive at both ends, return `positive`. If it is negative at both ends, return
+    `negative`, or `positive` if `negative` is None.
     """
     root, at_low, at_high = _find_root(function, data, low, high)
     none = positive if negative is None else jnp.where(at_low > 0, positive, negative)
@@ -39,19 +42,19 @@ def find_sign_change(
 
 
 def _find_root(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Return the root of a function in a bracket, and the function's values at both ends."""
+    """Return the root of a function in [low, high], and the function's values at both ends."""
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
     change = at_high - at_low
-    # After a step as short as this, the next one is below rounding.
+    # Newton's method converges quadratically: after so short a step, the next step is below rounding.
     short = jnp.finfo(at_low.dtype).eps ** 0.6
 
     def value_and_slope(s):
         return jax.jvp(lambda s: function(fixed, s), (s,), (jnp.ones_like(s),))
 
-    def is_under_way(carry):
-        *_, sought, steps = carry
-        return jnp.any(sought) & (steps < MAX_BISECTIONS)
+    def is_unfinished(carry):
+        *_, unconverged, steps = carry
+        return jnp.any(unconverged) & (steps < MAX_BISECTIONS)
 
     def improve(carry):
         low, high, guess, _, steps = carry
@@ -59,15 +62,15 @@ def _find_root(function: RootFunction, data: Any, low: Array, high: Array) -> tu
         above = (value > 0) == (change > 0)
         low, high = jnp.where(above, low, guess), jnp.where(above, guess, high)
         step = guess - value / jnp.where(slope != 0, slope, 1)
-        # At the root, rounding may place the step outside the bracket.
+        # Near the root, rounding errors may move the step slightly out of the bracket.
         inside = (slope != 0) & (step >= low - ARGUMENT_TOLERANCE) & (step <= high + ARGUMENT_TOLERANCE)
         nearer = jnp.where(inside, jnp.clip(step, low, high), (low + high) / 2)
         return low, high, nearer, crosses & (jnp.abs(nearer - guess) > short), steps + 1
 
     crosses = (at_low > 0) != (at_high > 0)
     secant = jnp.clip(low - at_low * (high - low) / jnp.where(change != 0, change, 1), low, high)
-    _, _, root, _, _ = lax.while_loop(is_under_way, improve, (low, high, secant, crosses, 0))
+    _, _, root, _, _ = lax.while_loop(is_unfinished, improve, (low, high, secant, crosses, 0))
     _, slope = value_and_slope(root)
-    # One more step of Newton's method adds the derivative, but not its value.
+    # One more step of Newton's method contributes its derivative (implicit function theorem), not its value.
     step = function(data, root) / jnp.where(slope != 0, slope, 1)
     return root - (step - lax.stop_gradient(step)), at_low, at_high

@@ -1,4 +1,4 @@
-"""Run of a mechanism's contacts: results of each contact, and all ticks."""
+"""Simulation of a mechanism's contacts on the rig: function `simulate`, and the results of a run."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,62 +36,70 @@ PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 class ContactResult(NamedTuple):
-    """Results of one contact; NaN for results that it does not have."""
+    """Results of one contact on the rig and of the ideal contact; NaN if a result does not exist.
 
-    restitution: float  # e, rebound speed over approach speed of the numerical model [1]
-    reference_restitution: float  # e*, of the ideal contact with the same approach velocity [1]
-    error: float  # e - e* [1]; positive if the contact diverges
+    The ideal contact is the contact without any delay at the same approach velocity.
+    """
+
+    restitution: float  # restitution e [1]: rebound speed over approach speed of the numerical model
+    reference_restitution: float  # restitution e* of the ideal contact [1]
+    error: float  # restitution error e - e* [1]; positive if the contact diverges
     peak_force: float  # largest real contact force [N]
     reference_peak_force: float  # peak force of the ideal contact [N]
-    peak_force_ratio: float  # peak force over the ideal contact's peak force [1]
-    peak_command: float  # largest |F_c|, the force on the numerical model [N]
+    peak_force_ratio: float  # peak force divided by the ideal contact's peak force [1]
+    peak_command: float  # largest |F_c| [N], where F_c is the force on the numerical model
     position_shortfall: float  # largest change of the position command by the motion simulator's limits [m]
-    duration: float  # time with a real contact force [s]
+    duration: float  # time during which a real contact force acts [s]
     reference_duration: float  # duration of the ideal contact [s]
-    duration_ratio: float  # duration over the ideal contact's duration [1]
+    duration_ratio: float  # duration divided by the ideal contact's duration [1]
     approach_velocity: float  # velocity of the numerical model at the tick before the contact [m/s]
-    force_delay: float | None  # compensator's estimate of the measurement's delay [s]; None without one
-    # "ok", or the reason for a missing restitution: "timeout" (not over within 10 s), "diverged",
-    # "non-finite", "not reached" (the run ended before it, or its force was not measured)
+    # delay of the force measurement as estimated by the compensator [s]; None if it estimates no delay
+    force_delay: float | None
+    # "ok", or why there is no restitution: "timeout" (not ended after 10 s), "diverged", "non-finite",
+    # "not reached" (the run ended before this contact, or no force was measured in it)
     status: str
 
 
 class Ticks(NamedTuple):
-    """All ticks of a run, all contacts one after the other; arrays of shape (ticks,)."""
+    """Signals at all ticks of a run, through all its contacts; arrays of shape (ticks,)."""
 
-    time: np.ndarray  # [s], from 0, one control period per tick
+    time: np.ndarray  # time since the first tick [s]; one control period per tick
     force_measured: np.ndarray  # reading of the force sensor [N]
     force_command: np.ndarray  # F_c, output of the compensator and force on the numerical model [N]
     position_desired: np.ndarray  # position of the numerical model [m]
     velocity_desired: np.ndarray  # velocity of the numerical model [m/s]
     position_measured: np.ndarray  # reading of the position sensor [m]
-    contact: np.ndarray  # index of the current or next contact, from 0
+    contact: np.ndarray  # index of the current contact or, in free flight, of the next contact, from 0
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run of a mechanism's contacts under a compensator.
+    """Simulated run of a mechanism's contacts with a compensator.
 
-    The ticks (`time`, `force_measured`, ...: see `Ticks`) are recorded at first use.
+    The signals at all ticks (see `Ticks`) are also attributes of the run, such as `run.force_measured`. They
+    are computed when one of them is first used.
     """
 
-    mechanism: Mechanism = field(repr=False)
+    mechanism: Mechanism = field(repr=False)  # mechanism
     compensator: str  # name of the compensator
-    gains: dict[str, float]  # gains by name, in SI units
+    gains: dict[str, float]  # gains by name [SI units]
     seed: int  # seed of the sensors' noise
-    contacts: tuple[ContactResult, ...]  # one for every contact of the schedule
-    status: str  # "ok", or the status of the first contact with another status
+    contacts: tuple[ContactResult, ...]  # results of every scheduled contact
+    status: str  # "ok" if all contacts are "ok", else the first other status of a contact
 
     @cached_property
     def meaning(self) -> MechanismSummary:
-        """Summary of the mechanism: mass, ideal contacts, rates, and `warnings` of implausible numbers."""
+        """Summary of the mechanism: mass, ideal contacts, rates, and warnings about implausible numbers."""
         return summarise_mechanism(self.mechanism)
 
     def reasons(self, limit: float = 0.01) -> list[str]:
-        """Return the reasons for which the run is bad, as sentences; an empty list if it is good.
+        """Return why the run is bad, one text per reason; an empty list if the run is good.
 
-        A run is good if every contact ended, no restitution error exceeds `limit` [1], and the peak force and
-        the duration of every real contact are within the bounds of `contact_bounds`.
+        A run is good if all contacts have ended, if no restitution error exceeds the limit, and if peak force
+        and duration of every real contact are within the bounds of `jaxhil.simulation.contact_bounds`.
+
+        Args:
+            limit: Largest allowed magnitude of a restitution error [1].
         """
         if self.status != CONTACT_STATUS_NAMES[OK]:
             return [f"the run ended with status '{self.status}': {CONTACT_STATUS_REASONS[self.status]}"]
@@ -99,7 +107,7 @@ class Run:
 
     @cached_property
     def ticks(self) -> Ticks:
-        """All ticks up to the end of the last contact, or to the first number that is not finite."""
+        """Signals at all ticks up to the end of the last contact, or to the first non-finite number."""
         with jax_context():
             scenarios = build_scenarios(self.mechanism, seed=self.seed)
             loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
@@ -147,21 +155,22 @@ class Run:
 
     @property
     def contact(self) -> np.ndarray:
-        """Index of the contact at every tick."""
+        """Index of the current or next contact at every tick, from 0."""
         return self.ticks.contact
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the ticks as CSV, one line each after a line of names, in SI units with all digits.
+        """Write the signals to a CSV file: one line of names, then one line per tick, in SI units.
 
-        Raise `InputError` if the file cannot be written.
+        Numbers have all digits, so that reading them back gives exactly equal values. Raise `InputError` if
+        the file cannot be written.
         """
         write_csv(path, {name: column.tolist() for name, column in self.ticks._asdict().items()})
 
     def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw force and position over time for each contact, beside the ideal contact.
+        """Plot force and position against time for each contact, together with the ideal contact.
 
-        The file name ends in .png, .pdf or .svg; parent folders are created. Raise `InputError` if the file
-        cannot be written.
+        The suffix of the file, .png, .pdf or .svg, selects the format. Parent folders are created. Raise
+        `InputError` if the file has another suffix or cannot be written.
         """
         target = to_path(path)
         if target.suffix.lower() not in PLOT_SUFFIXES:
@@ -186,10 +195,10 @@ def simulate(
     *,
     seed: int = 0,
 ) -> Run:
-    """Run the contacts of a nominal mechanism of one axis once.
+    """Simulate the nominal contacts of a mechanism with one axis.
 
-    See `jaxhil.simulate`, which also accepts mechanisms of six axes, for the arguments. Raise `InputError` if
-    an argument is invalid.
+    See `jaxhil.simulate` for the arguments; that function accepts mechanisms with six axes too. Raise
+    `InputError` if an argument is invalid.
     """
     checked = as_mechanism(mechanism)
     number = check_seed(seed)
@@ -207,7 +216,7 @@ def simulate(
 
 
 def check_seed(seed: Any) -> int:
-    """Return the seed, or raise `InputError` unless it is an integer >= 0."""
+    """Return the seed as an `int`; raise `InputError` unless it is an integer >= 0."""
     number = seed.item() if isinstance(seed, np.integer) else seed
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
         raise InputError(f"seed: found {format_value(seed)}, expected an integer >= 0")
@@ -215,7 +224,7 @@ def check_seed(seed: Any) -> int:
 
 
 def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[str]:
-    """Yield a sentence about the largest restitution error, if it exceeds the limit."""
+    """Yield a text about the largest restitution error if it exceeds the limit."""
     worst = max((contact.error for contact in contacts), key=abs)
     if not abs(worst) <= limit:
         kind = "divergence" if worst > 0 else "convergence"
@@ -223,13 +232,13 @@ def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[
 
 
 def _bound_reasons(contacts: Sequence[ContactResult], mechanism: Mechanism) -> Iterator[str]:
-    """Yield sentences about the real contacts that are too hard, too short or too long."""
+    """Yield a text for each real contact that is too hard, too short or too long."""
     for number, contact in enumerate(contacts, start=1):
         force, ideal_force = contact.peak_force, contact.reference_peak_force
         if is_peak_force_excessive(force, ideal_force):
             yield (
                 f"contact {number}: real peak force {force:.4g} N, {contact.peak_force_ratio:.3g} times "
-                f"the ideal contact's {ideal_force:.4g} N, expected {MAX_PEAK_FORCE_RATIO:g} times"
+                f"the ideal contact's {ideal_force:.4g} N, expected at most {MAX_PEAK_FORCE_RATIO:g} times"
             )
         duration, ideal_duration = contact.duration, contact.reference_duration
         if is_duration_out_of_bounds(duration, ideal_duration, mechanism.rig.control_period):
@@ -242,7 +251,7 @@ def _bound_reasons(contacts: Sequence[ContactResult], mechanism: Mechanism) -> I
 
 
 def _build_contact_result(outcome: Outcome, slot: int, law: Compensator) -> ContactResult:
-    """Return the results of one contact."""
+    """Return the results of the contact with index `slot`, from a batch with one scenario."""
     metrics = outcome.metrics
     status = int(metrics.status[slot, 0])
     ended = status == OK

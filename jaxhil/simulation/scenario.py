@@ -1,8 +1,11 @@
-"""Scenarios: nominal or drawn mechanisms as a batch of arrays, for one compiled program.
+"""Scenarios: the numbers of nominal or drawn mechanisms, as a batch of arrays.
 
-Every number of a mechanism file is an array leaf here, including the control period and the delays. Another
-mechanism, draw or batch of equal shape can therefore reuse the compiled loop, and the result can be
-differentiated. The batch is the trailing axis; contacts, segments and polynomial coefficients come first.
+Every number of a mechanism file is an array here, including the control period and the delays. Scenarios of
+another mechanism or draw can therefore reuse a compiled program if the arrays have equal shapes. Results can
+be differentiated with respect to every number.
+
+The batch is the last axis. Axes for contacts, segments of a contact law and polynomial coefficients come
+before it.
 """
 
 from collections.abc import Mapping
@@ -19,73 +22,83 @@ from jaxhil.contact.laws import CONTACT_KEYS, ContactParameters, find_contact_la
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
-MAX_CONTACT_DURATION = 10.0  # s; limit on the duration of a contact
+MAX_CONTACT_DURATION = 10.0  # s; a longer contact is ended with the status "timeout"
 
 
 class MotionSimulatorBatch(NamedTuple):
-    """Motion simulator num(s)/den(s) e^(-s delay)."""
+    """Parameters of the motion simulator num(s)/den(s) e^(-s delay), with s in rad/s."""
 
-    numerator: Float[Array, "order *batch"]  # coefficients in descending powers of s [rad/s]
-    denominator: Float[Array, "order_plus_1 *batch"]  # likewise
+    numerator: Float[Array, "order *batch"]  # coefficients of num(s), descending powers
+    denominator: Float[Array, "order_plus_1 *batch"]  # coefficients of den(s), descending powers
     delay: Float[Array, "*batch"]  # transport delay [s]
-    velocity_limit: Float[Array, "*batch"]  # [m/s]; infinite if none
-    acceleration_limit: Float[Array, "*batch"]  # [m/s^2]; infinite if none
+    velocity_limit: Float[Array, "*batch"]  # velocity limit [m/s]; infinite if there is none
+    acceleration_limit: Float[Array, "*batch"]  # acceleration limit [m/s^2]; infinite if there is none
 
 
 class ForceSensorBatch(NamedTuple):
-    """Force sensor."""
+    """Parameters of the force sensor."""
 
     delay: Float[Array, "*batch"]  # transport delay [s]
     time_constant: Float[Array, "*batch"]  # time constant of the first-order lag [s]
     noise_std: Float[Array, "*batch"]  # standard deviation of white noise [N]
-    quantum: Float[Array, "*batch"]  # [N]; 0 without quantisation
-    dead_zone: Float[Array, "*batch"]  # [N]; 0 for none
-    bias: Float[Array, "*batch"]  # [N]
-    range: Float[Array, "*batch"]  # [N]; infinite if unlimited
+    quantum: Float[Array, "*batch"]  # quantisation step [N]; 0 without quantisation
+    dead_zone: Float[Array, "*batch"]  # half-width of the dead zone [N]; 0 without dead zone
+    bias: Float[Array, "*batch"]  # bias [N]
+    range: Float[Array, "*batch"]  # largest |reading| [N]; infinite if unlimited
 
 
 class PositionSensorBatch(NamedTuple):
-    """Position sensor."""
+    """Parameters of the position sensor."""
 
-    delay: Float[Array, "*batch"]  # [s]
+    delay: Float[Array, "*batch"]  # transport delay [s]
     noise_std: Float[Array, "*batch"]  # standard deviation of white noise [m]
-    quantum: Float[Array, "*batch"]  # [m]; 0 without quantisation
+    quantum: Float[Array, "*batch"]  # quantisation step [m]; 0 without quantisation
 
 
 class Scenario(NamedTuple):
-    """Batch of scenarios, one run per lane."""
+    """Batch of scenarios; each element of the batch (lane) is one series of contacts."""
 
-    equivalent_mass: Float[Array, "*batch"]  # M [kg]
+    equivalent_mass: Float[Array, "*batch"]  # equivalent mass M of both bodies [kg]
     velocity: Float[Array, "*batch"]  # velocity of the first approach [m/s]
     contacts: Int[Array, "*batch"]  # number of contacts
-    phase: Float[Array, "slots *batch"]  # phase of each contact within a control period [1]
+    # additional duration of each contact's approach, as a fraction of the control period [1]
+    phase: Float[Array, "slots *batch"]
     clearance: Float[Array, "*batch"]  # distance between two surfaces [m]; infinite for one surface
-    contact: ContactParameters  # contact law's parameters for each contact
-    control_period: Float[Array, "*batch"]  # T [s]
-    # position of the hardware's surface [m]; the controller assumes 0
+    contact: ContactParameters  # parameters of the contact law for each contact
+    control_period: Float[Array, "*batch"]  # control period T [s]
+    # position of the real mechanism's surface [m]; the compensator assumes 0
     contact_plane: Float[Array, "*batch"]
-    simulator: MotionSimulatorBatch  # motion simulator
-    force_sensor: ForceSensorBatch  # force sensor
-    position_sensor: PositionSensorBatch  # position sensor
+    simulator: MotionSimulatorBatch  # parameters of the motion simulator
+    force_sensor: ForceSensorBatch  # parameters of the force sensor
+    position_sensor: PositionSensorBatch  # parameters of the position sensor
     time_limit: Float[Array, "*batch"]  # limit on the duration of a contact [s]
-    key: UInt32[Array, "2 *batch"]  # key of the sensors' noise: seed, index of the scenario
-    probe: Probe | None = None  # probe of the run; None without one
-    # ideal contacts that are known beforehand, NaN for others; None if none is known
+    key: UInt32[Array, "2 *batch"]  # key of the sensors' noise: seed and index of the scenario
+    probe: Probe | None = None  # push and reference trajectory for each contact; None without a probe
+    # metrics of the ideal contacts computed beforehand, NaN where not; None if none is computed beforehand
     reference: IdealContact | None = None
 
 
 def count_contact_slots(contacts: int) -> int:
-    """Return the number of result slots: a power of two, so that similar counts share a program."""
+    """Return the length of arrays with one entry per contact.
+
+    The length is a power of two, so that mechanisms with similar numbers of contacts share a program.
+    """
     return max(4, 1 << (contacts - 1).bit_length())
 
 
 def build_scenarios(
     mechanism: Mechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
 ) -> Scenario:
-    """Return a batch of scenarios of a mechanism, as NumPy arrays, or JAX arrays if draws are such.
+    """Return a batch of scenarios of a mechanism.
 
-    `draws` maps dotted paths to values, (number,), or (number, entries) for lists; other numbers are nominal.
-    Without draws the batch is the nominal run alone. Noise keys depend only on `seed` and `first` + lane.
+    The arrays are JAX arrays if one of the draws is a JAX array, else NumPy arrays.
+
+    Args:
+        mechanism: Mechanism with the nominal numbers.
+        draws: Values by dotted path, (scenarios,), or (scenarios, entries) for a list. Numbers that are not
+            drawn are nominal. None for a batch with the nominal scenario only.
+        seed: Seed of the sensors' noise.
+        first: Index of the first scenario. The noise of a scenario depends only on seed and index.
     """
     table = _MechanismNumbers(mechanism, dict(draws or {}))
     contact, rig, number = mechanism.contact, mechanism.rig, table.number
@@ -118,64 +131,64 @@ def build_scenarios(
 
 
 class _MechanismNumbers:
-    """Numbers of a mechanism by dotted path, drawn or nominal, one per lane."""
+    """Access to the numbers of a mechanism by dotted path: drawn values, else the nominal value."""
 
     def __init__(self, mechanism: Mechanism, draws: dict[str, Any]) -> None:
-        # Namespace of the arrays: JAX or NumPy.
+        # Module that creates the arrays: jax.numpy or numpy.
         self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
         self.number = len(next(iter(draws.values()))) if draws else 1
         self.slots = count_contact_slots(mechanism.approach.contacts)
         self._mechanism, self._draws = mechanism, draws
 
     def drawn(self, path: str, default: Any = None) -> Any:
-        """Return the drawn value, else the nominal one or, without one in the file, the `default`."""
+        """Return the drawn values; else the nominal value; else, if the file has no value, `default`."""
         value = self._draws.get(path)
         if value is None:
             value = value_at(self._mechanism, path)
         return self.np.asarray(default if value is None else value, float)
 
     def scalar(self, path: str, default: float | None = None) -> Any:
-        """Return a number, (number,)."""
+        """Return a parameter that is a single number, as an array (lanes,)."""
         return self.np.broadcast_to(self.drawn(path, default), (self.number,))
 
     def constant(self, value: float) -> Any:
-        """Return the same number in every lane, (number,)."""
+        """Return an array (lanes,) with the same value in every lane."""
         return self.np.broadcast_to(self.np.asarray(value, float), (self.number,))
 
     def entries(self, path: str) -> Any:
-        """Return a list, (entries, ..., number)."""
+        """Return a parameter that is a list, as an array (entries, ..., lanes)."""
         nominal = np.asarray(value_at(self._mechanism, path), float)
         repeated = np.broadcast_to(nominal, (self.number, *nominal.shape))
         value = self.np.asarray(self._draws.get(path, repeated))
         return self.np.moveaxis(value.reshape(self.number, *nominal.shape), 0, -1)
 
     def of_law(self, key: ContactKey) -> Any:
-        """Return a key that only some contact laws have, (..., number)."""
+        """Return a parameter that only some contact laws have, as an array (..., lanes)."""
         path = f"contact.{key.name}"
         if isinstance(key.default, bool):
             return np.full(self.number, value_at(self._mechanism, path))
         return self.entries(path) if isinstance(key.default, list) else self.scalar(path, key.neutral)
 
     def successive(self, path: str) -> Any:
-        """Return a list with one entry per slot; the last entry is repeated."""
+        """Return a list parameter with one entry per contact; the last entry is repeated if necessary."""
         entries = self.entries(path)
         return entries[np.minimum(np.arange(self.slots), len(entries) - 1)]
 
     def repeated(self, entry: Any) -> Any:
-        """Return the same entry in every slot."""
+        """Return an array with the same entry for every contact."""
         return self.np.broadcast_to(entry, (self.slots, *entry.shape))
 
 
 def _build_phases(mechanism, table) -> Any:
-    """Return phases (slots, number); draws may contain one phase or one per contact."""
+    """Return the phases (contacts, lanes); a draw contains one common phase or one phase per contact."""
     phase = table.drawn("approach.phase")
-    phase = table.np.atleast_2d(phase.T).T  # (number or 1, contacts or 1)
+    phase = table.np.atleast_2d(phase.T).T  # shape (lanes or 1, contacts or 1)
     phase = table.np.broadcast_to(phase, (table.number, phase.shape[1]))
     return phase[:, np.minimum(np.arange(table.slots), phase.shape[1] - 1)].T
 
 
 def _build_mass(mechanism, table) -> Any:
-    """Return the equivalent mass [kg]."""
+    """Return the equivalent mass [kg], given in the file or computed from the masses of both bodies."""
     if mechanism.bodies.equivalent_mass is not None:
         return table.scalar("bodies.equivalent_mass")
     chaser, target = table.scalar("bodies.chaser_mass"), table.scalar("bodies.target_mass")
@@ -183,7 +196,7 @@ def _build_mass(mechanism, table) -> Any:
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
-    """Return the motion simulator as a transfer function; `ideal` has order 0."""
+    """Return the motion simulator as a transfer function, of order 0 if the model is `ideal`."""
     path = "rig.simulator."
     ones = table.constant(1.0)
     numerator: Any

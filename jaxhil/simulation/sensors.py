@@ -1,11 +1,11 @@
-"""Force and position sensors: readings of the physical signals.
+"""Force sensor and position sensor: first-order lag, noise, quantisation, dead zone and range.
 
-Delays are in `jaxhil.simulation.motion_simulator`. Here are the force sensor's first-order lag, in continuous
-time, and the effects on a sample: bias and noise, quantum, dead zone, range.
+The first-order lag of the force sensor is computed in continuous time. The other effects apply to samples.
+The delays of the sensors are part of `jaxhil.simulation.motion_simulator`.
 
-Noise depends only on a lane's key, the number of the contact, and the tick within its run. Thus a contact has
-the same noise for all gains and whatever the durations of previous contacts (common random numbers), so that
-gains can be compared.
+The noise at a tick depends only on the key of the scenario, the index of the contact, and the number of ticks
+since the run began. A contact therefore has the same noise for all gains, and for all durations of earlier
+contacts. Results for different gains can be compared because of these common random numbers.
 """
 
 from typing import Any, NamedTuple
@@ -16,15 +16,15 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.simulation.scenario import Scenario
 
-THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits, of Threefry's rounds
-THREEFRY_PARITY = 0x1BD11BDA  # constant of Threefry's key schedule
+THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits; rotation constants of Threefry-2x32
+THREEFRY_PARITY = 0x1BD11BDA  # parity constant in the key schedule of Threefry-2x32
 
 
 class SensorNoise(NamedTuple):
-    """Noise of readings, (ticks, *batch) or at one tick."""
+    """Noise of both sensors at several ticks, (ticks, *batch), or at one tick, (*batch)."""
 
-    force: Array | None  # [N]; None for a sensor without noise
-    position: Array | None  # [m]; None for a sensor without noise
+    force: Array | None  # noise of the force sensor [N]; None for a sensor without noise
+    position: Array | None  # noise of the position sensor [m]; None for a sensor without noise
 
 
 def draw_noise(
@@ -34,7 +34,15 @@ def draw_noise(
     contact: Int[Array, "*batch"],
     age: Int[Array, "ticks *batch"],
 ) -> SensorNoise:
-    """Return the noise of both sensors at the ticks `age` of the run of contact number `contact`."""
+    """Return the noise of both sensors.
+
+    Args:
+        has_force: Whether the force sensor has noise.
+        has_position: Whether the position sensor has noise.
+        scenario: Scenarios with the noise keys and the standard deviations.
+        contact: Index of the current contact.
+        age: Number of ticks since the run began.
+    """
 
     def white(sensor, deviation):
         return deviation[None] * white_noise(scenario.key, contact, 2 * age + sensor, deviation.dtype)
@@ -53,10 +61,18 @@ def apply_lag(
     forces: list[Array],
     time_constant: Array,
 ) -> Float[Array, "*batch"]:
-    """Return the output of a first-order lag T_s y' = F - y, exact for a force composed of parabolas.
+    """Return the output y [N] of a first-order lag T_s y' = F - y after a period with one contact.
 
-    The force is 0 for `idle` [s]. While `touching` [s], it passes through an odd number of equidistant values
-    `forces` [N], along parabolas through three of them each. It is 0 again for `free` [s].
+    During contact, the force F is interpolated by parabolas through three consecutive values each. The result
+    is exact for this interpolation.
+
+    Args:
+        reading: Output of the lag at the start [N].
+        idle: Time before the contact, with F = 0 [s].
+        touching: Duration of the contact [s].
+        free: Time after the contact, with F = 0 [s].
+        forces: Odd number of forces at evenly spaced times, from the begin to the end of the contact [N].
+        time_constant: Time constant T_s [s].
     """
     arc = touching / (len(forces) // 2)
     decay, straight, bow = _lag_response(arc / _bound_above_zero(time_constant))
@@ -68,14 +84,14 @@ def apply_lag(
 
 
 def lag_decay(duration: Array, time_constant: Array) -> Array:
-    """Return the remaining fraction of the lag's output after `duration` [s] without force."""
+    """Return the factor [1] by which the output of a lag decays in `duration` [s] without force."""
     return jnp.exp(-duration / _bound_above_zero(time_constant))
 
 
 def sample_force(
     force: Float[Array, "*batch"], quantum: Array, dead_zone: Array, range_: Array
 ) -> Float[Array, "*batch"]:
-    """Return a sample [N] of a noisy force, with quantum, dead zone and range, in that order."""
+    """Apply quantisation, dead zone and range of the force sensor, in this order, to a force [N]."""
     force = quantise(force, quantum)
     beyond = jnp.abs(force) - dead_zone
     force = jnp.where(dead_zone > 0, jnp.sign(force) * jnp.where(beyond > 0, beyond, 0), force)
@@ -83,7 +99,7 @@ def sample_force(
 
 
 def quantise(value: Array, quantum: Array) -> Array:
-    """Return quantum * round(value / quantum), or the value itself if the quantum is 0."""
+    """Round a value to a multiple of the quantum; return the value unchanged if the quantum is 0."""
     safe = jnp.where(quantum > 0, quantum, 1)
     return jnp.where(quantum > 0, safe * jnp.round(value / safe), value)
 
@@ -94,19 +110,20 @@ def white_noise(
     count: Int[Array, "ticks *batch"],
     dtype: Any,
 ) -> Float[Array, "ticks *batch"]:
-    """Return independent samples of the standard normal distribution for all (key, contact, count)."""
+    """Return standard normal samples, independent for different (key, contact, count)."""
     bits, _ = threefry(key[0][None], key[1][None], contact[None].astype("uint32"), count.astype("uint32"))
-    # Odd multiples of a power of two lie strictly between -1 and 1, where erf_inv is infinite.
+    # erf_inv is infinite at -1 and 1. Odd multiples of a power of two lie strictly between these values.
     digits = min(32, jnp.finfo(dtype).nmant)
     share = (2 * (bits >> (32 - digits)).astype(dtype) + 1) * 2**-digits - 1
     return 2**0.5 * lax.erf_inv(share)
 
 
 def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tuple[Array, Array]:
-    """Return 64 random bits, as two words, for each key of two words and counter of two words [uint32].
+    """Return 64 random bits, as two words, for a key of two words and a counter of two words [uint32].
 
-    This is Threefry-2x32 with 20 rounds: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1,
-    2, 3" (2011). On a CPU, the version of `jax.random` would be a separate loop inside the loop over ticks.
+    The algorithm is Threefry-2x32 with 20 rounds: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as
+    easy as 1, 2, 3" (2011). `jax.random` contains the same algorithm, but on a CPU, XLA compiles that version
+    as an additional loop within the loop over ticks.
     """
     keys = key_0, key_1, key_0 ^ key_1 ^ THREEFRY_PARITY
     left, right = count_0 + keys[0], count_1 + keys[1]
@@ -120,20 +137,21 @@ def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tupl
 
 
 def _bound_above_zero(time_constant):
-    """Return the time constant [s], at least a tiny positive number."""
+    """Return the time constant [s], raised to a tiny positive number if it is 0."""
     tiny = jnp.finfo(time_constant.dtype).tiny ** 0.5
     return jnp.where(time_constant > tiny, time_constant, tiny)
 
 
 def _lag_response(span):
-    """Return the lag's response factors after `span` time constants.
+    """Return three response factors of a first-order lag after `span` time constants.
 
-    They are for the initial output, for an input s/span, and for an input 4 s/span (1 - s/span).
+    Let s be the time in time constants. The first factor multiplies the initial output. The second is 1 minus
+    the output for the input s/span. The third is the output for the input 4 s/span (1 - s/span).
     """
     decay = jnp.exp(-span)
     positive = jnp.where(span > 0, span, 1)
     mean = jnp.where(span > 0, -jnp.expm1(-positive) / positive, 1)
-    # The closed form suffers from cancellation for short spans.
+    # For short spans, the closed form suffers from cancellation; a power series is used instead.
     short = jnp.where(span < 1e-2, span, 0)
     series = 4 * short * (1 / 6 - short * (1 / 12 - short * (1 / 40 - short / 180)))
     return decay, mean, jnp.where(span < 1e-2, series, 4 * (mean - 2 * (mean - decay) / positive))

@@ -1,4 +1,4 @@
-"""Fingerprint of source files and dependency versions, which determine results besides the input."""
+"""Fingerprint of source code and dependency versions, on which results depend in addition to the input."""
 
 import hashlib
 import inspect
@@ -14,24 +14,27 @@ DEPENDENCIES = ("jax", "jaxlib", "optimistix", "equinox", "lineax", "numpy", "sc
 
 
 def sources_sha256(*laws: object) -> str:
-    """Return the SHA-256 of names and contents of the imported packages' Python files, at the first call.
+    """Return a SHA-256 hash of the Python files of this project's imported packages.
 
-    With `laws` (compensators and contact laws), the digest includes user-registered ones: their fields, and
-    the source of their module or class if available.
+    The files are read only once per process.
+
+    Args:
+        *laws: Compensators and contact laws. The hash includes those that are user-registered: their fields,
+            and the source of their module, or of their class, if available.
     """
     digest = _hash_folders(
         tuple(Path(str(sys.modules[name].__file__)).parent for name in OWN_PACKAGES if name in sys.modules)
     )
-    foreign = [law for law in laws if type(law).__module__.partition(".")[0] not in OWN_PACKAGES]
-    if not foreign:
+    user_laws = [law for law in laws if type(law).__module__.partition(".")[0] not in OWN_PACKAGES]
+    if not user_laws:
         return digest
-    descriptions = [(type(law).__qualname__, repr(law), _read_class_source(type(law))) for law in foreign]
+    descriptions = [(type(law).__qualname__, repr(law), _read_class_source(type(law))) for law in user_laws]
     return hashlib.sha256(repr((digest, descriptions)).encode()).hexdigest()
 
 
 @cache
 def dependency_versions(packages: tuple[str, ...] = ("jaxhil", *DEPENDENCIES)) -> dict[str, str]:
-    """Return the versions of Python and of packages, by default of all that affect results."""
+    """Return the versions of Python and of packages; by default, of all packages that affect results."""
     result = {"python": platform.python_version()}
     for name in packages:
         try:
@@ -42,7 +45,7 @@ def dependency_versions(packages: tuple[str, ...] = ("jaxhil", *DEPENDENCIES)) -
 
 
 def _read_class_source(kind: type) -> str:
-    """Return the source of a class's module, else of the class, else an empty text."""
+    """Return the source of a class's module or, if unavailable, of the class; else an empty text."""
     for source in (sys.modules.get(kind.__module__), kind):
         with suppress(OSError, TypeError):
             return inspect.getsource(source)  # pyright: ignore[reportArgumentType]
@@ -51,11 +54,11 @@ def _read_class_source(kind: type) -> str:
 
 @cache
 def _hash_folders(roots: tuple[Path, ...]) -> str:
-    """Return the SHA-256 of the Python files in these folders."""
-    whole = hashlib.sha256()
+    """Return a SHA-256 hash of names and contents of all Python files in these folders."""
+    digest = hashlib.sha256()
     for root in roots:
         for source in sorted(root.rglob("*.py")):
             name = f"{root.name}/{source.relative_to(root).as_posix()}"
             content = hashlib.sha256(source.read_bytes()).hexdigest()
-            whole.update(f"{content} {name}\n".encode())
-    return whole.hexdigest()
+            digest.update(f"{content} {name}\n".encode())
+    return digest.hexdigest()

@@ -1,13 +1,13 @@
-"""One tick of the hardware-in-the-loop contact rig, in the six stages of notebooks/guide/model.md, section 1.
+"""Simulation of one tick of the rig, in six stages (notebooks/guide/model.md, section 1).
 
-    sense           read the force sensor and the position sensor
-    compensate      F_c from (F, x_d, v_d, x_a)
-    integrate       M x_d'' = -F_c over one control period
-    actuate         command -> limits, latency, hold -> motion simulator
-    contact_force   force of the real contact at the force sensor's sampling instant
-    record_contact  beginning, end, restitution, peaks and energies of the current contact
+    sense            read the force sensor and the position sensor
+    compensate       compute the force command F_c from the measured force F, x_d, v_d and x_a
+    integrate        integrate M x_d'' = -F_c over one control period
+    actuate          apply limits, latency, hold and motion simulator to the position command
+    compute_contact  compute the real contact in the sampling interval
+    record_contact   record begin, end, restitution, peaks and work of the current contact
 
-`RunState` is the state from tick to tick, `Tick` the record of one tick.
+`RunState` contains what changes from tick to tick. `Tick` is the record of one tick.
 """
 
 from typing import Any, NamedTuple
@@ -44,63 +44,63 @@ from jaxhil.simulation.watch import ContactEndConditions, Watch, record_contact
 
 
 class RunState(NamedTuple):
-    """State from tick to tick."""
+    """State of the simulation, which changes from tick to tick."""
 
     state: LoopState  # state of the loop
     watch: Watch  # record of the current contact
     metrics: Metrics  # metrics of finished contacts
     index: Int[Array, "*batch"]  # index of the current contact, from 0
-    active: Bool[Array, "*batch"]  # whether the lane is still running
+    active: Bool[Array, "*batch"]  # whether the last contact of the lane has not yet ended
     tick: Int[Array, ""]  # number of the next tick, common to all lanes
-    skipped: Int[Array, "*batch"]  # skipped ticks of approaches
+    skipped: Int[Array, "*batch"]  # number of ticks of approaches that were skipped
 
 
 class Tick(NamedTuple):
-    """Record of a tick."""
+    """Record of one tick: sensor readings, commands and real forces."""
 
-    signals: Signals  # readings of the controller
-    command: Float[Array, "*batch"]  # F_c [N], output of the compensator
-    plant_signals: PlantSignals  # contact without the effects of the sensors
-    active: Bool[Array, "*batch"]  # whether the lane was still running
-    contact: Int[Array, "*batch"]  # index of the contact, from 0
-    # stiffness [N/m] and damping [N s/m], if the compensator identifies them
+    signals: Signals  # inputs of the compensator
+    command: Float[Array, "*batch"]  # force command F_c [N], output of the compensator
+    plant_signals: PlantSignals  # real forces, without the effects of the sensors
+    active: Bool[Array, "*batch"]  # whether the current contact of the lane has not yet ended
+    contact: Int[Array, "*batch"]  # index of the current or next contact, from 0
+    # estimates of stiffness [N/m] and damping [N s/m]; None if the compensator identifies neither
     identified: tuple[Array, Array] | None
-    sent: Float[Array, "*batch"]  # position command at the tick's end [m], before any limits of the drives
+    sent: Float[Array, "*batch"]  # unlimited position command at the end of the tick [m]
 
 
 class SegmentConstants(NamedTuple):
-    """Values computed once for many ticks of a contact."""
+    """Values that are computed once for all ticks of a segment."""
 
     gains: Gains  # gains of the compensator
-    controller: Any  # values that the compensator computed from them
+    controller: Any  # values that the compensator has computed from its gains
     rules: ContactEndConditions  # conditions for the end of a contact
-    probe: Probe | None  # probe of the current contact; None without one
+    probe: Probe | None  # probe of the current contact; None without a probe
 
 
 class ModelState(NamedTuple):
-    """Numerical model after a control period."""
+    """State of the numerical model at the end of a control period."""
 
-    position: Float[Array, "*batch"]  # x_d [m]
-    velocity: Float[Array, "*batch"]  # v_d [m/s]
-    acceleration: Float[Array, "*batch"]  # a_d during the period [m/s^2]
+    position: Float[Array, "*batch"]  # position x_d [m]
+    velocity: Float[Array, "*batch"]  # velocity v_d [m/s]
+    acceleration: Float[Array, "*batch"]  # constant acceleration a_d during the period [m/s^2]
 
 
 class ActuationResult(NamedTuple):
-    """Effect of a position command on the rig."""
+    """Motion of the rig that results from a position command."""
 
-    plant: PlantState  # drives and motion simulator after the control period
+    plant: PlantState  # state of drives and motion simulator at the end of the control period
     controller: Any  # state of the compensator
-    # position of the mechanism at its sampling instant [m]; None if unused
+    # position of the mechanism when the position sensor samples it [m]; None if unused
     position: Float[Array, "*batch"] | None
-    interval: SamplingInterval  # motion whose contact is computed now
-    # ring of the motions whose contact is not yet computed; None with one surface
-    under_way: SamplingInterval | None
+    interval: SamplingInterval  # sampling interval in which the contact is computed at this tick
+    # delay line of intervals in which the contact is not yet computed; None with one surface
+    pending: SamplingInterval | None
 
 
 def tick(
     loop: Loop, rig: RigConstants, prepared: SegmentConstants, run: RunState, noise: SensorNoise
 ) -> tuple[RunState, Tick]:
-    """Run one control period; return the next state and the tick's record."""
+    """Simulate one control period; return the next state and the record of the tick."""
     state, now = run.state, run.tick
     signals, plant_signals = sense(loop, rig, state, now, noise)
     force, controller = compensate(loop, prepared, state, signals, now)
@@ -115,7 +115,7 @@ def tick(
             rig, prepared.probe, state, run.watch.over, signals, actuated.interval.sample, contact, watch
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
-    seen = Tick(
+    record = Tick(
         signals,
         force,
         plant_signals,
@@ -124,13 +124,13 @@ def tick(
         identified=loop.compensator.identified(controller),
         sent=state.plant.sent,
     )
-    return run._replace(state=state, watch=watch, tick=now + 1), seen
+    return run._replace(state=state, watch=watch, tick=now + 1), record
 
 
 def sense(
     loop: Loop, rig: RigConstants, state: LoopState, now: Array, noise: SensorNoise
 ) -> tuple[Signals, PlantSignals]:
-    """Return the sensor readings at tick `now`, noise included, and the plant's own signals (stage 1)."""
+    """Stage 1: return the sensor readings at tick `now`, and the real forces in the last interval."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.onset_tick
     rings, delays = sensed.rings, rig.delays
@@ -158,7 +158,7 @@ def sense(
 def compensate(
     loop: Loop, prepared: SegmentConstants, state: LoopState, signals: Signals, now: Array
 ) -> tuple[Array, Any]:
-    """Return the force command F_c [N] and the compensator's next state (stage 2)."""
+    """Stage 2: return the force command F_c [N] and the compensator's next state."""
     force, controller = loop.compensator.step(prepared.controller, state.controller, signals, now)
     if loop.reads_always:
         force = jnp.where(signals.age == 0, 0, force)
@@ -166,7 +166,7 @@ def compensate(
 
 
 def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> ModelState:
-    """Integrate M x_d'' = -F_c over one control period, with F_c = `force` [N] (stage 3)."""
+    """Stage 3: integrate M x_d'' = -F_c over one control period, where F_c is `force` [N]."""
     acceleration = -force * rig.inverse_mass
     step = INTEGRATORS[loop.integrator]
     position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)
@@ -182,45 +182,45 @@ def actuate(
     model: ModelState,
     controller: Any,
 ) -> ActuationResult:
-    """Send the position command through limits, latency, hold and motion simulator (stage 4)."""
+    """Stage 4: apply limits, latency, hold and motion simulator to the position command."""
     command, controller = loop.compensator.position_command(gains, controller, *model)
     command, step, wanted = _apply_limits(rig, state.plant, command)
     commands = (command, *state.plant.commands)
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
     rows, simulator = rig.propagation, state.plant.state
-    course = IntervalInputs(simulator, start, end, rig.scenario.contact_plane) if loop.has_cells else None
+    inputs = IntervalInputs(simulator, start, end, rig.scenario.contact_plane) if loop.has_cells else None
     interval = _interval_motion(rows, simulator, start, end, rig.scenario.contact_plane)._replace(
-        interval_inputs=course
+        interval_inputs=inputs
     )
-    under_way = state.sensed.rings.interval
-    if under_way is not None:
-        under_way = write_samples(under_way, now, interval)
-        interval = _current_interval(rig, under_way, now, now - state.onset_tick)
+    pending = state.sensed.rings.interval
+    if pending is not None:
+        pending = write_samples(pending, now, interval)
+        interval = _current_interval(rig, pending, now, now - state.onset_tick)
     simulator = advance_state(rows.transition, simulator, start, end)
     return ActuationResult(
         plant=PlantState(commands[: loop.latency + 1], step, simulator, wanted),
         controller=controller,
         position=read_measured_position(rows, state.plant.state, start, end),
         interval=interval,
-        under_way=under_way,
+        pending=pending,
     )
 
 
 def compute_contact(
     loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval
 ) -> IntervalContact:
-    """Return the real contact during the sampling interval that takes place now (stage 5)."""
+    """Stage 5: return the real contact in a sampling interval."""
     if rig.cells is not None:
         return _compute_contact_in_cells(loop, rig, state, interval)
     scenario, period = rig.scenario, rig.constants.control_period
     clearance = scenario.clearance if loop.is_two_sided else None
     surfaces = Surfaces(loop.law, state.parameters, state.law, clearance)
-    until = rig.delays.force.fraction * period
+    sample_time = rig.delays.force.fraction * period
     if loop.law.remembers:
-        loaded = surfaces.after(interval.start, interval.sample, until)
-        force, _ = loaded.force(interval.sample)
-        law = loaded.after(interval.sample, interval.end, period - until).state
+        at_sample = surfaces.advance(interval.start, interval.sample, sample_time)
+        force, _ = at_sample.force(interval.sample)
+        law = at_sample.advance(interval.sample, interval.end, period - sample_time).state
     else:
         force, law = surfaces.force(interval.sample)
     last, lagged, reading = state.sensed.last, state.sensed.lagged, None
@@ -228,21 +228,21 @@ def compute_contact(
         last = surfaces.sample(interval.sample, force)
     if loop.has_lag:
         time_constant = scenario.force_sensor.time_constant
-        reading, lagged = apply_sensor_lag(surfaces, lagged, interval, until, period, time_constant)
-    works = peak = None
+        reading, lagged = apply_sensor_lag(surfaces, lagged, interval, sample_time, period, time_constant)
+    work = peak = None
     if loop.energies and loop.discontinuity_order == 0:
-        works = compute_work_between(state.sensed.last, last)
+        work = compute_work_between(state.sensed.last, last)
     elif loop.energies:
-        works = compute_work_along(surfaces, interval.start, interval.end, period)
+        work = compute_work_along(surfaces, interval.start, interval.end, period)
     if loop.has_corners:
         peak = largest_force(surfaces, interval.start, interval.end, period)
-    return IntervalContact(PlantSignals(force, works, peak, None), reading, lagged, last, None, law)
+    return IntervalContact(PlantSignals(force, work, peak, None), reading, lagged, last, None, law)
 
 
 def _compute_contact_in_cells(
     loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval
 ) -> IntervalContact:
-    """Return the real contact along the exact motion between samples (stage 5)."""
+    """Return the real contact in a sampling interval, from the exact motion between the samples."""
     scenario, period, cells = rig.scenario, rig.constants.control_period, rig.cells
     assert cells is not None and interval.interval_inputs is not None
     clearance = scenario.clearance if loop.is_two_sided else None
@@ -258,20 +258,20 @@ def _compute_contact_in_cells(
     )
     surfaces = Surfaces(loop.law, state.parameters, result.at_sample, clearance)
     force, _ = surfaces.force(interval.sample)
-    last, works = state.sensed.last, result.works if loop.energies else None
+    last, work = state.sensed.last, result.work if loop.energies else None
     if loop.is_two_sided or loop.energies:
         last = surfaces.sample(interval.sample, force)
     if loop.energies and loop.discontinuity_order == 0:
         before = state.sensed.last.position(clearance)
-        works = compute_jump_work(touch, state.law, before, interval.sample.position)
+        work = compute_jump_work(touch, state.law, before, interval.sample.position)
     reading = None
     if loop.has_lag:
-        # Cells cannot resolve the zero lag of a lane in a batch whose other lanes have one.
+        # Cells cannot resolve a lag of 0, which one lane may have while other lanes of the batch have a lag.
         lag = scenario.force_sensor.time_constant
         reading = jnp.where(lag > MIN_LAG * period, result.reading, force)
-    before, after = result.touched
-    assert state.sensed.touched is not None
-    signals = PlantSignals(force, works, result.peak, state.sensed.touched + before)
+    before, after = result.contact_time
+    assert state.sensed.contact_time is not None
+    signals = PlantSignals(force, work, result.peak, state.sensed.contact_time + before)
     return IntervalContact(signals, reading, result.lagged, last, after, result.at_end)
 
 
@@ -283,9 +283,10 @@ def update_state(
     actuated: ActuationResult,
     contact: IntervalContact,
 ) -> LoopState:
-    """Return the state after the tick.
+    """Return the state of the loop after the tick.
 
-    The contact is written to the delay lines, after `before` was read from them.
+    The new contact is written to the delay lines. `before` was read from the delay lines at this tick; the
+    dependence on `before` makes XLA read before it writes.
     """
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
     samples = Rings(plant_signals, contact.reading, actuated.position, None)
@@ -295,9 +296,9 @@ def update_state(
         velocity=model.velocity,
         plant=actuated.plant,
         sensed=state.sensed._replace(
-            rings=rings._replace(interval=actuated.under_way),
+            rings=rings._replace(interval=actuated.pending),
             last=contact.last,
-            touched=contact.touched,
+            contact_time=contact.contact_time,
             lagged=contact.lagged,
         ),
         law=contact.law,
@@ -306,12 +307,12 @@ def update_state(
 
 
 def _delayed_sample(ring, now, age, intervals):
-    """Return a sample `intervals` before the newest one; before the run there was no force."""
+    """Return the sample that is `intervals` older than the newest sample; 0 before the start of the run."""
     return look_back(ring, now - 1, intervals, age > intervals)
 
 
 def _delayed_position(rig, state, now, age):
-    """Return the delayed position [m], from uniform motion before the run; NaN if unused."""
+    """Return the delayed position [m], in uniform motion before the start of the run; NaN if unused."""
     ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
     if ring is None:
         return jnp.full_like(state.position, jnp.nan)
@@ -321,7 +322,7 @@ def _delayed_position(rig, state, now, age):
 
 
 def _apply_limits(rig, plant, command):
-    """Return the limited command, its step [m], and the command before limits (None without limits)."""
+    """Return limited command [m], its step [m], and unlimited command [m], which is None without limits."""
     if plant.wanted is None:
         return command, plant.step, None
     simulator = rig.scenario.simulator
@@ -333,7 +334,7 @@ def _apply_limits(rig, plant, command):
 
 
 def _interval_motion(rows, state, start, end, plane):
-    """Return the mechanism's motion over the current interval, relative to the surface at `plane` [m]."""
+    """Return the mechanism's motion in the current interval, relative to the surface at `plane` [m]."""
 
     def motion(position, velocity):
         return MotionSample(
@@ -346,10 +347,10 @@ def _interval_motion(rows, state, start, end, plane):
     return SamplingInterval(sample, motion(*rows.start), motion(*rows.end), None)
 
 
-def _current_interval(rig, under_way, now, age):
-    """Return the interval that takes place now.
+def _current_interval(rig, pending, now, age):
+    """Return the interval that takes place now, from the delay line of motions.
 
-    Before the run it is at rest at the surface, without force.
+    Before the start of the run, the mechanism is at rest at the surface without a force.
     """
     intervals = rig.delays.contact
-    return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), under_way)
+    return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), pending)

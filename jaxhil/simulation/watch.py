@@ -1,7 +1,7 @@
-"""Record of the current contact from tick to tick: begin, end, speeds, forces and energies.
+"""Record of the current contact, updated at every tick: begin, end, speeds, forces and work.
 
-It follows the real contact (`PlantSignals`) and the force command; notebooks/guide/model.md, section 2, says
-when a contact begins and when it is over.
+The record follows from the real contact (`PlantSignals`) and from the force command. Section 2 of
+notebooks/guide/model.md defines when a contact begins and when it ends.
 """
 
 from typing import NamedTuple
@@ -16,13 +16,13 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, initial_deviation
 from jaxhil.simulation.scenario import Scenario
 
-MAX_DECAY_WAIT = 0.1  # s; longest wait for the command to decay, which a noisy command never does
-COMMAND_DECAY_RATIO = 1e-6  # of the command's peak; below it the command has decayed
-DIVERGENCE_SPEED_RATIO = 1e3  # times the first approach speed; above it the run has diverged
+MAX_DECAY_WAIT = 0.1  # s; longest wait for the force command to decay, because a noisy command never decays
+COMMAND_DECAY_RATIO = 1e-6  # [1]; fraction of its peak below which the force command has decayed
+DIVERGENCE_SPEED_RATIO = 1e3  # [1]; multiple of the first approach speed above which the run has diverged
 
 
 class CommandVariation(NamedTuple):
-    """F_c in the current contact; all values begin with the 0 before the contact."""
+    """Variation of the force command F_c in the current contact, including the step from 0 at its begin."""
 
     last: Float[Array, "*batch"]  # last value [N]
     highest: Float[Array, "*batch"]  # highest value so far [N]
@@ -31,56 +31,59 @@ class CommandVariation(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """Record of the current contact."""
+    """Record of the current contact, from the end of the previous contact to the current tick."""
 
-    elapsed: Float[Array, "*batch"]  # ticks since the contact began; 0 before
-    over: Bool[Array, "*batch"]  # whether the contact is over, or the run has diverged
+    elapsed: Float[Array, "*batch"]  # number of ticks since the contact began; 0 before
+    over: Bool[Array, "*batch"]  # whether the contact has ended or the run has diverged
     approach: Float[Array, "*batch"]  # speed of the numerical model before the contact [m/s]
-    rebound: Float[Array, "*batch"]  # speed of the numerical model now [m/s]
-    peak_force: Float[Array, "*batch"]  # largest real force [N]
-    peak_command: Float[Array, "*batch"]  # largest |F_c| [N]
-    recent: tuple[Array, Array]  # real force at the last two ticks [N]
-    in_contact: Float[Array, "*batch"]  # ticks with a real force
+    rebound: Float[Array, "*batch"]  # speed of the numerical model at the current tick [m/s]
+    peak_force: Float[Array, "*batch"]  # largest real force so far [N]
+    peak_command: Float[Array, "*batch"]  # largest |F_c| so far [N]
+    recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
+    in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
     measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
-    quiet: Float[Array, "*batch"]  # ticks since the last real force, or since a contact began without one
-    works: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
-    swings: CommandVariation | None  # swings of the command; None unless recorded
-    shortfall: (
-        Float[Array, "*batch"] | None
-    )  # largest change of the position command by limits [m]; None without limits
-    side: Float[Array, "*batch"] | None  # side of the surface, 1 or -1; None with one surface
-    command: Float[Array, "*batch"] | None  # |F_c| of the last tick [N]; None with one surface
-    # |F_c| that remained at the end of the last contact [N]; None with one surface
-    left: Float[Array, "*batch"] | None
+    # number of ticks since the last real force, or since the begin of a contact without a real force yet
+    force_free_ticks: Float[Array, "*batch"]
+    work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
+    command_variation: CommandVariation | None  # variation of F_c; None unless recorded
+    # largest change of the position command by the limits so far [m]; None without limits
+    shortfall: Float[Array, "*batch"] | None
+    side: Float[Array, "*batch"] | None  # side of the touched surface, 1 or -1; None with one surface
+    command: Float[Array, "*batch"] | None  # |F_c| at the last tick [N]; None with one surface
+    # |F_c| at the end of the previous contact [N]; None with one surface
+    remaining_command: Float[Array, "*batch"] | None
     deviation: Deviation | None  # deviation of x_d from the ideal contact; None without a probe
 
 
 class ContactEndConditions(NamedTuple):
     """Conditions for the end of a contact."""
 
-    quiet: Float[Array, "*batch"]  # least ticks without a real force
-    # ticks without a real force after which the command need not have decayed
-    max_quiet: Float[Array, "*batch"]
-    fastest: Float[Array, "*batch"]  # speed beyond which the run has diverged [m/s]
+    force_free_ticks: Float[Array, "*batch"]  # least number of ticks without a real force
+    # number of ticks without a real force after which the contact ends even if F_c has not decayed
+    max_force_free_ticks: Float[Array, "*batch"]
+    divergence_speed: Float[Array, "*batch"]  # speed above which the run has diverged [m/s]
     clearance: Float[Array, "*batch"]  # distance between two surfaces [m]; infinite for one surface
 
 
 def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
-    """Return the conditions for the end of a contact.
+    """Compute the conditions for the end of a contact from the delays of the rig.
 
-    A contact ends tau_f + 20 sensor time constants + 2 T after the last real force, or up to 0.1 s later,
-    until the command has decayed.
+    After the last real force, the contact lasts for the delay of the force sensor, plus 20 time constants of
+    the sensor's lag, plus two control periods. If the force command has not decayed by then, the contact ends
+    when the force command has decayed, but at most 0.1 s later.
     """
     sensor, period = scenario.force_sensor, scenario.control_period
-    quiet = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
-    patience = quiet + jnp.ceil(MAX_DECAY_WAIT / period)
+    force_free_ticks = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
     return ContactEndConditions(
-        quiet, patience, DIVERGENCE_SPEED_RATIO * scenario.velocity, scenario.clearance
+        force_free_ticks=force_free_ticks,
+        max_force_free_ticks=force_free_ticks + jnp.ceil(MAX_DECAY_WAIT / period),
+        divergence_speed=DIVERGENCE_SPEED_RATIO * scenario.velocity,
+        clearance=scenario.clearance,
     )
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
-    """Return the record before a contact, long after any force."""
+    """Return the initial record, before a contact and long after any force."""
     zeros = jnp.zeros_like(like)
     return Watch(
         elapsed=zeros,
@@ -89,16 +92,16 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
         rebound=zeros,
         peak_force=zeros,
         peak_command=zeros,
-        recent=(zeros, zeros),
+        recent_forces=(zeros, zeros),
         in_contact=zeros,
         measured=jnp.zeros(like.shape, bool),
-        quiet=zeros + 1e6,
-        works=(zeros, zeros) if loop.energies else (),
-        swings=CommandVariation(zeros, zeros, zeros, zeros) if loop.chatter else None,
+        force_free_ticks=zeros + 1e6,
+        work=(zeros, zeros) if loop.energies else (),
+        command_variation=CommandVariation(zeros, zeros, zeros, zeros) if loop.chatter else None,
         shortfall=zeros if loop.has_limits else None,
         side=zeros + 1 if loop.is_two_sided else None,
         command=zeros if loop.is_two_sided else None,
-        left=zeros if loop.is_two_sided else None,
+        remaining_command=zeros if loop.is_two_sided else None,
         deviation=initial_deviation(like) if loop.probed else None,
     )
 
@@ -112,53 +115,69 @@ def record_contact(
     command: Array,
     shortfall: Array | None,
 ) -> Watch:
-    """Update the record of the contact; `command` is F_c [N], `shortfall` that of `Plant` (stage 6)."""
+    """Stage 6: return the record of the current contact, updated with the current tick.
+
+    Args:
+        loop: Loop.
+        rules: Conditions for the end of a contact.
+        watch: Record up to the previous tick.
+        signals: Inputs of the compensator.
+        plant_signals: Real forces in the last sampling interval.
+        command: Force command F_c [N].
+        shortfall: Change of the position command by the limits [m]; None without limits.
+    """
     speed, magnitude = jnp.abs(signals.velocity_desired), jnp.abs(command)
     force = jnp.abs(plant_signals.force)
     touching = force > 0
-    if plant_signals.touched is not None:
-        # A touch may begin and end between two samples.
-        touching = touching | ((watch.recent[1] == 0) & (plant_signals.touched > 0))
+    if plant_signals.contact_time is not None:
+        # A contact may begin and end between two samples, so that no sample has a force.
+        touching = touching | ((watch.recent_forces[1] == 0) & (plant_signals.contact_time > 0))
     begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
     side = _choose_side(rules, watch, signals)
     peak_command = jnp.maximum(watch.peak_command, magnitude)
-    # The hardware follows the numerical model with a delay.
-    quiet = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.quiet + 1)
-    touched = plant_signals.touched
+    # A contact may begin at the numerical model, before the delayed hardware touches. The count of ticks
+    # without a force then starts when the contact begins.
+    force_free_ticks = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.force_free_ticks + 1)
+    contact_time = plant_signals.contact_time
     in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
-    in_contact = in_contact if touched is None else watch.in_contact + touched
-    ends = begun & _has_ended(rules, signals, side, quiet, magnitude, peak_command)
+    in_contact = in_contact if contact_time is None else watch.in_contact + contact_time
+    ends = begun & _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command)
     lasts = begun & ~watch.over
+    variation = watch.command_variation
     return Watch(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
-        # A diverged run is over at once, even if its speed decreases again.
-        over=watch.over | ends | (speed > rules.fastest),
-        # The approach speed is that of the tick before the onset, the rebound speed that at the end.
+        # A run that has diverged ends at this tick, even if the speed would decrease again.
+        over=watch.over | ends | (speed > rules.divergence_speed),
+        # The approach speed is taken at the tick before the contact begins, the rebound speed at its end.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
         rebound=jnp.where(watch.over, watch.rebound, speed),
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
         peak_command=peak_command,
-        recent=(watch.recent[1], force),
+        recent_forces=(watch.recent_forces[1], force),
         in_contact=in_contact,
         measured=watch.measured | ((in_contact > 0) & (signals.force_measured != 0)),
-        quiet=quiet,
-        works=tuple(total + work for total, work in zip(watch.works, plant_signals.works or (), strict=True)),
-        swings=watch.swings and _update_variation(watch.swings, command, lasts, ends),
+        force_free_ticks=force_free_ticks,
+        work=tuple(total + work for total, work in zip(watch.work, plant_signals.work or (), strict=True)),
+        command_variation=variation and _update_variation(variation, command, lasts, ends),
         shortfall=_largest_shortfall(watch, shortfall, lasts),
         side=side,
         command=magnitude if loop.is_two_sided else None,
-        left=watch.left,
+        remaining_command=watch.remaining_command,
         deviation=watch.deviation,
     )
 
 
 def _has_begun(loop, rules, watch, signals, touching, magnitude):
-    """Return whether the contact has begun: by a force or, with a noisy or biased sensor, a penetration."""
+    """Return whether the contact has begun.
+
+    A contact begins with a real force or with a force command. If the sensor has noise or bias, there is
+    always a force command; then the penetration of the numerical model is used instead.
+    """
     if loop.reads_always:
         starts = touching | (deflection(signals.position_desired, rules.clearance) != 0)
-    elif watch.left is not None:
-        # A command that remains from the last contact does not begin the next one.
-        starts = touching | (magnitude > watch.left)
+    elif watch.remaining_command is not None:
+        # A force command that remains from the previous contact does not begin the next contact.
+        starts = touching | (magnitude > watch.remaining_command)
     else:
         starts = touching | (magnitude > 0)
     fresh = watch.elapsed == 0
@@ -167,7 +186,7 @@ def _has_begun(loop, rules, watch, signals, touching, magnitude):
 
 
 def _choose_side(rules, watch, signals):
-    """Return the nearer of two surfaces, constant after the contact begins; None with one surface."""
+    """Return the side of the nearer surface, constant during a contact; None with one surface."""
     if watch.side is None:
         return None
     position = signals.position_desired
@@ -175,59 +194,62 @@ def _choose_side(rules, watch, signals):
 
 
 def _nearer_side(rules, position):
-    """Return the side of the nearer of two surfaces, 1 or -1."""
+    """Return the side of the surface that is nearer to a position, 1 or -1."""
     return jnp.where(position > -rules.clearance / 2, 1, -1).astype(position.dtype)
 
 
-def _has_ended(rules, signals, side, quiet, magnitude, peak_command):
-    """Return whether a contact ends.
+def _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command):
+    """Return whether the contact ends at this tick.
 
-    It ends if the model moves away, there was no force for long enough, and the command has decayed. No
-    threshold depends on the noise: a command that is small by chance while its mean is not would end the
-    contact before its whole impulse has acted.
+    The contact ends if the numerical model moves away from the surface, no real force has acted for long
+    enough, and the force command has decayed. The threshold of the decay does not depend on the sensor noise.
+    If it did, a noisy command that is small by chance could end the contact before its whole impulse has
+    acted.
     """
     velocity = signals.velocity_desired
-    faded = (magnitude <= COMMAND_DECAY_RATIO * peak_command) | (quiet >= rules.max_quiet)
+    faded = (magnitude <= COMMAND_DECAY_RATIO * peak_command) | (
+        force_free_ticks >= rules.max_force_free_ticks
+    )
     if side is None:
-        return (velocity < 0) & (quiet >= rules.quiet) & faded
+        return (velocity < 0) & (force_free_ticks >= rules.force_free_ticks) & faded
     faded |= _nearer_side(rules, signals.position_desired) != side
-    return (side * velocity < 0) & (quiet >= rules.quiet) & faded
+    return (side * velocity < 0) & (force_free_ticks >= rules.force_free_ticks) & faded
 
 
 def _peak_force(loop, watch, plant_signals, force):
-    """Return the largest real force [N] since the last tick."""
+    """Return the largest real force [N] since the previous tick."""
     if plant_signals.peak is not None:
         return plant_signals.peak
-    # If the position itself jumps at the ticks, the force is constant between them.
-    return force if loop.discontinuity_order == 0 else _parabola_peak(watch.recent[0], watch.recent[1], force)
+    # If the position jumps at the ticks, the force is constant between two ticks.
+    return force if loop.discontinuity_order == 0 else _parabola_peak(watch.recent_forces, force)
 
 
 def _largest_shortfall(watch, shortfall, lasts):
-    """Return the largest change of the position command by limits [m]; None without limits."""
+    """Return the largest change of the position command by the limits so far [m]; None without limits."""
     if watch.shortfall is None or shortfall is None:
         return watch.shortfall
     return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)
 
 
 def _update_variation(
-    swings: CommandVariation, command: Array, lasts: Array, ends: Array
+    before: CommandVariation, command: Array, lasts: Array, ends: Array
 ) -> CommandVariation:
-    """Update the swings of the command.
+    """Return the variation of the force command, updated in lanes whose contact `lasts`.
 
-    Lanes whose contact `lasts` are updated. The command counts as 0 after the tick at which the contact
-    `ends`.
+    If a contact `ends` at this tick, the step of the command to 0 is included.
     """
-    step = jnp.abs(command - swings.last) + jnp.where(ends, jnp.abs(command), 0)
+    step = jnp.abs(command - before.last) + jnp.where(ends, jnp.abs(command), 0)
     return CommandVariation(
-        last=jnp.where(lasts, command, swings.last),
-        highest=jnp.where(lasts & (command > swings.highest), command, swings.highest),
-        lowest=jnp.where(lasts & (command < swings.lowest), command, swings.lowest),
-        variation=swings.variation + jnp.where(lasts, step, 0),
+        last=jnp.where(lasts, command, before.last),
+        highest=jnp.where(lasts & (command > before.highest), command, before.highest),
+        lowest=jnp.where(lasts & (command < before.lowest), command, before.lowest),
+        variation=before.variation + jnp.where(lasts, step, 0),
     )
 
 
-def _parabola_peak(before, middle, now):
-    """Return the largest force of the last period, at the peak of the parabola through three samples."""
+def _parabola_peak(recent_forces, now):
+    """Return the largest force [N] of the last period, from a parabola through the last three samples."""
+    before, middle = recent_forces
     bend = 2 * middle - before - now
     peaks = (middle >= before) & (middle >= now) & (bend > 0) & (before > 0) & (now > 0)
     vertex = middle + (now - before) ** 2 / (8 * jnp.where(peaks, bend, 1))

@@ -176,8 +176,8 @@ def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
         "measured_row": plant.measured_position,
         "steady_command": plant.steady_command,
         "steady_velocity": plant.steady_velocity,
-        "quiet": rules.quiet,
-        "patience": rules.max_quiet,
+        "quiet": rules.force_free_ticks,
+        "patience": rules.max_force_free_ticks,
         "gains": np.stack(table),
     }
     counts = {
