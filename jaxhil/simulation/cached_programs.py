@@ -1,4 +1,4 @@
-"""Disk cache of compiled programs, which saves later processes the tracing and the lowering.
+"""Disk cache of compiled programs, so that later processes need not trace and lower them again.
 
 Tracing and lowering take longer than running a short batch. For each compiled program, a file contains the
 data that JAX needs to load this program. The file's name is the hash of everything that determines the

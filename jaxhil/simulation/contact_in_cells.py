@@ -288,9 +288,9 @@ def _compute_side_contact(touch, states, pieces, side, period, rates, still=Fals
 
 
 def _lag_contributions(rates, path, impulses, arguments):
-    """Return what impulses [N periods] at relative times in the cells add to the force sensor's lag [N].
+    """Return the response of the force sensor's lag [N] to impulses [N periods].
 
-    The two results are for the sampling instant and for the interval's end.
+    The two results are the responses at the sampling instant and at the interval's end.
     """
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)

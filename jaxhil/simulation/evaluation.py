@@ -75,7 +75,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def runs(self, mechanism: Any) -> int:
-        """Return the number of runs in a scenario of this mechanism."""
+        """Return the number of contacts or episodes in a scenario of this mechanism."""
 
     @abc.abstractmethod
     def run(self, loop: Any, gains: Gains, scenario: Any) -> Outcome:
@@ -98,11 +98,11 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def without_noise(self, scenarios: Any) -> Any:
-        """Return the scenarios with noise-free sensors."""
+        """Return a copy of the scenarios in which the sensors have no noise."""
 
     @abc.abstractmethod
     def with_compensator(self, loop: Any, compensator: str) -> Any:
-        """Return the loop with another compensator."""
+        """Return a copy of the loop with another compensator."""
 
     @abc.abstractmethod
     def compensator_name(self, loop: Any) -> str:

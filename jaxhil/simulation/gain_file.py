@@ -29,12 +29,19 @@ BOUND_TOLERANCE = (
 
 
 class LoadedGains(NamedTuple):
-    """Content of a valid gain file."""
+    """Content of a valid gain file.
 
-    document: dict[str, Any]  # all keys of the file
-    compensator: str  # name of the compensator
-    gains: dict[str, float]  # gains by name [SI units]
-    mechanism: Any  # mechanism for which the gains were tuned: `Mechanism` or `SixAxisMechanism`
+    Attributes:
+        document: All keys of the file.
+        compensator: Name of the compensator.
+        gains: Gains by name [SI units].
+        mechanism: Mechanism for which the gains were tuned: `Mechanism` or `SixAxisMechanism`.
+    """
+
+    document: dict[str, Any]
+    compensator: str
+    gains: dict[str, float]
+    mechanism: Any
 
 
 def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:

@@ -68,8 +68,8 @@ def prepare_jax() -> None:
     """Set up JAX for the rest of the process.
 
     The settings are float64, one device per usable core but at least two, fast compilation, and a folder that
-    caches compiled programs between processes. Flags in the user's XLA_FLAGS have priority over ours. If JAX
-    has already been imported, XLA_FLAGS stays unchanged, because JAX would ignore it.
+    caches compiled programs between processes. Flags in the user's XLA_FLAGS have priority. If JAX has
+    already been imported, XLA_FLAGS stays unchanged, because JAX would ignore a change.
 
     Raise `InputError` if JAX cannot be imported with the user's environment variables.
     """
@@ -109,7 +109,9 @@ def jax_context() -> Iterator[None]:
 
 
 def start_jax() -> None:
-    """Start JAX with our environment variables, unless it runs already; then restore the caller's variables.
+    """Start JAX with the environment variables of `build_jax_variables`, unless it runs already.
+
+    The caller's environment variables are restored afterwards.
 
     Raise `InputError` if JAX cannot start.
     """
@@ -151,7 +153,7 @@ def use_float64() -> Iterator[None]:
 
 @contextmanager
 def _cache_programs() -> Iterator[None]:
-    """Cache compiled programs in our folder within this context, unless the caller has set a folder."""
+    """Cache compiled programs in `cache_folder()` within this context, unless the caller has set a folder."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -223,7 +225,7 @@ def rounding_flags(flags: str) -> str:
 
 
 def build_xla_flags(user_flags: str) -> str:
-    """Return the value of XLA_FLAGS: the user's flags, and our flags for names that the user did not set.
+    """Return the value of XLA_FLAGS: the user's flags, completed with flags for fast programs.
 
     Args:
         user_flags: The user's XLA_FLAGS: flags, or the name of a file that contains flags.

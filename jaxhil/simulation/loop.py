@@ -86,7 +86,7 @@ class Loop(eqx.Module):
 
     @property
     def follows_intervals(self) -> bool:
-        """Return whether the motion between the samples is needed."""
+        """Return whether results depend on the motion between the samples."""
         return self.has_lag or self.has_corners or self.energies or self.law.remembers
 
     @property

@@ -73,7 +73,7 @@ class OneAxis(RigModel):
         return force + position / (1 + np.max(position))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return the scenarios with noise-free sensors."""
+        """Return a copy of the scenarios in which the sensors have no noise."""
         force, position = (
             sensor._replace(noise_std=np.zeros_like(sensor.noise_std))
             for sensor in (scenarios.force_sensor, scenarios.position_sensor)
@@ -81,7 +81,7 @@ class OneAxis(RigModel):
         return scenarios._replace(force_sensor=force, position_sensor=position)
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
-        """Return the loop with another compensator."""
+        """Return a copy of the loop with another compensator."""
         return dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
 
     def compensator_name(self, loop: Loop) -> str:

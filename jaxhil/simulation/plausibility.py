@@ -40,24 +40,41 @@ _POLE_KEYS = ("rig.simulator.", "rig.control_period")
 
 
 class ContactSummary(NamedTuple):
-    """Metrics of an ideal contact with the velocity of the first approach."""
+    """Metrics of an ideal contact with the velocity of the first approach.
 
-    number: int  # number of the first scheduled contact with these metrics, from 1
-    frequency: float  # contact frequency [Hz]: sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws
-    duration: float  # duration [s]; infinite if the bodies do not separate
-    peak_force: float  # peak force [N]
+    Attributes:
+        number: Number of the first scheduled contact with these metrics, from 1.
+        frequency: Contact frequency [Hz]: sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws.
+        duration: Duration [s]; infinite if the bodies do not separate.
+        peak_force: Peak force [N].
+    """
+
+    number: int
+    frequency: float
+    duration: float
+    peak_force: float
 
 
 class MechanismSummary(NamedTuple):
-    """Summary of a mechanism with its nominal numbers."""
+    """Summary of a mechanism with its nominal numbers.
 
-    equivalent_mass: float  # equivalent mass of both bodies [kg]
-    contacts: tuple[ContactSummary, ...]  # scheduled contacts, those with equal metrics only once
-    control_rate: float  # control rate [Hz]
-    simulator_bandwidth: float  # bandwidth of the motion simulator [Hz]; infinite for an ideal one
-    force_range: float  # range of the force sensor [N]; infinite if unlimited
-    duration: float  # approximate duration of the run [s]
-    warnings: tuple[str, ...]  # one text per implausible number: key, found value, expected value
+    Attributes:
+        equivalent_mass: Equivalent mass of both bodies [kg].
+        contacts: Scheduled contacts; contacts with equal metrics are included only once.
+        control_rate: Control rate [Hz].
+        simulator_bandwidth: Bandwidth of the motion simulator [Hz]; infinite for an ideal motion simulator.
+        force_range: Range of the force sensor [N]; infinite if unlimited.
+        duration: Approximate duration of the run [s].
+        warnings: One text per implausible number, with key, found value and expected value.
+    """
+
+    equivalent_mass: float
+    contacts: tuple[ContactSummary, ...]
+    control_rate: float
+    simulator_bandwidth: float
+    force_range: float
+    duration: float
+    warnings: tuple[str, ...]
 
     def line(self, name: str) -> str:
         """Return the summary as one line of text that begins with `name`, without the warnings."""

@@ -39,37 +39,62 @@ class ContactResult(NamedTuple):
     """Results of one contact on the rig and of the ideal contact; NaN if a result does not exist.
 
     The ideal contact is the contact without any delay at the same approach velocity.
+
+    Attributes:
+        restitution: Restitution e [1]: rebound speed divided by approach speed of the numerical model.
+        reference_restitution: Restitution e* of the ideal contact [1].
+        error: Restitution error e - e* [1], positive if the contact diverges.
+        peak_force: Largest real contact force [N].
+        reference_peak_force: Peak force of the ideal contact [N].
+        peak_force_ratio: Peak force divided by the ideal contact's peak force [1].
+        peak_command: Largest |F_c| [N], where F_c is the force on the numerical model.
+        position_shortfall: Largest change of the position command by the motion simulator's limits [m].
+        duration: Time during which a real contact force acts [s].
+        reference_duration: Duration of the ideal contact [s].
+        duration_ratio: Duration divided by the ideal contact's duration [1].
+        approach_velocity: Velocity of the numerical model at the tick before the contact [m/s].
+        force_delay: Delay of the force measurement as estimated by the compensator [s]; None if the
+            compensator estimates no delay.
+        status: "ok", or why there is no restitution: "timeout" (not ended after 10 s), "diverged",
+            "non-finite", or "not reached" (the run ended before this contact, or no force was measured).
     """
 
-    restitution: float  # restitution e [1]: rebound speed over approach speed of the numerical model
-    reference_restitution: float  # restitution e* of the ideal contact [1]
-    error: float  # restitution error e - e* [1]; positive if the contact diverges
-    peak_force: float  # largest real contact force [N]
-    reference_peak_force: float  # peak force of the ideal contact [N]
-    peak_force_ratio: float  # peak force divided by the ideal contact's peak force [1]
-    peak_command: float  # largest |F_c| [N], where F_c is the force on the numerical model
-    position_shortfall: float  # largest change of the position command by the motion simulator's limits [m]
-    duration: float  # time during which a real contact force acts [s]
-    reference_duration: float  # duration of the ideal contact [s]
-    duration_ratio: float  # duration divided by the ideal contact's duration [1]
-    approach_velocity: float  # velocity of the numerical model at the tick before the contact [m/s]
-    # delay of the force measurement as estimated by the compensator [s]; None if it estimates no delay
+    restitution: float
+    reference_restitution: float
+    error: float
+    peak_force: float
+    reference_peak_force: float
+    peak_force_ratio: float
+    peak_command: float
+    position_shortfall: float
+    duration: float
+    reference_duration: float
+    duration_ratio: float
+    approach_velocity: float
     force_delay: float | None
-    # "ok", or why there is no restitution: "timeout" (not ended after 10 s), "diverged", "non-finite",
-    # "not reached" (the run ended before this contact, or no force was measured in it)
     status: str
 
 
 class Ticks(NamedTuple):
-    """Signals at all ticks of a run, through all its contacts; arrays of shape (ticks,)."""
+    """Signals at all ticks of a run, from the first approach to the end of the last contact.
 
-    time: np.ndarray  # time since the first tick [s]; one control period per tick
-    force_measured: np.ndarray  # reading of the force sensor [N]
-    force_command: np.ndarray  # F_c, output of the compensator and force on the numerical model [N]
-    position_desired: np.ndarray  # position of the numerical model [m]
-    velocity_desired: np.ndarray  # velocity of the numerical model [m/s]
-    position_measured: np.ndarray  # reading of the position sensor [m]
-    contact: np.ndarray  # index of the current contact or, in free flight, of the next contact, from 0
+    Attributes:
+        time: Time since the first tick [s], (ticks,); one control period per tick.
+        force_measured: Reading of the force sensor [N], (ticks,).
+        force_command: Force command F_c of the compensator, which acts on the numerical model [N], (ticks,).
+        position_desired: Position of the numerical model [m], (ticks,).
+        velocity_desired: Velocity of the numerical model [m/s], (ticks,).
+        position_measured: Reading of the position sensor [m], (ticks,).
+        contact: Index of the current contact or, in free flight, of the next contact, from 0, (ticks,).
+    """
+
+    time: np.ndarray
+    force_measured: np.ndarray
+    force_command: np.ndarray
+    position_desired: np.ndarray
+    velocity_desired: np.ndarray
+    position_measured: np.ndarray
+    contact: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +103,22 @@ class Run:
 
     The signals at all ticks (see `Ticks`) are also attributes of the run, such as `run.force_measured`. They
     are computed when one of them is first used.
+
+    Attributes:
+        mechanism: Mechanism.
+        compensator: Name of the compensator.
+        gains: Gains of the compensator by name [SI units].
+        seed: Seed of the sensors' noise.
+        contacts: Results of every scheduled contact.
+        status: "ok" if the status of every contact is "ok", else the first other status.
     """
 
-    mechanism: Mechanism = field(repr=False)  # mechanism
-    compensator: str  # name of the compensator
-    gains: dict[str, float]  # gains by name [SI units]
-    seed: int  # seed of the sensors' noise
-    contacts: tuple[ContactResult, ...]  # results of every scheduled contact
-    status: str  # "ok" if all contacts are "ok", else the first other status of a contact
+    mechanism: Mechanism = field(repr=False)
+    compensator: str
+    gains: dict[str, float]
+    seed: int
+    contacts: tuple[ContactResult, ...]
+    status: str
 
     @cached_property
     def meaning(self) -> MechanismSummary:

@@ -22,7 +22,7 @@ DIVERGENCE_SPEED_RATIO = 1e3  # [1]; multiple of the first approach speed above 
 
 
 class CommandVariation(NamedTuple):
-    """Variation of the force command F_c in the current contact, including the step from 0 at its begin."""
+    """Variation of the force command F_c since the begin of the current contact, starting from F_c = 0."""
 
     last: Float[Array, "*batch"]  # last value [N]
     highest: Float[Array, "*batch"]  # highest value so far [N]
