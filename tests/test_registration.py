@@ -117,12 +117,12 @@ def test_unusable_law_is_not_registered(registered):
         (Boundless(), "gains.toy_lead: found 0, 1, inf, expected lower <= nominal <= upper"),
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
-        (Holding(), "a law holds no arrays"),
+        (Holding(), "expected only numbers, texts and tuples, no arrays"),
         (OfItsOwnKey(), "keys: found toy_depth, expected keys of mechanism files: tension, exponent, "),
     ):
         assert message in refusal(jaxhil.register, law)
     assert "expected one of none" in refusal(jaxhil.simulate, "varying", "holding")
-    assert "a contact law runs in the simulation alone" in refusal(
+    assert "expected none: contact laws run in the simulation only" in refusal(
         jaxhil.register, SquaredSpring(), runtime=ScaledLeadOnTheRig
     )
     assert "expected a class" in refusal(
