@@ -153,13 +153,13 @@ def test_identify_uses_prior_for_missing_motion_or_contact():
 
 
 @pytest.mark.parametrize("speeds, seconds, says", (
-    ((0.006, 0.012), 0, "rig.simulator (a run of kind free would) and contact.stiffness"),
-    ((), 5.0, "contact.stiffness (a run of kind contact or press would)"),
+    ((0.006, 0.012), 0, "rig.simulator (add a run of kind free) and contact.stiffness"),
+    ((), 5.0, "contact.stiffness (add a run of kind contact or press)"),
 ))  # fmt: skip
 def test_identify_names_missing_runs_without_prior(speeds, seconds, says):
     result = identify(campaigns.campaign("clean", 2, speeds, seconds))
     assert result.mechanism is None and not result.good
-    assert f"neither the logs nor a prior tell {says}" in result.verdict
+    assert f"logs and prior do not determine {says}" in result.verdict
     assert result["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.06)
 
 
@@ -226,7 +226,7 @@ def test_identify_copies_previous_list_entry_for_missing_contact():
     result = identify(replace(campaign, runs=runs), options=IdentificationOptions(law="kelvin_voigt"))
     first, between, last = result.mechanism["contact"]["stiffness"]
     assert first == between == pytest.approx(1.2e5, rel=0.01) and last == pytest.approx(7e4, rel=0.01)
-    assert "only entries 0, 2 were met" in result.notes[0]
+    assert "the logs contain only entries 0, 2" in result.notes[0]
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def test_identify_never_drops_damping_while_delay_is_free(monkeypatch, tmp_path,
     if name == "hidden":
         pair = {"rig.force_sensor.delay", "contact.damping.0"}
         assert any(pair == {*entry[:2]} and entry[3] == PRESS for entry in result.confounded)
-        assert not result.good and result.verdict.startswith("Bad: the numbers are too uncertain")
+        assert not result.good and result.verdict.startswith("Bad: the parameters are too uncertain")
         assert PRESS in result.verdict
 
 
@@ -106,7 +106,7 @@ def test_identify_uses_specified_contact_law(monkeypatch):
     campaign = ambiguous.campaign(monkeypatch, "undamped", 0, speeds=FEW, seconds=10.0)
     result = identify(campaign, options=IdentificationOptions(law="linear", hold_out=0.0))
     assert result.contact.law.name == "linear" and result["rig.force_sensor.delay"].std < 5e-5
-    assert any(note.startswith("law linear: without damping, as asked for") for note in result.notes)
+    assert any(note.startswith("law linear: without damping, as specified") for note in result.notes)
 
 
 def test_identify_reports_negative_delay_and_verdict_is_bad(monkeypatch, tmp_path):
@@ -119,7 +119,7 @@ def test_identify_reports_negative_delay_and_verdict_is_bad(monkeypatch, tmp_pat
     assert result["rig.force_sensor.delay"].value == pytest.approx(-0.0018, abs=3e-4)
     assert result.mechanism["rig"]["force_sensor"]["delay"] == 0.0
     assert result.mechanism["uncertainty"]["rig.force_sensor.delay"]["std"] > 0.0015
-    assert any(note.startswith("rig.force_sensor.delay: the logs say -0.001") for note in result.notes)
+    assert any(note.startswith("rig.force_sensor.delay: the logs give -0.001") for note in result.notes)
     assert not result.good and not check_against_mechanism(campaign, written(result, tmp_path)).good
 
 
@@ -175,7 +175,7 @@ def test_uncertainty_effect_matches_spring_to_first_order():
     natural = np.sqrt(124355.0 / 350.0)
     assert contact.restitution == pytest.approx(1.0, abs=1e-3)
     assert 2.0 * np.pi * frequency == pytest.approx(natural, rel=0.01)
-    assert contact.age_sensitivity == pytest.approx(np.pi / 2.0 * natural, rel=0.01)
+    assert contact.delay_sensitivity == pytest.approx(np.pi / 2.0 * natural, rel=0.01)
     # e* = exp(-pi zeta), zeta = b / (2 sqrt(k M)).
     assert contact.coefficient_sensitivity[1] == pytest.approx(
         -np.pi / 2.0 / np.sqrt(124355.0 * 350.0), rel=0.01

@@ -89,7 +89,7 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
         bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path))
     most = 100
     again = bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path, resume=True), say=messages.append)
-    assert len(done) == 4 and messages == ["fits to contacts drawn again: 15 of 20"]
+    assert len(done) == 4 and messages == ["bootstrap fits: 15 of 20"]
     whole = bootstrap.bootstrap(fit, 20)
     assert again.resampled == whole.resampled
     np.testing.assert_array_equal(again.posterior.draws, whole.posterior.draws)

@@ -41,7 +41,7 @@ def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
     assert result["rig.contact_plane"].value == pytest.approx(0.0, abs=5e-6)
     assert result["rig.force_sensor.delay"].is_fixed
     # The only reason is the uncertain damping after six touches.
-    assert result.verdict.startswith("Bad: the numbers are too uncertain: contact.damping")
+    assert result.verdict.startswith("Bad: the parameters are too uncertain: contact.damping")
     assert replace(result, limit=0.03).good
     assert result.mechanism["rig"]["force_sensor"]["delay"] == 0.0037
     assert f"gains {1e6 * drift.rate:.3g}" in " ".join(result.notes)
@@ -50,7 +50,7 @@ def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
 def test_identify_cannot_estimate_constant_clock_offset():
     campaign = day(speeds=(0.012, 0.006, 0.012))
     result = identify(campaign, options=IdentificationOptions(law="linear", hold_out=0.0))
-    assert result.mechanism is None and "rig.force_sensor.delay (--fix would" in result.verdict
+    assert result.mechanism is None and "rig.force_sensor.delay (specify it with --fix" in result.verdict
     prior = jaxhil.load("rig-300kg")
     result = identify(campaign, prior, IdentificationOptions(law="linear", hold_out=0.0))
     assert result.mechanism["rig"]["force_sensor"]["delay"] == prior.rig.force_sensor.delay
@@ -70,9 +70,9 @@ def test_identify_verdict_is_bad_for_undeclared_second_clock():
 
 def test_identify_rejects_unusable_logs_of_two_clocks():
     together = day(every=0.0)
-    with pytest.raises(jaxhil.InputError, match="6 touches within 0 s, expected 3 apart"):
+    with pytest.raises(jaxhil.InputError, match="6 contacts within 0 s, expected at least 3"):
         identify(together, options=IdentificationOptions(law="kelvin_voigt", fixed=DELAY, hold_out=0.0))
-    with pytest.raises(jaxhil.InputError, match="forces that follow no touch"):
+    with pytest.raises(jaxhil.InputError, match="forces that do not follow the motion"):
         identify(day(constant=0.3), options=IdentificationOptions(law="linear", fixed=DELAY, hold_out=0.0))
     with pytest.raises(jaxhil.InputError, match='"separate", expected "stamps" or "index"'):
         check_against_mechanism(together, jaxhil.load("rig-300kg"))

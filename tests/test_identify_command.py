@@ -100,7 +100,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
     free = [path for path in logs(day) if path.name.startswith("free")]
     ran = jaxhil("identify", *free, "--map", drafted(jaxhil, day), "-o", tmp_path)
     assert ran.code == 1 and not list(tmp_path.iterdir())
-    assert "neither the logs nor a prior tell contact.stiffness" in " ".join(ran.out.split())
+    assert "logs and prior do not determine contact.stiffness" in " ".join(ran.out.split())
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
     [
         ([], ["logs: found none"]),
         (["--guess"], ["logs: found none"]),
-        (["LOGS"], ["': found none of this name", "--guess drafts one"]),
+        (["LOGS"], ["': found no column with this name", "--guess drafts one"]),
         (["LOGS", "--map", "none.toml"], ["none.toml: found no such file"]),
         (["LOGS", "--prior", "rig-300"], ["did you mean rig-300kg"]),
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),

@@ -59,7 +59,7 @@ def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_
     result = identify(campaign, from_plain_data(prior, "prior"))
     findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
     assert findings == (
-        ["no reading lies between 0 and 3 N, as behind a dead zone that cuts"] if is_cut else []
+        ["no reading lies between 0 and 3 N, as with a dead zone that is not subtracted"] if is_cut else []
     )
     assert not (is_cut and result.good)
 

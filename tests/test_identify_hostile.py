@@ -75,10 +75,10 @@ REFUSED = {
     "m for mm": (lambda day: changed(day, COMMAND, lambda values: 1e-3 * values), "is its unit right?"),
     "position and command": (swapped(COMMAND, POSITION), "are the two swapped?"),
     "force and position": (swapped(FORCE, POSITION), "is its unit right?"),
-    "commands held for 2 rows": (lambda day: changed(day, COMMAND, held(2)), "changes every 2 rows"),
-    "commands held for 4 rows": (lambda day: changed(day, COMMAND, held(4)), "changes every 4 rows"),
+    "commands held for 2 rows": (lambda day: changed(day, COMMAND, held(2)), "a new command every 2 rows"),
+    "commands held for 4 rows": (lambda day: changed(day, COMMAND, held(4)), "a new command every 4 rows"),
     "commands against forces": (
-        lambda day: changed(day, COMMAND, held(4), ("contact",), reveals=True), "changes every 4 rows",
+        lambda day: changed(day, COMMAND, held(4), ("contact",), reveals=True), "a new command every 4 rows",
     ),
     "time backwards": (
         lambda day: changed(day, TIME, lambda values: values[::-1]), "expected time that increases",
@@ -141,7 +141,7 @@ def test_identify_command_verdict_is_bad_for_spoilt_logs(jaxhil, day, tmp_path, 
 
 def test_identify_command_verdict_is_bad_for_rest_alone_despite_prior(jaxhil, day, tmp_path):
     ran = identified(jaxhil, tmp_path, only("rest")(day), MAPPING, *PRIOR)
-    assert ran.code == 1 and "nothing shows that the file is right" in ran.document["reason"]
+    assert ran.code == 1 and "the file cannot be checked" in ran.document["reason"]
 
 
 def gaps(day):
@@ -177,7 +177,7 @@ def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_pa
     spoil, options = FAIR[case]
     ran = identified(jaxhil, tmp_path, spoil(day), MAPPING, *options)
     # Fewer readings separate force delay and damping less well: only that may make the verdict bad.
-    uncertain = ran.document["reason"].startswith("Bad: the numbers are too uncertain")
+    uncertain = ran.document["reason"].startswith("Bad: the parameters are too uncertain")
     assert ran.code == 0 or (uncertain and case in ("a gap in every contact", "two contacts"))
     off = {item["key"]: (item["value"] - TRUE[item["key"]]) / item["std"]
            for item in ran.document["estimates"] if item["key"] in TRUE}  # fmt: skip

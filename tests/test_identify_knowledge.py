@@ -96,7 +96,7 @@ def test_fixed_values_condition_draws_and_note_contradictions():
     rest = COVARIANCE[:3, :3] - np.outer(regression, COVARIANCE[3, :3])
     close(summary(result, KEYS[:3]), (MEAN[:3] + 10.0 * regression, rest), 1e-6)
     _, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 0.0})
-    assert notes == ["contact.damping.0: 0 was told, the logs say 650 +- 12"]
+    assert notes == ["contact.damping.0: fixed at 0, but the logs give 650 +- 12"]
 
 
 def test_spread_out_assigns_list_values_entry_by_entry():
@@ -117,7 +117,9 @@ def test_spread_out_assigns_list_values_entry_by_entry():
 
 
 def test_with_prior_rejects_prior_without_uncertainty():
-    with pytest.raises(InputError, match=r"prior: \[uncertainty\]: found no entry of what the logs tell"):
+    with pytest.raises(
+        InputError, match=r"prior: \[uncertainty\]: found no normal entry for a parameter that"
+    ):
         conditioning.condition_on_prior(logs_say(KEYS), campaign_rigs.mechanism("clean"), 3.0)
     with pytest.raises(InputError, match="bayes: found no prior"):
         identify(campaigns.campaign("clean", 0, (), 5.0), options=IdentificationOptions(bayes=True))

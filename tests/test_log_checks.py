@@ -46,16 +46,16 @@ def test_rows_of_another_tick_are_detected_with_any_integrator(tmp_path, integra
     assert read(path, timing={"row": row}).runs[0].kind == "contact"
     other = "tick" if row == "sent" else "sent"
     assert f'timing.row: found "{other}"' in (result := message(path, timing={"row": other}))
-    assert f'({integrator}) in rows that are "{row}"' in result
+    assert f'expected "{row}": ' in result and f"(integrator {integrator})" in result
     if row == "tick":
         assert read(path, timing={"row": "after"}).notes == ()
 
 
 def test_wrong_sign_or_mass_of_force_command_is_detected(tmp_path):
     path = write_csv(tmp_path / "a.csv", model("zoh", "tick", sign=-1))
-    assert "force_command: found one that pulls the model forward" in message(path)
+    assert "force_command: found forces that accelerate the approach" in message(path)
     assert read(path, force_command={"column": "Fc", "sign": -1}).notes == ()
-    assert "of 350 kg (nearest: 175 kg)" in message(
+    assert "with 350 kg (nearest: 175 kg)" in message(
         path, force_command={"column": "Fc", "sign": -1, "scale": 0.5}
     )
     coarse = model("zoh", "tick")
@@ -63,23 +63,23 @@ def test_wrong_sign_or_mass_of_force_command_is_detected(tmp_path):
     path = write_csv(tmp_path / "b.csv", coarse)
     assert read(path).notes == ()
     assert "(nearest: 175 kg)" in message(path, force_command={"column": "Fc", "scale": 0.5})
-    assert 'in rows that are "tick"' in message(path, timing={"row": "sent"})
+    assert 'expected "tick": only then' in message(path, timing={"row": "sent"})
 
 
 @pytest.mark.parametrize(
     ("channels", "reason"),
     [
-        ({"force_measured": {"column": "F", "sign": -1}}, "found one that pulls where"),
-        ({"force_measured": {"column": "F", "unit": "kN"}}, "times the impulse that there was"),
+        ({"force_measured": {"column": "F", "sign": -1}}, "found F < 0 in contacts that push"),
+        ({"force_measured": {"column": "F", "unit": "kN"}}, "times the impulse that reverses 350 kg"),
         ({"force_measured": {"column": "F", "unit": "mN"}}, "found 0.001 times the impulse"),
         ({"position_measured": {"column": "xm", "unit": "mm"}}, "found a stroke of 1.3e-06 m"),
-        ({"position_measured": {"column": "xm", "sign": -1}}, "found one that moves against"),
-        ({"position_desired": "xm", "position_measured": "xd"}, "one that follows (are the two swapped?)"),
+        ({"position_measured": {"column": "xm", "sign": -1}}, "found a motion against position_desired"),
+        ({"position_desired": "xm", "position_measured": "xd"}, "a later one (are the two swapped?)"),
         ({"position_desired": {"column": "xd", "unit": "mm"}}, "found a stroke of 1.27e-06"),
         ({"position_desired": {"column": "xd", "scale": 1e3}}, "found a stroke of 1.27 m, expected"),
         ({"position_measured": "still"}, "found 0 m in every row, expected"),
         ({"force_measured": "still"}, "force_measured: found 0 N in every row"),
-        ({"position_desired": "still"}, "nothing excites the motion"),
+        ({"position_desired": "still"}, "m in every row, expected a motion"),
     ],
 )  # fmt: skip
 def test_wrong_units_signs_and_swapped_channels_are_detected(tmp_path, channels, reason):
@@ -90,10 +90,10 @@ def test_wrong_units_signs_and_swapped_channels_are_detected(tmp_path, channels,
 def test_wrong_channels_of_a_free_run_are_detected(tmp_path):
     path = write_csv(tmp_path / "a.csv", sway() | {"slow": 1e-3 * sway()["xm"]})
     assert read(path, "free").notes == ()
-    assert "leads position_desired" in message(path, "free", position_desired="xm", position_measured="xd")
-    assert "a stroke 0.01 times that" in message(
-        path, "free", position_measured={"column": "slow", "scale": 10}
+    assert "ticks earlier than position_desired" in message(
+        path, "free", position_desired="xm", position_measured="xd"
     )
+    assert "0.01 times the stroke" in message(path, "free", position_measured={"column": "slow", "scale": 10})
     fast = write_csv(tmp_path / "b.csv", sway(amplitude=0.3))
     assert "found speeds of" in message(fast, "free")
     noise = sway() | {"xm": 1e-3 * np.random.default_rng(0).standard_normal(800)}
@@ -105,7 +105,7 @@ def test_wrong_channels_of_a_free_run_are_detected(tmp_path):
 def test_held_readings_are_noted(tmp_path):
     log = sway() | {"xm": np.repeat(sway()["xm"][::4], 4)}
     (note,) = read(write_csv(tmp_path / "a.csv", log), "free").notes
-    assert "the same in 75 % of rows, as if each reading was held for 4 of them" in note
+    assert "repeated in 75 % of rows, as if each reading was held for 4 rows" in note
     rounded = sway() | {"xm": np.round(sway()["xm"], 5)}
     assert read(write_csv(tmp_path / "b.csv", rounded), "free").notes == ()
 
@@ -116,10 +116,10 @@ def test_press_requires_force_that_rises_with_depth_and_clipping_is_noted(tmp_pa
     path = write_csv(tmp_path / "a.csv", press)
     assert read(path, "press").runs[0].kind == "press"
     wrong = {"column": "F", "sign": -1}
-    assert "force_measured: found one that falls where" in message(path, "press", force_measured=wrong)
+    assert "force_measured: found a force that decreases when" in message(path, "press", force_measured=wrong)
     clipped = LOG | {"F": np.minimum(LOG["F"], 20.0)}
     notes = read(write_csv(tmp_path / "b.csv", clipped), force_command=None).notes
-    assert any("rows at the largest reading" in note for note in notes)
+    assert any("rows have the largest reading" in note for note in notes)
 
 
 @pytest.mark.parametrize("every", [2, 5])
@@ -128,13 +128,11 @@ def test_commands_and_forces_of_another_rate_are_detected(tmp_path, every):
         return np.repeat(values[::every], every)[: len(values)]
 
     path = write_csv(tmp_path / "a.csv", sway() | {"xd": held(sway()["xd"])})
-    assert f"position_desired: found one that changes every {every} rows, expected one" in message(
-        path, "free"
-    )
+    assert f"position_desired: found a new command every {every} rows, expected one" in message(path, "free")
     assert read(path, "free", timing={"command_hold": "zoh"}).runs[0].kind == "free"
     path = write_csv(tmp_path / "b.csv", LOG | {"F": held(LOG["F"])})
     (note,) = read(path, force_command=None).notes
-    assert f"force_measured: a new reading every {every} rows" in note
+    assert f"force_measured: a new reading only every {every} rows" in note
     # A steady motion in steps of the last digit also changes at regular intervals.
     slow = {"t": PERIOD * np.arange(800), "xd": 1e-5 * (np.arange(800) // every), "xm": sway()["xm"]}
     slow["xm"] = np.concatenate([np.zeros(LAG), slow["xd"][:-LAG]])
@@ -156,7 +154,7 @@ def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
     """Cover forces that were taken for ones in a wrong unit, or ended in an internal error."""
     log, back = far_side()
     path = write_csv(tmp_path / "a.csv", log)
-    with pytest.raises(InputError, match=r"row \d+: found a contact on the far side") as caught:
+    with pytest.raises(InputError, match=r"row \d+: found a contact at the second surface") as caught:
         read(path, **dict.fromkeys(gone))
     first = back + int(np.argmax(log["F"][back:] < -2.0))
     assert int(str(caught.value).split("row ")[1].split(":")[0]) == pytest.approx(first + 1, abs=5)

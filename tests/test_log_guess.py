@@ -53,7 +53,9 @@ def test_draft_mapping_recognises_own_columns_and_refuses_unknown_ones(tmp_path)
         assert f'{name} = {{ column = "{name}"' in text
     assert 'contact_index = { column = "contact" }' in text
     path = write_csv(tmp_path / "a.csv", {"a": LOG["t"], "b": LOG["xd"]})
-    with pytest.raises(InputError, match="found no column named like position_desired among a, b"):
+    with pytest.raises(
+        InputError, match="found no column with a name like position_desired, expected one; columns: a, b"
+    ):
         draft_mapping([path])
     with pytest.raises(InputError, match="logs: found none"):
         draft_mapping([])

@@ -50,8 +50,8 @@ def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
     ticks, force, notes = joined(sampled, scattered(sampled, jitter, 2), jitter=jitter)
     np.testing.assert_array_equal(force, smooth(PERIOD * (late + np.arange(ROWS)))[(ticks - int(late))])
     assert ticks[0] == max(late, 0) and ticks[-1] == ROWS - 41 + late
-    assert "taken at their own times" in notes[0]
-    assert f"{40 + max(0, -late):.0f} rows at which a channel was not read" in notes[1]
+    assert "are used unchanged" in notes[0]
+    assert f"{40 + max(0, -late):.0f} rows without readings of all channels" in notes[1]
 
 
 @given(
@@ -80,7 +80,7 @@ def test_joined_readings_are_those_of_the_rows_times(late, rate, jitter, lost, e
 def test_gap_in_a_channel_drops_its_rows():
     sampled = np.delete(PERIOD * np.arange(ROWS), slice(1000, 1200)) + 4e-4
     ticks, _, notes = joined(sampled)
-    assert not np.any((ticks > 1000) & (ticks < 1200)) and "interpolated between their own times" in notes[0]
+    assert not np.any((ticks > 1000) & (ticks < 1200)) and "are interpolated" in notes[0]
     assert len(ticks) == ROWS - 200 - 2
 
 
@@ -99,10 +99,10 @@ def test_gap_in_a_channel_drops_its_rows():
         ),
         (
             100 + PERIOD * np.arange(ROWS),
-            "found no time at which all channels were read ('xd' 0 to 1.999 s, 'F' 100",
+            "found no time with readings of all channels ('xd' 0 to 1.999 s, 'F' 100",
         ),
-        (PERIOD * np.arange(ROWS - 1), "stamps of 'F': found 1999, expected 2000, one a row"),
-        (None, "column 'F': found no stamps, expected some"),
+        (PERIOD * np.arange(ROWS - 1), "stamps of 'F': found 1999, expected 2000: one per row"),
+        (None, "column 'F': found no stamps, expected stamps"),
     ],
 )
 def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
@@ -149,11 +149,11 @@ def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
     (run,) = campaign.runs
     shift, first = round(1e3 * late), np.flatnonzero(log["xd"] == run.position_desired[0])[0]
     np.testing.assert_array_equal(run.force_measured, log["F"][first - shift : first - shift + len(run.tick)])
-    assert f"begins {abs(shift)} ms" in campaign.notes[0]
+    assert f"which begin {abs(shift)} ms" in campaign.notes[0]
     # They cannot be joined by row numbers.
-    with pytest.raises(InputError, match="found columns of unlike length"):
+    with pytest.raises(InputError, match="found columns of different lengths"):
         read(tmp_path / "a.h5", **TIMES | {"force_measured": "f/F"})
-    with pytest.raises(InputError, match=r"channels.force_measured.time is named"):
+    with pytest.raises(InputError, match=r"channels.force_measured.time is given"):
         read(tmp_path / "a.h5", **TIMES, timing={"clock": "index"})
 
 
@@ -180,7 +180,7 @@ def test_group_stamps_that_differ_from_those_of_the_rows_are_refused(tmp_path, u
         file["f/F"] = log["F"]
     said = TIMES | {"time": "x/time", "force_measured": "f/F"}
     with pytest.raises(
-        InputError, match=r"'f/F': found stamps of its own in 'f/time' that are not those in 'x/time'"
+        InputError, match=r"'f/F': found separate time stamps in 'f/time' that differ from 'x/time'"
     ):
         read(tmp_path / "a.h5", **said)
     if unit == 1.0:

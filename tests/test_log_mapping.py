@@ -91,7 +91,7 @@ def test_mapping_file_is_equivalent_to_its_table(tmp_path):
         (("channels", "time", "unit"), "mm", "time.unit: found 'mm', expected one of s, ms, us, ns"),
         (("channels", "force_measured", "unit"), "mm", "found 'mm', expected one of N, kN, mN, lbf, counts"),
         (("channels", "position_desired", "unit"), "mmm", "did you mean mm"),
-        (("channels", "position_measured", "scale"), None, "scale: found none, expected how much a count is"),
+        (("channels", "position_measured", "scale"), None, "scale: found none, expected the value of"),
         (("channels", "position_desired", "sign"), 0, "sign: found 0, expected 1 or -1"),
         (("channels", "position_desired", "sign"), 2, "sign: found 2, expected an integer from -1 to 1"),
         (("channels", "position_desired", "scale"), 0, "scale: found 0.0"),
@@ -133,9 +133,9 @@ def test_value_missing_from_mapping_and_prior_is_refused(tmp_path):
             read_campaign([log], parse_mapping(raw, "map"))
     prior = load("varying").mechanism
     bare = {key: one for key, one in FULL.items() if key not in ("bodies", "timing", "text")}
-    with pytest.raises(InputError, match=r"free_1.csv: found no line of columns' names"):
+    with pytest.raises(InputError, match=r"free_1.csv: found no line of column names"):
         read_campaign([log], parse_mapping(bare, "map"), prior)
     with pytest.raises(
-        InputError, match=r"x.csv: found a log that no run names, expected 'free_\*.csv', 'day1"
+        InputError, match=r"x.csv: found a name that no run matches, expected 'free_\*.csv', 'day1"
     ):
         read_campaign([tmp_path / "x.csv"], parse_mapping(FULL, "map"))

@@ -152,8 +152,8 @@ def edit(path: Path, row: int, cell: int, text: str) -> Path:
         (1, 1, "abc", "column 'xd': found 'abc', expected numbers"),
         (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, expected time that increases"),
         (30, 0, "0.028", "row 30: time: found 0.028 s after 0.028 s"),
-        (0, 1, "xdd", "found none of this name, expected t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
-        (0, 2, "xd", "column 'xd': found 2, expected one"),
+        (0, 1, "xdd", "found no column with this name, expected t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
+        (0, 2, "xd", "column 'xd': found 2 columns, expected one"),
     ],
 )  # fmt: skip
 def test_unusable_cells_are_refused(tmp_path, row, cell, text, reason):
@@ -170,7 +170,7 @@ def test_unusable_log_files_are_refused(tmp_path):
         "none.csv": "found no such file",
         "folder": "found a name that ends in ''",
         "a.docx": "found a name that ends in '.docx', expected .csv",
-        "empty.csv": "found no line of columns' names",
+        "empty.csv": "found no line of column names",
         "names.csv": "found 0 rows, expected at least 200",
         "short.csv": "found 100 rows, expected at least 200",
         "torn.parquet": "cannot be read",

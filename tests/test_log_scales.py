@@ -56,15 +56,15 @@ NO_COMMAND = {"force_command": None}
 @pytest.mark.parametrize(
     ("factors", "said", "reason"),
     [
-        ({"F": 1 / LBF}, {}, "times the impulse that there was, expected 0.5 to 2 "),
+        ({"F": 1 / LBF}, {}, "times the impulse that reverses 350 kg, expected 0.5 to 2 times"),
         ({"F": 1 / LBF}, {}, "(force in lbf, read as N?)"),
         ({"F": 1 / LBF}, NO_COMMAND, "force in lbf, read as N"),
         ({"F": LBF}, NO_COMMAND, "force in N, read as lbf"),
         ({"F": 1 / 9.80665}, NO_COMMAND, "force in kgf, read as N"),
-        ({"Fc": 1 / LBF}, {}, "0.2248 times the force that there was"),
-        ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); or leave force_command out"),
+        ({"Fc": 1 / LBF}, {}, "0.2248 times the required force"),
+        ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); or omit force_command"),
         ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(nearest: 78.68 kg)"),
-        (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the force that there was"),
+        (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the required force"),
         (dict.fromkeys(ALL, 1 / 2.54), {}, "(positions in in, read as cm?)"),
         (dict.fromkeys(ALL, 1 / 2.54), NO_COMMAND, "positions in in, read as cm"),
         (dict.fromkeys(ALL, 2.54), {}, "(positions in cm, read as in?)"),
@@ -87,7 +87,7 @@ def test_channel_in_a_wrong_unit_is_refused_with_factor_and_unit(tmp_path, facto
 
 def test_wrong_mass_of_a_few_percent_is_found(tmp_path):
     result = refused(tmp_path, scaled(LOG, Fc=1.03))
-    assert "(nearest: 360.5 kg), 1.03 times the force" in result
+    assert "(nearest: 360.5 kg): force_command is 1.03 times" in result
     assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
 
 
@@ -110,19 +110,19 @@ def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
     log, gone = REAL[name](LOG), dict.fromkeys(without)
     result = read(write_csv(tmp_path / "a.csv", log), **gone)
     assert result.notes == () and all(run.force_command is not None for run in result.runs)
-    assert 'in rows that are "tick"' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
+    assert 'expected "tick": only then' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
     assert "(nearest: 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
-    assert "pulls the model forward" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
+    assert "accelerate the approach" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 
 
 def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"Fc": 5.0 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     result = read(write_csv(tmp_path / "a.csv", noise))
     (note,) = result.notes
-    assert "a.csv: force_command: ignored, since M x_d'' = -F_c leaves" in note
+    assert "a.csv: force_command: ignored, because M x_d'' = -F_c leaves" in note
     assert all(run.force_command is None for run in result.runs)
     result = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
-    assert "force_command: ignored, since it is 0 N in every contact" in "\n".join(result.notes)
+    assert "force_command: ignored, because it is 0 N in every contact" in "\n".join(result.notes)
     # The measured force is then compared with the momentum of the positions.
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
@@ -130,13 +130,15 @@ def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
 def test_velocity_that_does_not_match_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"vd": 5e-3 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     result = read(write_csv(tmp_path / "a.csv", noise))
-    assert "velocity_desired: ignored, since position_desired does not move by it" in "\n".join(result.notes)
+    assert "velocity_desired: ignored, because it is not the rate of position_desired" in "\n".join(
+        result.notes
+    )
     assert all(run.velocity_desired is None for run in result.runs)
 
 
 def test_undetermined_row_is_noted(tmp_path):
     coarse = rounded(scatter(LOG, 2e-4, samples=True), xd=2e-6, vd=1e-4)
-    assert "timing.row: force_command is too coarse" in "\n".join(
+    assert "timing.row: not checked: force_command is too coarse" in "\n".join(
         read(write_csv(tmp_path / "a.csv", coarse)).notes
     )
 
@@ -171,7 +173,7 @@ def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lo
     try:
         holds, _ = check_command("a", stretch, contacts, PERIOD, MASS, "tick", "semi_implicit_euler")
     except InputError as error:
-        result = float(str(error).split("kg), ")[1].split(" times")[0])
+        result = float(str(error).split("force_command is ")[1].split(" times")[0])
         assert factor != 1.0 and result == pytest.approx(factor, rel=0.05)
         return
     assert factor == 1.0 or not holds

@@ -1,9 +1,9 @@
-"""Bootstrap over contacts: fits to contacts that are drawn again with replacement.
+"""Bootstrap over contacts: repeated fits of the contact law to contacts drawn with replacement (Efron 1979).
 
-The likelihood knows only the noise of the readings. If contacts differ by more than noise, its intervals are
-too narrow; the scatter of the bootstrap fits includes all differences (Efron 1979). Contacts are drawn only
-among those of the same entry of the contact lists. The fits are independent, so a cluster's workers can
-compute them, and finished chunks are checkpointed.
+The likelihood accounts only for the noise of the readings. If the contacts differ by more than this noise,
+the intervals of the likelihood are too narrow. The scatter of the bootstrap fits includes all differences
+between contacts. Contacts are drawn separately for each entry of the contact lists. The fits are independent
+of each other, so that the workers of a cluster can compute them. Finished chunks of fits are checkpointed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import compute_posterior
 from tuning.identification.force_readings import ForceReadings
 
-MIN_CONTACTS_FOR_BOOTSTRAP = 6  # contacts that a bootstrap needs
-FITS_PER_CHUNK = 5  # fits in a chunk, which one worker computes and which is checkpointed
-MIN_STD_RATIO = (
-    1.5  # ratio to the stated standard deviation, above which the bootstrap replaces the intervals
-)
+MIN_CONTACTS_FOR_BOOTSTRAP = 6  # minimum number of contacts for a bootstrap
+FITS_PER_CHUNK = 5  # number of fits that one worker computes and saves as one checkpoint
+# Ratio of the bootstrap's standard deviation to the posterior's; above it, the bootstrap's intervals are
+# used.
+MIN_STD_RATIO = 1.5
 
 
 def bootstrap(
@@ -37,9 +37,7 @@ def bootstrap(
     kept: Checkpoints = NO_CHECKPOINTS,
     say: Callable[[str], None] = lambda text: None,
 ) -> ContactFit:
-    """Return the fit with wider draws if fits to resampled contacts scatter more than stated.
-
-    The field `resampled` of the result summarizes the outcome.
+    """Widen the posterior draws of a fit if bootstrap fits scatter much more than the posterior.
 
     Args:
         fit: Fit to all contacts.
@@ -47,7 +45,10 @@ def bootstrap(
         seed: Seed of the random numbers.
         scheduler: Address of a cluster's scheduler whose workers compute the fits, or None.
         kept: Checkpoints of finished chunks.
-        say: Function that receives a progress message after every chunk but the last.
+        say: Function that receives a progress message after every chunk except the last one.
+
+    Returns:
+        The fit with the same draws or wider ones; its field `resampled` summarizes the bootstrap in words.
     """
     posterior, readings = fit.posterior, fit.readings
     lanes = readings.force.shape[1]
@@ -62,18 +63,18 @@ def bootstrap(
     groups = len({*_find_contact_entries(fit)})
     spread = np.cov(estimates.T) * lanes / max(lanes - groups, 1)
     stated = posterior.covariance
-    moving = np.flatnonzero(np.diag(stated) > 0.0)
-    std = np.sqrt(np.diag(stated)[moving])
-    ratio = np.sqrt(np.diag(spread)[moving]) / std
+    varying = np.flatnonzero(np.diag(stated) > 0.0)
+    std = np.sqrt(np.diag(stated)[varying])
+    ratio = np.sqrt(np.diag(spread)[varying]) / std
     worst = int(np.argmax(ratio))
     summary = f"bootstrap over {lanes} contacts, {repeats} times: standard deviations {ratio.min():.2g} to "
-    summary += f"{ratio[worst]:.2g} times those of noise ({posterior.names[moving[worst]]})"
+    summary += f"{ratio[worst]:.2g} times those of noise ({posterior.names[varying[worst]]})"
     if ratio[worst] <= MIN_STD_RATIO:
         return replace(fit, resampled=f"{summary}: intervals are those of noise")
-    block = np.ix_(moving, moving)
+    block = np.ix_(varying, varying)
     old, new = (_factorise_regularised(cov[block] / np.outer(std, std)) for cov in (stated, spread))
-    draws, mean = posterior.draws.copy(), posterior.mean[moving]
-    draws[:, moving] = mean + ((draws[:, moving] - mean) / std) @ np.linalg.solve(old.T, new.T) * std
+    draws, mean = posterior.draws.copy(), posterior.mean[varying]
+    draws[:, varying] = mean + ((draws[:, varying] - mean) / std) @ np.linalg.solve(old.T, new.T) * std
     positive = [2 + i for i in fit.problem.damping_indices]
     draws[:, positive] = np.maximum(draws[:, positive], 0.0)
     widened = replace(posterior, draws=draws)
@@ -81,7 +82,10 @@ def bootstrap(
 
 
 def _factorise_regularised(covariance: np.ndarray) -> np.ndarray:
-    """Return a Cholesky factor of a covariance that may be singular because there are few fits."""
+    """Return the Cholesky factor of a covariance matrix after a small increase of its diagonal.
+
+    The matrix is singular if there are fewer bootstrap fits than parameters.
+    """
     return np.linalg.cholesky(covariance + 1e-9 * np.max(np.diag(covariance)) * np.eye(len(covariance)))
 
 
@@ -93,30 +97,30 @@ def fit_bootstrap_samples(
     kept: Checkpoints,
     say: Callable[[str], None],
 ) -> np.ndarray:
-    """Return the posterior mean of every bootstrap fit, (repeats, names)."""
+    """Fit the law to bootstrap samples and return the posterior means, shape (repeats, parameters)."""
     rng, entries = np.random.default_rng([seed, 3]), _find_contact_entries(fit)
     members = [np.flatnonzero(entries == entry) for entry in np.unique(entries)]
     drawn = [np.concatenate([rng.choice(group, len(group)) for group in members]) for _ in range(repeats)]
-    lanes = {begin: drawn[begin : begin + FITS_PER_CHUNK] for begin in range(0, repeats, FITS_PER_CHUNK)}
+    chunks = {begin: drawn[begin : begin + FITS_PER_CHUNK] for begin in range(0, repeats, FITS_PER_CHUNK)}
     shared = fit.problem, fit.readings, seed, fit.posterior.best[:2]
-    same = compute_digest((_describe_problem(fit.problem), *shared[1:]))
-    read = {begin: kept.read(f"fits {begin}", (same, chunk), np.ndarray) for begin, chunk in lanes.items()}
-    results: dict[int, np.ndarray] = {begin: values for begin, values in read.items() if values is not None}
-    pieces = [WorkUnit(begin, (chunk, *shared)) for begin, chunk in lanes.items() if begin not in results]
+    digest = compute_digest((_describe_problem(fit.problem), *shared[1:]))
+    saved = {
+        begin: kept.read(f"fits {begin}", (digest, chunk), np.ndarray) for begin, chunk in chunks.items()
+    }
+    results: dict[int, np.ndarray] = {begin: values for begin, values in saved.items() if values is not None}
+    units = [WorkUnit(begin, (chunk, *shared)) for begin, chunk in chunks.items() if begin not in results]
     if scheduler is None:
-        computed = ((piece.name, fit_resampled_contacts(*piece.arguments)) for piece in pieces)
+        computed = ((unit.name, fit_resampled_contacts(*unit.arguments)) for unit in units)
     else:
-        task, alike = (
-            f"bootstrap-{compute_digest((same, drawn))[:16]}",
-            get_process_setting()._replace(xla_flags=None),
-        )
-        computed = run_on_workers(scheduler, fit_resampled_contacts, pieces, alike, task)
+        task = f"bootstrap-{compute_digest((digest, drawn))[:16]}"
+        setting = get_process_setting()._replace(xla_flags=None)
+        computed = run_on_workers(scheduler, fit_resampled_contacts, units, setting, task)
     for begin, values in computed:
         results[begin] = values
-        kept.write(f"fits {begin}", (same, lanes[begin]), values)
-        if len(results) < len(lanes):
-            say(f"fits to contacts drawn again: {sum(map(len, results.values()))} of {repeats}")
-    return np.concatenate([results[begin] for begin in lanes])
+        kept.write(f"fits {begin}", (digest, chunks[begin]), values)
+        if len(results) < len(chunks):
+            say(f"bootstrap fits: {sum(map(len, results.values()))} of {repeats}")
+    return np.concatenate([results[begin] for begin in chunks])
 
 
 def fit_resampled_contacts(
@@ -126,22 +130,30 @@ def fit_resampled_contacts(
     seed: int,
     near: tuple[float, float],
 ) -> np.ndarray:
-    """Return the posterior means of fits to each set of drawn lanes, (fits, names)."""
-    again = [
+    """Fit the law to sets of contacts and return the posterior means, shape (fits, parameters).
+
+    Args:
+        drawn: For each fit, the indices of its contacts; an index may repeat.
+        problem: Problem with the motion and the law of all contacts.
+        readings: Force readings of all contacts.
+        seed: Seed of the random numbers.
+        near: Delay [s] and surface position [m] of the fit to all contacts.
+    """
+    problems = [
         ContactProblem(problem.motion.of(lanes), readings.select_lanes(lanes), problem.law, problem.plane)
         for lanes in drawn
     ]
     return np.array(
-        [compute_posterior(problem_again, seed, near, COARSE_GRID_SIZE).mean for problem_again in again]
+        [compute_posterior(resampled, seed, near, COARSE_GRID_SIZE).mean for resampled in problems]
     )
 
 
 def _find_contact_entries(fit: ContactFit) -> np.ndarray:
-    """Return the entry of the contact lists for each contact."""
+    """Return the index into the contact lists for each contact."""
     return np.max(fit.readings.entry, axis=0)
 
 
 def _describe_problem(problem: ContactProblem) -> Any:
-    """Return everything that defines the problem except its readings."""
+    """Return the data that define the problem, without its readings."""
     law = problem.law
     return law.name, law.names, law.pulls, law.shape, problem.plane, vars(problem.motion)

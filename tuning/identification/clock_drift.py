@@ -1,9 +1,10 @@
-"""Rate of a separate force clock relative to the drives' clock, from contacts at different times.
+"""Drift between a separate force clock and the drives' clock, estimated from contacts at different times.
 
-A constant offset between the clocks cannot be separated from the force sensor's delay. A rate can: the time
-between motion and force then grows from contact to contact. Over hours the clocks diverge by more than the
-longest delay of a search. So the rate is estimated in two steps: first from the mean time of each contact's
-force after its deepest point, then from the residuals of a law fitted to all contacts.
+A constant offset between the two clocks cannot be distinguished from a delay of the force sensor. A drift
+can: the time from the motion to the force changes from contact to contact. After some hours, the clocks
+differ by more than `MAX_FORCE_DELAY`, the longest delay that a fit searches. The drift is therefore estimated
+in two steps. The first step uses, for each contact, the time from the deepest point to the mean time of the
+force. The second step uses the residuals of a contact law that is fitted to all contacts.
 """
 
 from __future__ import annotations
@@ -24,29 +25,29 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 MIN_CONTACTS_FOR_DRIFT = 3  # contacts
-FORCE_DETECTION_SIGMAS = 5.0  # standard deviations of the noise, above which a force is detected
-CENTRAL_DELAY = (
-    0.5 * MAX_FORCE_DELAY
-)  # s, delay that the data are shifted to, since the offset of the clocks is arbitrary
-DELAY_DIFFERENCE_STEP = 2.5e-4  # s, step of finite differences by the delay
-DRIFT_ITERATIONS = 6  # iterations of law and rate
-DRIFT_TOLERANCE = 1e-6  # s, over all contacts; a smaller step ends the iteration
+FORCE_DETECTION_SIGMAS = 5.0  # standard deviations of the noise; a larger force indicates contact
+# s; the data are shifted to this delay, the middle of the search range, because the clock offset is
+# arbitrary.
+CENTRAL_DELAY = 0.5 * MAX_FORCE_DELAY
+DELAY_DIFFERENCE_STEP = 2.5e-4  # s, step of the finite differences with respect to the delay
+DRIFT_ITERATIONS = 6  # alternating estimates of the contact law and of the drift
+DRIFT_TOLERANCE = 1e-6  # s, change of the delay over all contacts; a smaller change ends the iteration
 SEPARATE_CLOCK_MESSAGE = (
-    'timing.clock: found "separate", expected "stamps" or "index" where a mechanism is told'
+    'timing.clock: found "separate", expected "stamps" or "index" to compare logs with a mechanism'
 )
 
 
 @dataclass(frozen=True)
 class ClockDrift:
-    """Drift of the forces' clock relative to the drives' clock."""
+    """Drift of the force clock relative to the drives' clock."""
 
-    rate: float  # s/s, time that the forces' clock gains
-    std: float  # standard deviation of the rate
-    late: np.ndarray  # s, delay that it adds in each run, up to a constant
+    rate: float  # s/s, time that the force clock gains per second
+    std: float  # s/s, standard error of the rate
+    delays: np.ndarray  # s, (runs,), force delay of each run due to the drift, up to a constant
 
 
 def reject_separate_clocks(timing: CampaignTiming) -> None:
-    """Raise `InputError` for logs with two clocks, because their constant offset is unknown."""
+    """Raise `InputError` if the forces were logged with a separate clock, because its offset is unknown."""
     if timing.two_clocks:
         raise InputError(SEPARATE_CLOCK_MESSAGE)
 
@@ -59,84 +60,109 @@ def estimate_clock_drift(
     law: Law | str | None,
     plane: float | None,
 ) -> ClockDrift:
-    """Return the drift of the forces' clock from the trend of the contacts' times.
+    """Estimate the drift of the force clock from the trend of the force delay over all contacts.
+
+    Args:
+        runs: Runs in contact.
+        model: Model of the motion simulator.
+        timing: Timing of commands and readings.
+        readings: Force readings of the runs.
+        law: Contact law, the name of a law, or None to choose the law.
+        plane: Position of the surface [m], or None to estimate it.
 
     Raises:
-        InputError: If there are too few contacts, or all at one time.
+        InputError: If there are too few contacts, if all contacts are at one time, or if the forces do not
+            follow
+            the motion.
     """
     period, longest = timing.control_period, MAX_FORCE_DELAY + timing.control_period
     time = np.array([run.begin + period * run.tick[len(run.tick) // 2] for run in runs])
-    touches = np.array([run.kind in ("contact", "tap") for run in runs])
-    if touches.sum() < MIN_CONTACTS_FOR_DRIFT or not np.ptp(time[touches]):
-        finding = f"{touches.sum()} touches within {np.ptp(time[touches]) if touches.any() else 0:g} s"
-        allowed = f"{MIN_CONTACTS_FOR_DRIFT} apart by their stamps"
-        raise InputError(f'timing.clock: found "separate" and {finding}, expected {allowed}')
+    is_contact = np.array([run.kind in ("contact", "tap") for run in runs])
+    if is_contact.sum() < MIN_CONTACTS_FOR_DRIFT or not np.ptp(time[is_contact]):
+        finding = (
+            f"{is_contact.sum()} contacts within {np.ptp(time[is_contact]) if is_contact.any() else 0:g} s"
+        )
+        expected = f"at least {MIN_CONTACTS_FOR_DRIFT} contacts with different time stamps"
+        raise InputError(f'timing.clock: found "separate" and {finding}, expected {expected}')
     time = time - time.mean()
-    late = _estimate_run_delays(MotionResponse(model, runs, timing, longest), readings, time, touches)
+    delays = _estimate_run_delays(MotionResponse(model, runs, timing, longest), readings, time, is_contact)
     rate = std = 0.0
     for _ in range(DRIFT_ITERATIONS):
-        motion = MotionResponse(model, runs, timing, longest, late)
+        motion = MotionResponse(model, runs, timing, longest, delays)
         if not isinstance(law, Law):
             law = choose_contact_law(motion, readings, plane, None if law is None else (law,))[0].law
         problem = ContactProblem(motion, readings, law, plane)
         delay, surface, _ = search_coarsely(problem)
-        off, variance = estimate_residual_delays(
+        delay_changes, variance = estimate_residual_delays(
             problem, delay, surface, problem.at(delay, surface).coefficients
         )
-        step, std = fit_weighted_slope(off, 1.0 / variance, time)
-        late = late + step * time
+        step, std = fit_weighted_slope(delay_changes, 1.0 / variance, time)
+        delays = delays + step * time
         if abs(step) * np.ptp(time) < DRIFT_TOLERANCE:
             break
     if not std * np.ptp(time) < MAX_FORCE_DELAY:
-        allowed = "touches whose forces are within their runs"
+        expected = "runs that contain the force of their contact"
         raise InputError(
-            f'timing.clock: found "separate" and forces that follow no touch, expected {allowed}'
+            f'timing.clock: found "separate" and forces that do not follow the motion, expected {expected}'
         )
-    rate = float(np.ptp(late) / np.ptp(time) * np.sign(np.dot(late - late.mean(), time)))
-    return ClockDrift(rate, std, late)
+    rate = float(np.ptp(delays) / np.ptp(time) * np.sign(np.dot(delays - delays.mean(), time)))
+    return ClockDrift(rate, std, delays)
 
 
 def _estimate_run_delays(
-    motion: MotionResponse, readings: ForceReadings, time: np.ndarray, touches: np.ndarray
+    motion: MotionResponse, readings: ForceReadings, time: np.ndarray, is_contact: np.ndarray
 ) -> np.ndarray:
-    """Return the delay that the clock adds to each run [s], from the mean time of its force."""
+    """Return the delay that the clock adds to each run [s], from the mean time of the force in the run."""
     level = np.median(readings.force[readings.counts])
     above = np.where(readings.counts, np.abs(readings.force - level), 0.0)
     weight = np.where(above > FORCE_DETECTION_SIGMAS * readings.std, above, 0.0) ** 2
     row = np.arange(len(weight))[:, None]
     middle = np.sum(row * weight, axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
     position, _ = motion.at(0.0)
-    off = motion.period * (middle - np.argmax(np.where(readings.counts, position, -np.inf), axis=0))
-    pairs = combinations(np.flatnonzero(touches & (weight.sum(axis=0) > 0.0)), 2)
-    rates = [(off[j] - off[i]) / (time[j] - time[i]) for i, j in pairs if time[j] != time[i]]
+    delay_changes = motion.period * (middle - np.argmax(np.where(readings.counts, position, -np.inf), axis=0))
+    pairs = combinations(np.flatnonzero(is_contact & (weight.sum(axis=0) > 0.0)), 2)
+    rates = [
+        (delay_changes[j] - delay_changes[i]) / (time[j] - time[i]) for i, j in pairs if time[j] != time[i]
+    ]
     rate = float(np.median(rates)) if rates else 0.0
-    return rate * time + float(np.median((off - rate * time)[touches])) - CENTRAL_DELAY
+    return rate * time + float(np.median((delay_changes - rate * time)[is_contact])) - CENTRAL_DELAY
 
 
 def estimate_residual_delays(
     problem: ContactProblem, delay: float, plane: float, coefficients: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the delay of each run's readings beyond these parameters [s], and its variance.
+    """Return each run's force delay in excess of `delay` [s], and the variance of this estimate [s^2].
 
-    Rows near an onset are not used, because the force of damped contact jumps there.
+    Readings near the onset of contact are not used, because the force of a damped contact jumps there.
+
+    Args:
+        problem: Readings, motion and contact law of the runs.
+        delay: Force delay that all runs share [s].
+        plane: Position of the surface [m].
+        coefficients: Coefficients of the contact law.
     """
     readings, sooner = problem.readings, max(delay - DELAY_DIFFERENCE_STEP, problem.min_delay)
     counts = readings.counts & ~flag_rows_near_edges(problem.motion, readings, (delay, plane, 0.0))
     after, before = (
         problem.force(shifted, plane, coefficients) for shifted in (delay + DELAY_DIFFERENCE_STEP, sooner)
     )
-    grows = problem.whiten(after - before) / (delay + DELAY_DIFFERENCE_STEP - sooner)
-    left = problem.whiten(readings.force - problem.force(delay, plane, coefficients))
-    grows, left = (np.where(counts, values, 0.0) / readings.std for values in (grows, left))
-    power = np.maximum(np.sum(grows**2, axis=0), 1e-300)
-    return np.sum(grows * left, axis=0) / power, 1.0 / power
+    sensitivity = problem.whiten(after - before) / (delay + DELAY_DIFFERENCE_STEP - sooner)
+    residual = problem.whiten(readings.force - problem.force(delay, plane, coefficients))
+    sensitivity, residual = (
+        np.where(counts, values, 0.0) / readings.std for values in (sensitivity, residual)
+    )
+    power = np.maximum(np.sum(sensitivity**2, axis=0), 1e-300)
+    return np.sum(sensitivity * residual, axis=0) / power, 1.0 / power
 
 
-def fit_weighted_slope(values: np.ndarray, weight: np.ndarray, place: np.ndarray) -> tuple[float, float]:
-    """Return the weighted slope and its standard error, inflated if the reduced chi-square exceeds 1."""
-    from_centre = place - np.average(place, weights=weight)
+def fit_weighted_slope(values: np.ndarray, weight: np.ndarray, position: np.ndarray) -> tuple[float, float]:
+    """Return the weighted least-squares slope of `values` over `position`, and its standard error.
+
+    The standard error is inflated if the reduced chi-square exceeds 1.
+    """
+    from_centre = position - np.average(position, weights=weight)
     spread = float(np.sum(weight * from_centre**2))
-    result = float(np.sum(weight * from_centre * values)) / spread
-    scatter = values - np.average(values, weights=weight) - result * from_centre
-    inflation = max(1.0, float(np.sum(weight * scatter**2)) / max(len(values) - 2, 1))
-    return result, float(np.sqrt(inflation / spread))
+    slope = float(np.sum(weight * from_centre * values)) / spread
+    residual = values - np.average(values, weights=weight) - slope * from_centre
+    inflation = max(1.0, float(np.sum(weight * residual**2)) / max(len(values) - 2, 1))
+    return slope, float(np.sqrt(inflation / spread))

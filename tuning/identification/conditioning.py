@@ -1,12 +1,12 @@
-"""Knowledge in addition to the logs: specified parameters and the normal marginals of a prior.
+"""Combination of the logs with further knowledge: fixed parameters and the normal marginals of a prior.
 
-The logs give draws with mean m and covariance C. The additional knowledge that H theta is normal with mean p
-and covariance P moves draw i by
+The logs give draws theta_i of the parameters, with the covariance C. Assume that H theta is also known to be
+normal with mean p and covariance P. This knowledge moves each draw theta_i by
 
     K (p_i - H theta_i),    K = C H^T (H C H^T + P)^-1,
 
-where p_i is a draw of the additional knowledge (Matheron's rule, a Kalman update of each draw). This is exact
-for normal draws; a specified parameter has P = 0.
+where p_i is drawn from the normal distribution of H theta (Matheron's rule, a Kalman update of each draw).
+The result is exact for normal draws. A fixed parameter has P = 0.
 """
 
 from __future__ import annotations
@@ -24,28 +24,32 @@ from tuning.identification import mechanism_models
 
 DrawsByKey = dict[str, np.ndarray]
 
-CONTRADICTION_SIGMAS = 4.0  # standard deviations between a specified value and the logs that cause a note
+CONTRADICTION_SIGMAS = 4.0  # standard deviations; a fixed value further from the logs causes a note
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 
 
-def split_lists(fixed: Mapping[str, Any], found: Sequence[str]) -> dict[str, float]:
-    """Return the specified parameters by key, with lists split into entries.
+def split_lists(fixed: Mapping[str, Any], keys: Sequence[str]) -> dict[str, float]:
+    """Return the fixed parameters with one key per list entry.
 
-    A scalar for a list applies to each of its entries.
+    A scalar value for a list applies to each entry of the list.
+
+    Args:
+        fixed: Fixed values by key; the value of a list may be a list or a scalar.
+        keys: Keys of the parameters that the logs determine.
 
     Raises:
-        InputError: If the logs do not determine a key, or a list has another length.
+        InputError: If the logs do not determine a fixed parameter, or a list has the wrong length.
     """
     values_by_key: dict[str, float] = {}
     for key, value in fixed.items():
-        entries = [name for name in found if name == key or name.startswith(f"{key}.")]
+        entries = [name for name in keys if name == key or name.startswith(f"{key}.")]
         values = _flatten(key, value)
         if isinstance(value, (int, float)):
             values = dict.fromkeys(entries, float(value))
-        unknown = [name for name in values if name not in found]
+        unknown = [name for name in values if name not in keys]
         if not values or unknown:
-            allowed = ", ".join(found) or "nothing: these logs tell no number"
-            raise InputError(f"fix: found {to_one_line((*unknown, key)[0], 60)}, expected {allowed}")
+            expected = ", ".join(keys) or "no key: these logs determine no parameter"
+            raise InputError(f"fix: found {to_one_line((*unknown, key)[0], 60)}, expected {expected}")
         values_by_key |= values
     return values_by_key
 
@@ -56,69 +60,76 @@ def _flatten(key: str, value: Any) -> dict[str, float]:
     return {key: float(value)}
 
 
-def condition_on_fixed(found: DrawsByKey, told: Mapping[str, float]) -> tuple[DrawsByKey, list[str]]:
-    """Condition the draws on specified parameters.
+def condition_on_fixed(draws: DrawsByKey, fixed: Mapping[str, float]) -> tuple[DrawsByKey, list[str]]:
+    """Condition posterior draws on fixed parameters.
 
     Returns:
-        The draws of the other parameters, and a note for each value that contradicts the logs.
+        The draws of the parameters that are not fixed, and a note for each fixed value that contradicts the
+        logs.
     """
-    if not told:
-        return found, []
-    keys, indices = list(found), [list(found).index(key) for key in told]
+    if not fixed:
+        return draws, []
+    keys, indices = list(draws), [list(draws).index(key) for key in fixed]
     notes = []
-    for key, value in told.items():
-        mean, std = found[key].mean(), found[key].std(ddof=1)
+    for key, value in fixed.items():
+        mean, std = draws[key].mean(), draws[key].std(ddof=1)
         if abs(value - mean) > CONTRADICTION_SIGMAS * std:
-            notes.append(f"{key}: {value:g} was told, the logs say {mean:.5g} +- {std:.2g}")
-    values = np.broadcast_to(np.array(list(told.values())), (len(next(iter(found.values()))), len(told)))
-    moved = _update_draws(np.array(list(found.values())), np.eye(len(keys))[indices], values.T, exact=True)
-    return {key: row for key, row in zip(keys, moved, strict=True) if key not in told}, notes
+            notes.append(f"{key}: fixed at {value:g}, but the logs give {mean:.5g} +- {std:.2g}")
+    values = np.broadcast_to(np.array(list(fixed.values())), (len(next(iter(draws.values()))), len(fixed)))
+    moved = _update_draws(np.array(list(draws.values())), np.eye(len(keys))[indices], values.T, exact=True)
+    return {key: row for key, row in zip(keys, moved, strict=True) if key not in fixed}, notes
 
 
-def condition_on_prior(found: DrawsByKey, prior: Mechanism, frequency: float, seed: int = 0) -> DrawsByKey:
-    """Combine the draws with the prior's normal marginals and their correlation.
+def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, seed: int = 0) -> DrawsByKey:
+    """Combine posterior draws with the normal marginals of a prior and their correlation.
 
-    The result includes parameters of the simulator and of the prior's correlation that the logs do not
-    determine.
+    The result also contains parameters that only the prior determines: those of the simulator, and those in
+        the
+    prior's `[correlation]`.
 
     Args:
-        found: Draws from the logs, by key.
+        draws: Draws from the logs, by key.
         prior: Mechanism with `[uncertainty]`.
-        frequency: Contact frequency [Hz]; an error of the simulator's lag there changes the force delay.
+        frequency: Contact frequency [Hz]. An error of the simulator's phase delay at this frequency changes
+            the
+            estimated force delay.
         seed: Seed of the random numbers.
 
     Raises:
-        InputError: If no parameter of the logs has a normal marginal.
+        InputError: If the prior has a normal marginal for none of the parameters that the logs determine.
     """
-    marginals = _draw_normal_marginals(prior, len(next(iter(found.values()), ())), seed)
-    common = [key for key in marginals if key in found]
+    marginals = _draw_normal_marginals(prior, len(next(iter(draws.values()), ())), seed)
+    common = [key for key in marginals if key in draws]
     if not common:
-        allowed = f"a normal one of {', '.join(found) or 'what logs tell'}"
-        raise InputError(f"prior: [uncertainty]: found no entry of what the logs tell, expected {allowed}")
+        expected = ", ".join(draws) or "logs that determine a parameter"
+        raise InputError(
+            "prior: [uncertainty]: found no normal entry for a parameter that the logs determine, expected "
+            f"one of {expected}"
+        )
     linked = () if prior.correlation is None else prior.correlation.keys
     prior_only = [
         key
         for key in marginals
-        if key not in found and (key.startswith(SIMULATOR_PREFIX) or key.rstrip("0123456789.") in linked)
+        if key not in draws and (key.startswith(SIMULATOR_PREFIX) or key.rstrip("0123456789.") in linked)
     ]
-    extended = {**found, **{key: marginals[key] for key in prior_only}}
-    if FORCE_DELAY_KEY in found:
+    extended = {**draws, **{key: marginals[key] for key in prior_only}}
+    if FORCE_DELAY_KEY in draws:
         lag = _differentiate_lag(
             prior, [key for key in prior_only if key.startswith(SIMULATOR_PREFIX)], frequency
         )
         lag_changes = [slope * (marginals[key] - marginals[key].mean()) for key, slope in lag.items()]
-        extended[FORCE_DELAY_KEY] = found[FORCE_DELAY_KEY] - sum(lag_changes, np.zeros(1))
+        extended[FORCE_DELAY_KEY] = draws[FORCE_DELAY_KEY] - sum(lag_changes, np.zeros(1))
     keys = list(extended)
     select = np.zeros((len(common), len(keys)))
     select[np.arange(len(common)), [keys.index(key) for key in common]] = 1.0
     values = np.array([marginals[key] for key in common])
     if prior_only:
-        # Condition the marginals on the parameters that only the prior has.
-        beside = np.array([marginals[key] for key in prior_only])
-        covariance, split = np.cov(values, beside), len(common)
+        # Condition the marginals on the parameters that only the prior determines.
+        prior_values = np.array([marginals[key] for key in prior_only])
+        covariance, split = np.cov(values, prior_values), len(common)
         follow = covariance[:split, split:] @ _invert_scaled(covariance[split:, split:])
         select[:, [keys.index(key) for key in prior_only]] = -follow
-        values = values - follow @ beside
+        values = values - follow @ prior_values
     moved = _update_draws(np.array(list(extended.values())), select, values)
     result = dict(zip(keys, moved, strict=True))
     return {k: np.maximum(v, 0.0) if k.startswith("contact.damping") else v for k, v in result.items()}
@@ -127,7 +138,14 @@ def condition_on_prior(found: DrawsByKey, prior: Mechanism, frequency: float, se
 def _update_draws(
     draws: np.ndarray, select: np.ndarray, values: np.ndarray, exact: bool = False
 ) -> np.ndarray:
-    """Return draws (keys, draws), updated by `values` (rows, draws) of `select` times the draws."""
+    """Return the draws after the update with further knowledge (see the module's text).
+
+    Args:
+        draws: Draws theta_i, shape (parameters, draws).
+        select: Matrix H, shape (rows, parameters).
+        values: Draws p_i, shape (rows, draws).
+        exact: Whether P is 0; otherwise P is the covariance of `values`.
+    """
     covariance = np.atleast_2d(np.cov(draws))
     across = covariance @ select.T
     spread = np.zeros((len(select), len(select))) if exact else np.atleast_2d(np.cov(values))
@@ -135,7 +153,7 @@ def _update_draws(
 
 
 def _invert_scaled(covariance: np.ndarray) -> np.ndarray:
-    """Return the pseudoinverse of a covariance of possibly dependent parameters in different units."""
+    """Return the pseudoinverse of a covariance matrix whose parameters have different units."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     return np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(
         scale, scale
@@ -143,7 +161,7 @@ def _invert_scaled(covariance: np.ndarray) -> np.ndarray:
 
 
 def _draw_normal_marginals(prior: Mechanism, number: int, seed: int) -> DrawsByKey:
-    """Return draws of the prior's parameters with a normal marginal, with lists split into entries."""
+    """Draw the prior's parameters that have a normal marginal, with one key per list entry."""
     normal = {key for key, entry in prior.uncertainty.items() if entry.distribution == "normal"}
     result: DrawsByKey = {}
     for key, values in draw(prior, number, seed).items():
@@ -154,7 +172,10 @@ def _draw_normal_marginals(prior: Mechanism, number: int, seed: int) -> DrawsByK
 
 
 def _differentiate_lag(prior: Mechanism, keys: Sequence[str], frequency: float) -> dict[str, float]:
-    """Return the motion lag's derivative at a frequency [Hz] by each simulator parameter [s per unit]."""
+    """Return the derivatives of the motion's phase delay [s] with respect to the simulator parameters.
+
+    The phase delay is evaluated at `frequency` [Hz].
+    """
     simulator = prior.rig.simulator
     s = np.array([2j * np.pi * frequency])
 

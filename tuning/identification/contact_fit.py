@@ -1,9 +1,10 @@
-"""Estimation of the contact from runs in contact: law, coefficients, surface position and force delay.
+"""Fit of the contact to runs in contact: contact law, its coefficients, surface position and force delay.
 
-A dead zone hides small forces, so only rows with a predicted force well beyond it are used; the force that
-these readings lack is the dead zone. A dead zone and a shift of the surface reduce the force in the same way.
-The surface must therefore be specified (else it is taken as 0) unless the dead zone is specified or noise at
-rest reaches beyond it.
+A dead zone of the force sensor hides small forces. Therefore only readings are used whose predicted force is
+well above the dead zone; the difference between predicted and measured force is the dead zone. A surface that
+is further away reduces the force like a dead zone. The fit can distinguish the two only if the dead zone is
+known: specified, or estimated from noise at rest that exceeds it. Otherwise the surface must be specified, or
+it is assumed at 0.
 """
 
 from __future__ import annotations
@@ -35,25 +36,23 @@ from tuning.identification.sensor_lag import (
 
 SETTLING_TIME = 0.5  # s, settling time of a motion simulator
 SEGMENT_LENGTH = 1.0  # s, length of the segments of a long run
-MEMORY_TIME_CONSTANTS = 10.0  # time constants after which earlier commands have no effect
-SPEED_ROWS, MAX_SPEED_CHANGE = (
-    5,
-    0.01,
-)  # rows between speeds, and their largest relative change in uniform motion
+MEMORY_TIME_CONSTANTS = 10.0  # time constants of the motion simulator; older commands have no effect
+SPEED_ROWS = 5  # rows between two positions that give a speed
+MAX_SPEED_CHANGE = 0.01  # largest relative change of the speed in uniform motion
 SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dead zone
-UNKNOWN_SURFACE_STD = 5e-5  # m; standard deviation of a surface position that nothing specifies, about 0
-DEAD_ZONE_MARGIN = 4.0  # standard deviations beyond the dead zone, above which a reading is used
-COARSE_GRID_SIZE = 21, 5  # delays and planes of a coarse grid, for fits that only serve comparisons
-ASSUMED_NOISE_SHARE = 0.01  # noise over the largest force, if it is unknown
-MIN_NOISE_SHARE = 1e-6  # least noise over the largest force, for simulated logs with rounding errors alone
-MIN_DEAD_ZONE_SIGMAS = 3.0  # standard deviations above 0 that show a dead zone
-MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
+UNKNOWN_SURFACE_STD = 5e-5  # m; standard deviation of a surface position that is assumed to be 0
+DEAD_ZONE_MARGIN = 4.0  # standard deviations above the dead zone; readings of smaller forces are not used
+COARSE_GRID_SIZE = 21, 5  # numbers of delays and surface positions in the grid of bootstrap and test fits
+ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force
+MIN_NOISE_SHARE = 1e-6  # minimum noise relative to the largest force; simulated logs may have none
+MIN_DEAD_ZONE_SIGMAS = 3.0  # standard deviations; a dead zone this far above 0 is significant
+MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom; above it, the intervals are widened
 
 
 def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
-    """Divide a long run into segments of one second, so that all lanes have a similar length.
+    """Divide a long run into segments of about one second, so that all runs have a similar length.
 
-    Each segment starts earlier with rows that are not used, during which the motion simulator settles.
+    Each segment begins with additional rows in which the motion simulator settles; fits do not use them.
     """
     settling, length = round(SETTLING_TIME / period), round(SEGMENT_LENGTH / period)
     if len(run.tick) <= settling + 2 * length:
@@ -63,18 +62,19 @@ def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
         part = slice(begin - settling, min(begin + length, len(run.tick)))
         names = ("tick", "position_desired", "position_measured", "force_measured", "velocity_desired",
                  "force_command", "contact_index", "force_late")  # fmt: skip
-        cut = {name: None if getattr(run, name) is None else getattr(run, name)[part] for name in names}
+        arrays = {name: None if getattr(run, name) is None else getattr(run, name)[part] for name in names}
         valid = run.valid[part].copy()
         valid[:settling] = False
-        segments.append(replace(run, valid=valid, **cut))
+        segments.append(replace(run, valid=valid, **arrays))
     return segments
 
 
 def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, period: float) -> list[LoggedRun]:
-    """Mark the first rows of runs after a gap in mid-contact as unused, because their past commands are lost.
+    """Mark the rows after a gap in the log as not valid if lost commands affect their motion.
 
-    The lost commands affect the motion for ten of its time constants plus all delays. A run that begins in
-    uniform motion is taken to have moved uniformly before, so all its rows are used.
+    The lost commands affect the motion for ten time constants of the motion simulator plus all delays. If a
+    run begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows
+    remain valid.
     """
     slowest = max((-1.0 / pole.real for pole in np.roots(model.fraction[1])), default=0.0)
     settling = int(
@@ -91,25 +91,26 @@ def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, perio
 
 
 def _is_uniform_motion(position: np.ndarray) -> bool:
-    """Return whether the first rows move without acceleration."""
+    """Return whether the speed is constant in the first rows."""
     first, second = np.diff(position[: 2 * SPEED_ROWS + 1 : SPEED_ROWS])
     return bool(abs(second - first) <= MAX_SPEED_CHANGE * abs(first))
 
 
 @dataclass(frozen=True)
 class ContactFit:
-    """Contact fitted to runs in contact, with the motion given."""
+    """Contact law fitted to runs in contact, with the posterior of its parameters."""
 
     law: Law
-    judged: tuple[EvaluatedLaw, ...]  # all laws tried, the chosen one first; empty if the law was specified
+    # all fitted laws, the chosen law first; empty if the law was specified
+    evaluated: tuple[EvaluatedLaw, ...]
     problem: ContactProblem
     posterior: Posterior
-    freedom: int  # degrees of freedom: readings minus parameters
+    freedom: int  # degrees of freedom: number of readings minus number of parameters
     noise_error: float  # relative standard error of the noise level that weights the residuals
-    dead_zone: bool  # whether the sensor has a dead zone, which then lowers "bias"
-    drift: ClockDrift | None = None  # drift of a separate force clock; the delay then includes a constant
-    has_specified_surface: bool = False  # whether the surface was an option, neither fitted nor assumed
-    resampled: str = ""  # summary of the bootstrap in words, if there was one
+    dead_zone: bool  # whether the sensor has a dead zone; the parameter "bias" is then minus the dead zone
+    drift: ClockDrift | None = None  # drift of a separate force clock; the delay then includes its offset
+    has_specified_surface: bool = False  # whether the user specified the surface position
+    resampled: str = ""  # summary of the bootstrap in words; empty without a bootstrap
 
     @property
     def readings(self) -> ForceReadings:
@@ -121,7 +122,7 @@ class ContactFit:
         return self.posterior.best[2].misfit / self.freedom
 
     def draws(self) -> np.ndarray:
-        """Return draws of the posterior, wider if the law leaves more than noise, (draws, names)."""
+        """Return the posterior draws, shape (draws, parameters), widened if chi-squared exceeds the noise."""
         values = self.posterior.draws
         if self.left <= MAX_REDUCED_CHI_SQUARE or self.resampled:
             return values
@@ -138,45 +139,48 @@ def fit_contact(
     seed: int = 0,
     dead_zone: float = 0.0,
 ) -> ContactFit:
-    """Fit the contact to all runs in contact together.
+    """Fit a contact law, the surface position and the force delay to all runs in contact together.
 
     Args:
         runs: Runs in contact.
-        model: Motion simulator.
+        model: Model of the motion simulator.
         timing: Timing of commands and readings.
-        noise: Noise of the force sensor at rest, if it is known.
-        law: A law; the name of a law whose shape is searched; or None to choose among all laws.
-        plane: Position of the surface [m], if it is specified.
+        noise: Noise of the force sensor at rest, or None if it is unknown.
+        law: Contact law, the name of a law whose shape is fitted too, or None to choose among all laws.
+        plane: Position of the surface [m], or None to estimate it.
         seed: Seed of the random numbers.
-        dead_zone: Specified dead zone [N], used if readings at rest show one.
+        dead_zone: Specified dead zone [N], or 0. It is used only if readings at rest show a dead zone.
     """
-    apart = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
+    drift = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
     motion = MotionResponse(
-        model, runs, timing, MAX_FORCE_DELAY + timing.control_period, apart and apart.late
+        model, runs, timing, MAX_FORCE_DELAY + timing.control_period, drift and drift.delays
     )
     plane_option = plane
     readings, plane = _prepare_readings(runs, motion, noise, plane, dead_zone)
-    hidden = noise is not None and noise.silent
-    judged: tuple[EvaluatedLaw, ...] = ()
+    noise_is_hidden = noise is not None and noise.silent
+    evaluated: tuple[EvaluatedLaw, ...] = ()
     near = None
     if law is None or isinstance(law, str):
-        judged = tuple(choose_contact_law(motion, readings, plane, None if law is None else (law,)))
-        law, near = judged[0].law, (judged[0].delay, judged[0].plane)
-    laws = (law, kelvin_voigt()) if judged and law.pulls else (law,)
-    problem, posterior = _fit_laws(motion, readings, laws, plane, near, hidden, seed)
+        evaluated = tuple(choose_contact_law(motion, readings, plane, None if law is None else (law,)))
+        law, near = evaluated[0].law, (evaluated[0].delay, evaluated[0].plane)
+    laws = (law, kelvin_voigt()) if evaluated and law.pulls else (law,)
+    problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
     law = problem.law
-    if hidden and not _has_dead_zone(posterior):
-        # Zeros at rest without a dead zone are not readings of a noisy sensor: estimate the noise.
+    if noise_is_hidden and not _has_dead_zone(posterior):
+        # Without a dead zone, readings of 0 at rest do not show the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed)
-    if hidden and readings.bias is None and plane_option is None:
-        # What the edges of contact tell of delay and damping holds for the surface that is assumed.
+    if noise_is_hidden and readings.bias is None and plane_option is None:
+        # The surface is only assumed, so readings near onset and release must not determine delay and
+        # damping.
         readings = _drop_readings_near_edges(problem, posterior)
-        problem, posterior = _fit_laws(motion, readings, (law,), plane, None, hidden, seed)
+        problem, posterior = _fit_laws(motion, readings, (law,), plane, None, noise_is_hidden, seed)
         posterior = _add_surface_uncertainty(posterior, seed)
     freedom = len(problem.kept) - len(posterior.names)
-    error = 0.0 if noise is None or hidden else noise.std_std / max(noise.std, 1e-300)
+    error = 0.0 if noise is None or noise_is_hidden else noise.std_std / max(noise.std, 1e-300)
     is_specified = plane_option is not None
-    return ContactFit(law, judged, problem, posterior, freedom, error, bool(hidden), apart, is_specified)
+    return ContactFit(
+        law, evaluated, problem, posterior, freedom, error, bool(noise_is_hidden), drift, is_specified
+    )
 
 
 def _prepare_readings(
@@ -186,19 +190,26 @@ def _prepare_readings(
     plane: float | None,
     dead_zone: float,
 ) -> tuple[ForceReadings, float | None]:
-    """Return the readings with noise level and prior bias, and the surface [m], or None if it is fitted."""
-    prior, hidden = None, noise is not None and noise.silent
-    if noise is not None and hidden:
+    """Return the readings with their noise and the prior of the bias, and the surface position for the fit.
+
+    The surface position [m] is None if it is to be estimated.
+    """
+    prior, noise_is_hidden = None, noise is not None and noise.silent
+    if noise is not None and noise_is_hidden:
         prior = (dead_zone, SPECIFIED_DEAD_ZONE_STD * dead_zone) if dead_zone else noise.dead_zone
-    if noise is None or hidden:
-        readings = ForceReadings.of(runs, 1.0, threshold=1.0 if hidden else 0.0)
-        usual = 0.0 if hidden and plane is None else plane
+    if noise is None or noise_is_hidden:
+        readings = ForceReadings.of(runs, 1.0, threshold=1.0 if noise_is_hidden else 0.0)
+        usual = 0.0 if noise_is_hidden and plane is None else plane
         readings = _estimate_noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)
         plane = plane if prior else usual
     else:
         readings = _make_readings(runs, noise)
-    # With a dead zone the bias only stands for the force that it removes.
-    bias = find_bias_prior(runs, motion, noise, plane) if not hidden else prior and (-prior[0], prior[1])
+    # With a dead zone, the parameter "bias" represents the force that the dead zone removes.
+    bias = (
+        find_bias_prior(runs, motion, noise, plane)
+        if not noise_is_hidden
+        else prior and (-prior[0], prior[1])
+    )
     return replace(readings, bias=bias), plane
 
 
@@ -208,18 +219,31 @@ def _fit_laws(
     laws: Sequence[Law],
     plane: float | None,
     near: tuple[float, float] | None,
-    hidden: bool,
+    noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior]:
-    """Return the fit of the likeliest of the laws, averaged over a sensor lag and contact without damping."""
-    # A sensor lag that a law does not model looks like a contact that pulls: two laws are compared.
-    fits = [(_fit_law(motion, readings, law, plane, near, hidden, seed), law) for law in laws]
+    """Fit the law with the largest evidence; average its posterior over models with and without damping.
+
+    Args:
+        motion: Motion of the mechanism in all runs.
+        readings: Force readings.
+        laws: Candidate laws.
+        plane: Position of the surface [m], or None to estimate it.
+        near: Approximate delay [s] and surface position [m], or None.
+        noise_is_hidden: Whether a dead zone hides the noise at rest.
+        seed: Seed of the random numbers.
+
+    Returns:
+        The contact problem of the chosen law and the posterior.
+    """
+    # A sensor lag that is not modelled looks like a contact that pulls, so each law is fitted with a lag.
+    fits = [(_fit_law(motion, readings, law, plane, near, noise_is_hidden, seed), law) for law in laws]
     (problem, posterior, lag, evidence), law = max(reversed(fits), key=lambda fit: fit[0][3])
     if lag is not None:
         problem, posterior = problem.changed(law, lag.value), lag.posterior
 
     def without_damping(law: Law) -> tuple[Posterior, float]:
-        _, alone, lagging, evidence = _fit_law(motion, readings, law, plane, near, hidden, seed)
+        _, alone, lagging, evidence = _fit_law(motion, readings, law, plane, near, noise_is_hidden, seed)
         return alone if lagging is None else lagging.posterior, evidence
 
     posterior = damping_average.average_over_damping(problem, posterior, evidence, without_damping)
@@ -227,7 +251,7 @@ def _fit_laws(
 
 
 def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> ForceReadings:
-    """Return the readings that are in contact wherever the surface is, to two standard deviations."""
+    """Exclude readings that are out of contact for a surface position within two standard deviations."""
     position, _ = problem.motion.at(posterior.best[0])
     readings = problem.readings
     return replace(
@@ -236,18 +260,18 @@ def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> 
 
 
 def _add_surface_uncertainty(posterior: Posterior, seed: int) -> Posterior:
-    """Return the posterior with the uncertainty of a surface that nothing specifies, and of the dead zone.
+    """Add the uncertainty of an assumed surface position to the posterior.
 
-    A spring that begins later lacks as much force as a dead zone removes.
+    A shift of the surface and a change of the dead zone compensate for each other: both change the force by a
+    constant.
     """
     names, draws = posterior.names, posterior.draws.copy()
-    slope = draws[
-        :, names.index("plane") + 1
-    ]  # the first coefficient of every law is its slope at the surface
-    lacking = -draws[:, names.index("bias")]
+    # The first coefficient of every law is its stiffness at the surface.
+    slope = draws[:, names.index("plane") + 1]
+    missing_force = -draws[:, names.index("bias")]
     surface = UNKNOWN_SURFACE_STD * np.random.default_rng(seed).standard_normal(len(draws))
-    # The dead zone is not below 0.
-    surface = np.maximum(surface, -lacking / slope)
+    # The dead zone must not become negative.
+    surface = np.maximum(surface, -missing_force / slope)
     draws[:, names.index("plane")] += surface
     draws[:, names.index("bias")] -= slope * surface
     return replace(posterior, draws=draws)
@@ -259,13 +283,13 @@ def _fit_law(
     law: Law,
     plane: float | None,
     near: tuple[float, float] | None,
-    hidden: bool,
+    noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
     """Fit one law, with a sensor lag unless a dead zone hides the onset; return the log evidence last."""
     problem = summarized(ContactProblem(motion, readings, law, plane), near)
     posterior = compute_posterior(problem, seed, near)
-    lag = None if hidden else estimate_sensor_lag(problem, posterior, seed)
+    lag = None if noise_is_hidden else estimate_sensor_lag(problem, posterior, seed)
     return (
         problem,
         posterior,
@@ -288,7 +312,7 @@ def _estimate_clock_drift(
     law: Law | str | None,
     plane,
 ) -> ClockDrift:
-    """Return the drift of the force clock; if the noise is unknown, it is a share of the largest force."""
+    """Estimate the drift of the force clock; unknown noise is assumed as a share of the largest force."""
     if noise is None or noise.silent:
         readings = ForceReadings.of(runs, 1.0)
         readings = replace(readings, std=ASSUMED_NOISE_SHARE * float(np.abs(readings.force).max()))
@@ -298,17 +322,26 @@ def _estimate_clock_drift(
 
 
 def _has_dead_zone(posterior: Posterior) -> bool:
-    """Return whether the readings lack so much force that there is a dead zone."""
-    lacking = -posterior.draws[:, posterior.names.index("bias")]
-    return bool(lacking.mean() > MIN_DEAD_ZONE_SIGMAS * lacking.std())
+    """Return whether the measured force is significantly smaller than predicted, as with a dead zone."""
+    missing_force = -posterior.draws[:, posterior.names.index("bias")]
+    return bool(missing_force.mean() > MIN_DEAD_ZONE_SIGMAS * missing_force.std())
 
 
 def _estimate_noise_from_contact(
     motion: MotionResponse, readings: ForceReadings, plane: float | None, at_rest: float
 ) -> ForceReadings:
-    """Estimate the noise from the residuals of a fit; with a dead zone, from the readings well beyond it.
+    """Estimate the noise of the force readings from the residuals of a Kelvin-Voigt fit.
 
-    `at_rest` is the noise that reaches beyond the dead zone at rest [N], or 0.
+    With a dead zone, only readings of forces well above the dead zone are used.
+
+    Args:
+        motion: Motion of the mechanism in all runs.
+        readings: Force readings.
+        plane: Position of the surface [m], or None to estimate it.
+        at_rest: Noise at rest [N] if it exceeds the dead zone, or 0.
+
+    Returns:
+        The readings with their noise level and flags of the readings that fits use.
     """
     counts = readings.counts
     if readings.threshold:
@@ -333,26 +366,31 @@ def _estimate_noise_from_contact(
 
 
 def estimate_contact_frequency(contact: ContactFit, mass: float) -> float:
-    """Return the frequency [Hz] of the mass on the stiffest contact, by the secant at the greatest depth."""
-    delay, plane, inner = contact.posterior.best
+    """Return the contact frequency [Hz] of the stiffest contact, from the secant stiffness at full depth."""
+    delay, plane, coefficient_fit = contact.posterior.best
     position, _ = contact.problem.motion.at(delay)
     depth = np.where(contact.readings.counts, position - plane, 0.0)
-    force = np.where(contact.readings.counts, contact.problem.force(delay, plane, inner.coefficients), 0.0)
+    force = np.where(
+        contact.readings.counts, contact.problem.force(delay, plane, coefficient_fit.coefficients), 0.0
+    )
     deepest, lanes = np.argmax(depth, axis=0), np.arange(depth.shape[1])
     peak = force[deepest, lanes]
-    # The secant of a very light contact is mostly noise.
+    # In a contact with a very small force, noise dominates the secant stiffness.
     secant = np.where(peak > 0.2 * peak.max(), peak / np.maximum(depth[deepest, lanes], 1e-9), 0.0)
     return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
 
 
 def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float) -> float:
-    """Return the delay of the force's phase behind the command at a frequency [Hz], in s."""
+    """Return the phase delay from the command to the force reading at a frequency [Hz], in s."""
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
 
 
-def refit_without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFit:
-    """Fit the same law to the contacts outside `held`; the result keeps the readings of all contacts."""
+def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> ContactFit:
+    """Fit the same law again without the contacts that `held_out` flags.
+
+    The result keeps the readings of all contacts, so that it can be evaluated on the omitted contacts.
+    """
     readings, problem = fit.readings, fit.problem
     taught = replace(readings, counts=readings.counts & ~held)
     taught = ContactProblem(problem.motion, taught, fit.law, problem.plane, problem.time_constant)
@@ -363,5 +401,5 @@ def refit_without(fit: ContactFit, held: np.ndarray, seed: int = 0) -> ContactFi
         best = search_coarsely(taught, (delay, plane, inner.misfit), 2)
         posterior = compute_posterior_at_lag(taught, best, fit.posterior, seed)
     else:
-        posterior = compute_posterior(taught, seed, (delay, plane), COARSE_GRID_SIZE)
+        posterior = compute_posterior(training, seed, (delay, plane), COARSE_GRID_SIZE)
     return replace(fit, posterior=posterior, freedom=freedom)

@@ -1,4 +1,4 @@
-"""Contact laws in fits to logs (`jaxhil.contact.regression`), and the initial law of the fits."""
+"""Contact laws as linear regressions (`jaxhil.contact.regression`), and the law for first fits."""
 
 from jaxhil.contact.regression import Regression as Law
 
@@ -6,5 +6,5 @@ __all__ = ["Law", "kelvin_voigt"]
 
 
 def kelvin_voigt() -> Law:
-    """Return the law F = k d + b d' >= 0."""
+    """Return the Kelvin-Voigt law F = k d + b d' >= 0."""
     return Law("kelvin_voigt", lambda d, v: [d], ("stiffness", "damping"), lambda d, v: [v])

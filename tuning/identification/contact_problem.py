@@ -1,7 +1,7 @@
-"""Linear fit of a contact law at one delay and surface position, with known motion.
+"""Linear least-squares fit of a contact law at a given force delay and surface position.
 
-The commands determine the position of the mechanism (`motion`). For a given force delay and surface, the law
-is linear in its coefficients: stiffness, damping and the sensor's bias.
+The logged commands determine the motion of the mechanism (`motion`). For a given force delay and surface
+position, the predicted force is linear in the coefficients: stiffness, damping and the bias of the sensor.
 """
 
 from __future__ import annotations
@@ -35,30 +35,32 @@ FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's res
 
 
 class _NearbyRows(NamedTuple):
-    """Rows that may be in contact for any of several planes, with the law's functions there."""
+    """Rows that are in contact for at least one of several surface positions ("planes")."""
 
-    rows: np.ndarray  # (rows,)
+    rows: np.ndarray  # (rows,), indices of the rows
     depth: np.ndarray  # m, (planes, rows); 0 out of contact
-    rate: np.ndarray  # m/s, (rows,)
-    columns: np.ndarray  # (planes, coefficients, rows), one per coefficient but the bias
+    rate: np.ndarray  # m/s, (rows,), rate of the depth
+    # (planes, coefficients, rows), the law's function for each coefficient except the bias
+    columns: np.ndarray
 
 
 class _Onsets(NamedTuple):
-    """Onsets of contact within a period, for the integration by a sensor's lag."""
+    """Onsets of contact within control periods, which a sensor's lag has to integrate exactly."""
 
-    plane: np.ndarray  # (onsets,), index of the plane
-    row: np.ndarray  # (onsets,), index among the rows near contact
+    plane: np.ndarray  # (onsets,), index of the surface position
+    row: np.ndarray  # (onsets,), index into `_NearbyRows.rows` of the row after the onset
     columns: np.ndarray  # (coefficients, onsets), the law's functions just after the onset
-    after: np.ndarray  # (onsets,), weight of the force just after the onset
+    after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
     end: np.ndarray  # (onsets,), weight of the force at the end of the period
 
 
 class ContactProblem:
-    """Linear least-squares problem of a law, with the motion given; `plane` [m] is None if it is fitted.
+    """Least-squares problem of a contact law for known motion of the mechanism.
 
-    Rows out of contact only depend on the bias, so three sums represent all of them, and the law's functions
-    are computed only near contact. With a lag of the sensor [s] or coloured noise, every function is filtered
-    along the rows like the force, until the filter's response is over.
+    The surface position `plane` [m] is None if it is estimated. Readings out of contact depend only on the
+    bias. Therefore three sums represent all these readings, and the law's functions are computed only near
+    contact. If the sensor has a lag (`time_constant` [s]) or the noise is coloured, the functions are
+    filtered like the readings.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class ContactProblem:
     ):
         self.motion, self.readings, self.law, self.plane = motion, readings, law, plane
         self.time_constant = time_constant
-        # The delay is relative to the position sensor's, so it may be negative.
+        # The force delay is relative to the delay of the position sensor, so it may be negative.
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
         self.plain = len(readings.whitening) == 1 and time_constant == 0.0
         self.kept = np.flatnonzero(readings.counts)
@@ -82,15 +84,16 @@ class ContactProblem:
         self.where = self.kept if self.plain else np.arange(readings.counts.size)
         self.target = self.whiten(readings.force).ravel()[self.kept] / readings.std
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
-        # A dead zone lowers the readings in contact alone; a bias shifts every reading.
+        # A dead zone changes only the readings in contact; a bias changes all readings.
         self.local = bool(readings.threshold)
-        # Whitened reading out of contact for a bias of 1 N.
+        # Whitened and normalized reading out of contact for a bias of 1 N.
         self.bias_alone = 0.0 if self.local else float(np.sum(readings.whitening)) / readings.std
         self.sums = sums(self.target)
         self.memory = len(readings.whitening) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
         )
-        # Times before the row, in periods, at which the force is computed: a lag integrates it.
+        # Times at which the force is computed, in periods before a row; a lag integrates the force between
+        # rows.
         self.before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
         self._at: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
         self._guess: np.ndarray | None = None
@@ -113,7 +116,7 @@ class ContactProblem:
     def at(self, delay: float, plane: float, pseudo: Pseudo | None = None) -> Inner:
         """Fit the coefficients at one delay [s] and plane [m], to the readings and to pseudo-rows.
 
-        Rows at which the law would pull are treated as out of contact.
+        Rows in which the force of the law would be negative are treated as out of contact.
         """
         near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)
@@ -135,7 +138,8 @@ class ContactProblem:
     def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None):
         """Fit at each plane, with the rows in contact updated until they agree with the fit.
 
-        Returns the rows near contact, the flags of rows in contact, and the linear fit.
+        Returns:
+            The rows near contact, flags of the rows in contact, and the fit for each surface position.
         """
         moved = self._motion_at(delay)
         near = [self._near(*motion, self.where, planes) for motion in moved]
@@ -161,7 +165,7 @@ class ContactProblem:
         return [Inner(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)]
 
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position and rate at the rows of `where`, for each time in `before`."""
+        """Return position [m] and rate [m/s] in the rows `where`, for each time in `before`."""
         if self._at is None or self._at[0] != delay:
             moved = self.motion_at(delay)
             self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
@@ -172,7 +176,7 @@ class ContactProblem:
         return [self.motion.at(delay + part * self.motion.period) for part in self.before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
-        """Return the sorted planes between `low` and `high` at which a row enters the contact."""
+        """Return the surface positions [m] from `low` to `high` at which another row enters the contact."""
         position, rate = self._motion_at(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
@@ -184,7 +188,7 @@ class ContactProblem:
         return _NearbyRows(rows, depth, rate, self._columns(depth, rate, where[rows]))
 
     def _columns(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the law's functions at rows of the readings, (planes, coefficients, rows)."""
+        """Return the law's functions in the given rows, shape (planes, coefficients, rows)."""
         own_columns, entries = self.law.entry_functions(depth, rate), self.readings.entries
         if len(entries) > 1:
             entry = self.readings.entry.ravel()[rows]
@@ -196,7 +200,7 @@ class ContactProblem:
         return columns
 
     def _touching(self, near: _NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
-        """Return the rows in contact, without those at which the law with these coefficients would pull."""
+        """Return flags of the rows in contact, except rows in which the force of the law is negative."""
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
@@ -206,7 +210,10 @@ class ContactProblem:
         return np.where(sound[:, None], pushing, inside)
 
     def _onsets(self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray) -> _Onsets | None:
-        """Return the onsets, from the positions at all rows and half a period earlier; None without a lag."""
+        """Return the onsets of contact within control periods, or None without a lag of the sensor.
+
+        `positions` [m] are those at all rows and half a period earlier.
+        """
         if self.time_constant == 0.0:
             return None
         now, half = positions
@@ -225,8 +232,12 @@ class ContactProblem:
     def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: Packed, whitening):
         """Return columns as the sensor with its lag reads them, whitened, at packed rows.
 
-        `tables` holds the columns for each time in `before`; `first` those just after the onsets, (columns,
-        onsets).
+        Args:
+            near: Rows near contact, for each time in `before`.
+            tables: Values of the functions in these rows, for each time in `before`.
+            onsets: Onsets of contact, or None without a lag.
+            first: Values of the functions just after the onsets, shape (functions, onsets), or None.
+            window: Range of rows.
         """
         full, places = [], [where.places(part.rows) for part in near]
         for columns, place in zip(tables, places, strict=True):
@@ -271,7 +282,8 @@ class ContactProblem:
         """Return the design near contact, (planes, coefficients, rows), and the readings, over the noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
-            # The last column is the bias: with a dead zone only in the rows in contact, else in all rows.
+            # The last column is that of the bias: 1 in rows in contact if there is a dead zone, else in all
+            # rows.
             table = np.empty((len(flag), rows_near.columns.shape[1] + 1, len(rows_near.rows)))
             np.multiply(rows_near.columns, flag[:, None] / std, out=table[:, :-1])
             table[:, -1] = flag / std if self.local else 1.0 / std
@@ -345,7 +357,7 @@ class ContactProblem:
         return self._filtered(near, tables, onsets, first, where, whitening)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
-        """Return whether each row is in contact according to the model, (rows, lanes)."""
+        """Return flags of the rows that are in contact according to the model, shape (rows, lanes)."""
         position, rate = self.motion.at(delay)
         moved = [(position.ravel(), rate.ravel())]
         (near,), (flag,), _ = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
@@ -354,9 +366,12 @@ class ContactProblem:
         return flags
 
     def _all_rows_near_contact(self, moved, planes: np.ndarray, coefficients: np.ndarray):
-        """Return rows near contact, flags of rows in contact, and onsets, for used and unused rows.
+        """Return the rows near contact, flags of the rows in contact, and the onsets, among all rows.
 
-        `moved` holds position and rate at all rows, for each time in `before`.
+        Args:
+            moved: Position and rate in all rows, for each time in `before`.
+            planes: Surface positions [m].
+            coefficients: Coefficients of the law.
         """
         all_rows = np.arange(moved[0][0].size)
         near = [self._near(position, rate, all_rows, planes) for position, rate in moved]
@@ -368,7 +383,13 @@ class ContactProblem:
     def find_best_surface(self, delay: float, plane: float) -> tuple[float, Inner, float]:
         """Return the plane of least misfit at a delay, a fit nearby, and the gain of log likelihood.
 
-        The gain is from the fit to the returned plane: that of the last Newton step, along a parabola.
+        Args:
+            delay: Force delay [s].
+            plane: Starting value of the surface position [m].
+
+        Returns:
+            The best surface position [m], the fit before the last Newton step, and the gain of log likelihood
+            that this step adds to the fit.
         """
         inner = self.at(delay, plane)
         for _ in range(MAX_NEWTON_STEPS):

@@ -1,9 +1,12 @@
-"""Posterior on a grid of force delay and surface position, with linear least squares for the coefficients.
+"""Posterior of force delay, surface position and coefficients of a contact law, computed on a grid.
 
-The delay is not differentiated. During damped contact, first-order information on the delay is shared with
-the damping; the rest comes from the onset, where the likelihood has kinks. Therefore the grid represents the
-posterior itself (flat prior on delay and surface, no negative damping). All results, such as means, intervals
-and correlations, come from draws of this posterior.
+At each delay and surface position of the grid, linear least squares determine the coefficients. The
+likelihood is not approximated by its derivatives with respect to the delay: during contact, a change of the
+delay acts like a
+    change of
+the damping, and at the onset of contact the likelihood has kinks. The prior is flat in delay and surface
+position, and excludes negative damping. All results, such as means, intervals and correlations, come from
+draws of the posterior.
 """
 
 from __future__ import annotations
@@ -20,22 +23,23 @@ from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_D
 from tuning.identification.contact_regression import Inner
 from tuning.identification.normal_draws import factorise_covariance
 
-FINE_DELAY_STEP = 2e-5  # s, between the delays of the second grid
-SMOOTHING_DELAYS = 7  # delays of the second grid over which the plane is averaged
-FINAL_GRID_DROP = 30.0  # drop of twice the log posterior below its maximum that the final grid covers
-COARSE_GRID_DROP = 400.0  # the same for the coarse grid, whose log posterior is less accurate near onsets
-SECOND_GRID_SURFACES = 15  # planes of the second grid
-MAX_CELL_EDGES = 1000  # of cell edges; a surface that nothing determines spans every row of the runs
-COARSE_STD_FACTOR = 2.0  # factor on the plane's standard deviation from the coarse grid
-FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # size of the final grid
-DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search about an approximate delay
-SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width in standard deviations of the plane at a given delay
-POSTERIOR_DRAWS = 4000
+FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
+SMOOTHING_DELAYS = 7  # number of delays of the second grid over which the surface position is averaged
+FINAL_GRID_DROP = 30.0  # the final grid covers all delays with a smaller drop of twice the log posterior
+# The same for the second grid; it is larger, because the coarse log posterior is less accurate near onsets.
+COARSE_GRID_DROP = 400.0
+SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
+MAX_CELL_EDGES = 1000  # maximum number of cell edges, for surfaces that the readings do not determine
+COARSE_STD_FACTOR = 2.0  # factor on the surface's standard deviation that the coarse grid gives
+FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
+DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search around an approximate delay
+SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid at a delay, in standard deviations of the surface
+POSTERIOR_DRAWS = 4000  # number of draws
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of delay, surface and coefficients, and the profile over the delay."""
+    """Posterior draws of the contact parameters, and the marginal posterior of the force delay."""
 
     names: list[str]  # "delay", "plane", then the coefficients
     draws: np.ndarray  # (draws, names)
@@ -59,14 +63,15 @@ def compute_posterior(
     near: tuple[float, float] | None = None,
     size: tuple[int, int] = (FINAL_GRID_DELAYS, FINAL_GRID_SURFACES),
 ) -> Posterior:
-    """Return the posterior of the force delay, the surface and the coefficients.
+    """Compute the posterior of the force delay, the surface position and the coefficients.
 
     Args:
-        problem: Readings, motion and law.
+        problem: Readings, motion and contact law.
         seed: Seed of the random numbers.
-        near: Delay [s] and surface [m] within some milliseconds of the best fit, if they are known. All
-            delays are searched without it, or if the best delay may lie further away.
-        size: Numbers of delays and planes of the final grid.
+        near: Approximate delay [s] and surface position [m], or None. All delays are searched if it is None,
+            or if
+            the best delay may be outside the search range around it.
+        size: Numbers of delays and surface positions of the final grid.
     """
     delays, start = (
         np.arange(problem.min_delay, MAX_FORCE_DELAY + COARSE_DELAY_STEP / 2.0, COARSE_DELAY_STEP),
@@ -102,7 +107,7 @@ def compute_posterior(
     heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
     low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
-    # If a single cell holds the posterior of a delay, the plane jumps from delay to delay: smooth it.
+    # If one cell contains the whole posterior of a delay, the surface jumps from delay to delay: smooth it.
     planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
     places, cells = _fit_grid(problem, delays, surface, size[1])
@@ -110,7 +115,10 @@ def compute_posterior(
 
 
 def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
-    """Return the position [m] at which the force first rises above its noise, the median of the runs."""
+    """Return the position [m] at which the force first exceeds its noise: the median over all runs.
+
+    If a prior of the bias is known, the surface comes from the forces of a press instead (`press_bias`).
+    """
     position, _ = problem.motion.at(delay)
     readings = problem.readings
     if readings.bias is not None:
@@ -127,7 +135,7 @@ def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
 def _scan_delays(
     problem: ContactProblem, delays: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the best plane, its standard deviation and the marginal log posterior at each delay."""
+    """Return the best surface position, its standard deviation and the log posterior at each delay."""
     planes, stds, heights = [], [], []
     for delay in delays:
         plane, inner, gain = problem.find_best_surface(delay, start)
@@ -140,7 +148,10 @@ def _scan_delays(
 def _find_likely_delays(
     problem: ContactProblem, delays: np.ndarray, heights: np.ndarray, reach: float
 ) -> tuple[float, float]:
-    """Return the range of delays within `reach` of the best posterior, one step wider on each side."""
+    """Return the range of delays [s] in which twice the log posterior is within `reach` of its maximum.
+
+    The range is extended by one step on each side.
+    """
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
     step = delays[1] - delays[0]
     return max(problem.min_delay, delays[inside[0]] - step), min(MAX_FORCE_DELAY, delays[inside[-1]] + step)
@@ -151,18 +162,19 @@ def _fit_grid(
 ) -> tuple[np.ndarray, list[Inner]]:
     """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
 
-    Damped contacts begin with a jump, so a row on the wrong side of the onset raises the misfit. The
-    likelihood is smooth between the planes at which a row enters the contact; these planes are the edges of
-    the cells.
+    The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
+    only between positions at which another row enters the contact. These positions are the edges of the grid
+    cells.
 
     Args:
-        problem: Readings, motion and law.
+        problem: Readings, motion and contact law.
         delays: Delays [s].
-        surface: Mean and standard deviation of the plane [m] at each delay.
-        across: Number of planes at each delay.
+        surface: Mean and standard deviation of the surface position [m] at each delay.
+        across: Number of surface positions (cells) at each delay.
 
     Returns:
-        Rows of (delay, plane, width in the plane), and the fit of each row.
+        For each cell, its delay [s], its centre [m] and its width [m]; and the fit at the centre of each
+        cell.
     """
     places, cells = [], []
     for delay, centre, std in zip(delays, *surface, strict=True):
@@ -179,10 +191,10 @@ def _fit_grid(
 
 
 def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
-    """Return the edges of `number` cells from `low` to `high` that include the positions `at`.
+    """Divide the interval from `low` to `high` into `number` cells with edges at the positions `at`.
 
-    Further edges halve the widest cells. If there are too many positions, those that leave the smallest cells
-    are dropped.
+    If there are too few positions, the widest cells are halved. If there are too many, the positions between
+    the smallest cells are dropped.
     """
     if len(at) > MAX_CELL_EDGES:
         at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]
@@ -198,7 +210,7 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
 def _marginalise_over_surface(
     places: np.ndarray, cells: list[Inner], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the marginal log posterior of each delay, and the plane's mean and standard deviation there."""
+    """Return, for each delay, its marginal log posterior, and the surface's mean and standard deviation."""
     heights, planes = (
         _compute_cell_posteriors(places, cells).reshape(count, -1),
         places[:, 1].reshape(count, -1),
@@ -207,7 +219,7 @@ def _marginalise_over_surface(
     share = np.exp(heights - total[:, None])
     mean = np.sum(share * planes, axis=1)
     spread = np.sqrt(np.sum(share * (planes - mean[:, None]) ** 2, axis=1))
-    # If one plane holds all of the posterior, only the spacing of the planes bounds the deviation.
+    # If one cell contains the whole posterior, its width is the only bound on the standard deviation.
     best = np.argmax(heights, axis=1)
     width = places[:, 2].reshape(count, -1)[np.arange(count), best]
     return total, mean, np.maximum(spread, width / 2.0)
@@ -221,7 +233,7 @@ def _compute_cell_posteriors(places: np.ndarray, cells: list[Inner]) -> np.ndarr
 def _draw_from_grid(
     problem: ContactProblem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
 ) -> Posterior:
-    """Return draws from the grid: a cell by its weight, a point in it, and normal coefficients."""
+    """Draw from the posterior: a cell by its probability, a point in the cell, and normal coefficients."""
     heights = _compute_cell_posteriors(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
@@ -234,7 +246,7 @@ def _draw_from_grid(
     step, rows = delays[1] - delays[0], []
     slopes = np.zeros((len(cells), len(cells[0].coefficients)))
     if problem.plane is not None:
-        # Within a cell the coefficients change with the delay, above all the damping.
+        # The coefficients, especially the damping, change with the delay within a cell.
         slopes = np.gradient(np.array([cell.coefficients for cell in cells]), step, axis=0)
     for index in np.unique(picked):
         count = int(np.sum(picked == index))

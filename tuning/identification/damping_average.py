@@ -1,11 +1,12 @@
-"""Bayesian average over contact with and without damping.
+"""Bayesian average over contact models with and without damping.
 
-Damping has nearly the same effect on a contact as a force delay that is shorter by damping over stiffness.
-Only the onset of contact separates the two. A flat prior on the damping excludes zero damping, so noise at a
-few onsets can look like damping with a small standard deviation. The draws therefore come from both models in
-proportion to their posterior probabilities (spike-and-slab prior, Mitchell and Beauchamp, "Bayesian variable
-selection in linear regression", 1988). The prior gives one half to no damping and spreads the other half
-evenly up to `MAX_DAMPING_OVER_STIFFNESS`.
+A damping b has nearly the same effect on a contact as a force delay that is shorter by b over the stiffness.
+Only readings at the onset of contact distinguish the two. Under a flat prior, zero damping has no
+probability, so that noise at a few onsets can look like damping with a small standard deviation. The draws
+therefore come from both models, in proportion to their posterior probabilities (spike-and-slab prior,
+Mitchell and Beauchamp, "Bayesian variable selection in linear regression", 1988). The prior probability of
+zero damping is one half. The other half is uniform in damping over stiffness, from 0 to
+`MAX_DAMPING_OVER_STIFFNESS`.
 """
 
 from __future__ import annotations
@@ -23,17 +24,16 @@ from tuning.identification.law_choice import search_coarsely
 
 DAMPING_NAME, TIME_CONSTANT_NAME = "damping", "time_constant"
 MAX_DAMPING_OVER_STIFFNESS = 0.01  # s, upper bound of damping over stiffness in the prior
-MIN_UNDAMPED_PROBABILITY = 1e-4  # posterior probability of no damping, below which that model is ignored
-MAX_OCCAM_GAIN = (
-    7.0  # largest gain of log evidence that the model without damping has from one parameter less
-)
+MIN_UNDAMPED_PROBABILITY = 1e-4  # the undamped model is ignored if its posterior probability is smaller
+# Largest gain of log evidence that the undamped model has because it has one parameter less.
+MAX_OCCAM_GAIN = 7.0
 
 # Function that fits a law and returns the posterior and the log evidence.
 FitLaw = Callable[[Law], tuple[Posterior, float]]
 
 
 def drop_damping_term(law: Law) -> Law:
-    """Return the law without its term proportional to the rate."""
+    """Return the law without the damping term that all entries of the contact lists share."""
     names = tuple(name for name in law.names if name != DAMPING_NAME)
     return replace(law, names=names, shared=lambda depth, rate: [], pulls=False)
 
@@ -41,15 +41,19 @@ def drop_damping_term(law: Law) -> Law:
 def average_over_damping(
     problem: ContactProblem, posterior: Posterior, evidence: float, fit: FitLaw
 ) -> Posterior:
-    """Return the posterior with a share of its draws replaced by draws without damping.
+    """Replace a share of the posterior draws by draws of the law without damping.
 
-    The share is the posterior probability of no damping.
+    The share is the posterior probability of zero damping.
 
     Args:
-        problem: Problem with the damped law.
-        posterior: Posterior of that problem.
-        evidence: Logarithm of the posterior's integral under a flat prior on the damping.
-        fit: Function that fits a law and returns its posterior and its log evidence.
+        problem: Contact problem with the damped law.
+        posterior: Posterior of this problem.
+        evidence: Log evidence of the damped law under a flat prior on the damping.
+        fit: Function that fits a law and returns its posterior and log evidence.
+
+    Returns:
+        The posterior with mixed draws; unchanged if zero damping is improbable or the law has no damping
+        term.
     """
     law = problem.law
     own_count = len(law.entry_functions(np.zeros(1), np.zeros(1)))

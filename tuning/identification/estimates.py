@@ -1,4 +1,4 @@
-"""Estimates with 95 % intervals, from posterior draws and from the sensors' noise at rest."""
+"""Estimates with 95 % intervals, from posterior draws and from the noise of the sensors at rest."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ from tuning.identification.contact_fit import ContactFit
 from tuning.identification.result import Estimate
 
 DAMPING_KEY, FORCE_DELAY_KEY = "contact.damping", "rig.force_sensor.delay"
-ZERO_WIDTH_SIGMAS, MAX_SHARE_AT_ZERO = (
-    0.1,
-    0.005,
-)  # draws pile up at 0 if more than this share lies within this many std of 0
+# Draws accumulate at 0 if more than this share of them lies within this number of standard deviations of 0.
+MAX_SHARE_AT_ZERO, ZERO_WIDTH_SIGMAS = 0.005, 0.1
 
 
-def make_estimates(found, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
-    """Return the estimates of the parameters with draws, then of the noise and the fixed parameters."""
-    at_bound = select_dampings_at_zero(found)
-    from_draws = [_estimate_from_draws(key, values, at_bound) for key, values in found.items()]
+def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
+    """Return the estimates of all parameters: those with draws, the sensors' noise, and the fixed parameters.
+
+    Args:
+        draws_by_key: Posterior draws of each parameter.
+        motion: Fit of the motion simulator, or None.
+        contact: Fit of the contact, or None.
+        force: Noise of the force sensor at rest, or None.
+        position: Noise of the position sensor at rest, or None.
+        fixed: Values of the fixed parameters by key.
+    """
+    at_bound = select_dampings_at_zero(draws_by_key)
+    from_draws = [_estimate_from_draws(key, values, at_bound) for key, values in draws_by_key.items()]
     direct = []
     if force is not None and not force.silent:
         direct.append(_make_normal_estimate("rig.force_sensor.noise_std", force.std, force.std_std))
@@ -56,28 +63,33 @@ def make_estimates(found, motion, contact, force, position, fixed) -> tuple[Esti
 
 
 def accumulates_at_zero(values: np.ndarray) -> bool:
-    """Return whether draws that cannot be negative accumulate at 0, so that 0 is as probable as any value."""
+    """Return whether draws of a parameter that cannot be negative accumulate at 0."""
     return bool(np.mean(values <= ZERO_WIDTH_SIGMAS * values.std()) > MAX_SHARE_AT_ZERO)
 
 
-def select_dampings_at_zero(found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the draws of the damping coefficients [N s/m] that accumulate at 0, by key."""
+def select_dampings_at_zero(draws_by_key: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the draws of those damping coefficients [N s/m] whose draws accumulate at 0, by key."""
     return {
         key: values
-        for key, values in found.items()
+        for key, values in draws_by_key.items()
         if key.startswith(DAMPING_KEY) and accumulates_at_zero(values)
     }
 
 
 def shift_to_zero_damping(values: np.ndarray, at_bound: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return draws moved to zero damping coefficients `at_bound`, by linear regression."""
+    """Return the draws of a parameter, extrapolated to zero damping by linear regression.
+
+    Args:
+        values: Draws of the parameter.
+        at_bound: Draws of the damping coefficients that are set to zero, by key.
+    """
     damping = np.column_stack(list(at_bound.values()))
     slope = np.linalg.lstsq(damping - damping.mean(axis=0), values - values.mean(), rcond=None)[0]
     return values - damping @ slope
 
 
 def find_shortest_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the shortest interval with 95 % of the draws; it includes 0 if they accumulate there."""
+    """Return the ends of the shortest interval that contains 95 % of the draws."""
     ordered = np.sort(values)
     inside = int(np.ceil(0.95 * len(ordered)))
     first = int(np.argmin(ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]))
@@ -87,8 +99,9 @@ def find_shortest_interval(values: np.ndarray) -> tuple[float, float]:
 def _estimate_from_draws(key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}) -> Estimate:
     """Return the estimate of a parameter from its draws.
 
-    `at_bound` holds the dampings whose draws accumulate at 0. Their interval is one-sided. The logs hardly
-    separate them from the force delay, so its interval includes the delays that belong to zero damping.
+    `at_bound` holds the draws of the damping coefficients that accumulate at 0. The interval of such a
+    coefficient is one-sided. The logs hardly distinguish damping from force delay, so the interval of the
+    force delay also includes the delays that zero damping would imply.
     """
     low, high = np.quantile(values, (0.025, 0.975))
     if key in at_bound:
@@ -108,7 +121,7 @@ def _make_normal_estimate(key: str, value: float, std: float) -> Estimate:
 
 
 def get_unit(key: str) -> str:
-    """Return the SI unit of a key, with or without the index of a list's entry."""
+    """Return the SI unit of a mechanism key; the index of a list entry is ignored."""
     parts = key.split(".")
     while parts[-1].isdigit():
         parts.pop()
@@ -116,15 +129,15 @@ def get_unit(key: str) -> str:
 
 
 def estimate_combinations(
-    found: Mapping[str, np.ndarray], contact: ContactFit | None
+    draws_by_key: Mapping[str, np.ndarray], contact: ContactFit | None
 ) -> tuple[Estimate, ...]:
-    """Return the combinations that the logs determine better than their parts.
+    """Return estimates of parameter combinations that the logs determine better than the single parameters.
 
-    These are sums of delays, and the damping minus stiffness times delay ("apparent damping").
+    The combinations are sums of delays, and damping minus stiffness times force delay ("apparent damping").
     """
-    combined, at_bound = [], select_dampings_at_zero(found)
-    motion, force = (found.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
-    lag = found.get("rig.force_sensor.time_constant")
+    combined, at_bound = [], select_dampings_at_zero(draws_by_key)
+    motion, force = (draws_by_key.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
+    lag = draws_by_key.get("rig.force_sensor.time_constant")
     if force is not None and lag is not None:
         force = force + lag
         combined.append(
@@ -137,7 +150,7 @@ def estimate_combinations(
                 key="delay of motion and force",
             )
         )
-    damping, stiffness = found.get("contact.damping.0"), found.get("contact.stiffness.0")
+    damping, stiffness = draws_by_key.get("contact.damping.0"), draws_by_key.get("contact.stiffness.0")
     if contact is None or not find_contact_law(contact.law.name).is_linear:
         return tuple(combined)
     if force is not None and damping is not None and stiffness is not None:

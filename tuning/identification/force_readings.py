@@ -1,4 +1,4 @@
-"""Force readings of all runs in contact, as arrays."""
+"""Force readings of all runs in contact, in arrays with one lane (column) per run."""
 
 from __future__ import annotations
 
@@ -14,23 +14,32 @@ from tuning.identification.records import LoggedRun
 
 @dataclass(frozen=True)
 class ForceReadings:
-    """Forces of all runs in contact, padded to arrays of shape (rows, lanes)."""
+    """Force readings of all runs in contact and their noise.
 
-    force: np.ndarray  # N, 0 where a reading is missing
-    counts: np.ndarray  # bool, rows that are used
-    entry: np.ndarray  # int, entry of the contact lists
-    entries: tuple[int, ...]  # entries of the contact lists that occur
-    std: float  # N, standard deviation of the white noise
+    Arrays have the shape (rows, lanes), with one run per lane; shorter runs are padded.
+    """
+
+    force: np.ndarray  # N; 0 if the reading is missing
+    counts: np.ndarray  # bool, whether fits use the reading
+    entry: np.ndarray  # int, index into the mechanism's contact lists
+    entries: tuple[int, ...]  # indices that occur in `entry`
+    std: float  # N, standard deviation of the noise after whitening
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
-    threshold: float = 0.0  # N, predicted forces below it are not used (a dead zone hides them)
-    # N, bias of the sensor and its standard deviation, if runs at rest determine them
-    bias: tuple[float, float] | None = None
+    threshold: float = 0.0  # N; smaller predicted forces are not used, because a dead zone hides them
+    bias: tuple[float, float] | None = None  # N, prior mean and standard deviation of the sensor's bias
 
     @classmethod
     def of(
         cls, runs: Sequence[LoggedRun], std: float, whitening=(1.0,), threshold: float = 0.0
     ) -> ForceReadings:
-        """Return the readings of runs, padded to the longest one."""
+        """Collect the readings of runs in arrays.
+
+        Args:
+            runs: Runs with a measured force.
+            std: Standard deviation of the noise after whitening [N].
+            whitening: Coefficients of the whitening filter.
+            threshold: Predicted force [N] below which readings are not used.
+        """
         rows = max(len(run.tick) for run in runs)
 
         def padded(values, fill, kind):
@@ -45,7 +54,7 @@ class ForceReadings:
         force = padded([np.nan_to_num(force_column) for force_column in forces], 0.0, float)
         entry = padded([_assign_contact_entries(run) for run in runs], 0, int)
         if len(whitening) > 1:
-            # A row is used if all rows that the filter needs are there.
+            # A reading is used only if all readings that the filter combines with it are valid.
             gap: Any = lfilter(np.ones(len(whitening)), [1.0], ~counts, axis=0)
             counts = counts & (gap < 0.5)
             counts[: len(whitening) - 1] = False
@@ -59,7 +68,11 @@ class ForceReadings:
 
 
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
-    """Return the contact's entry for each row; rows out of contact have that of a neighbouring contact."""
+    """Return the index into the contact lists for each row.
+
+    Rows out of contact get the index of the previous contact, or of the first contact if there is none
+    before.
+    """
     index = np.full(len(run.tick), -1) if run.contact_index is None else run.contact_index
     if not np.any(index >= 0):
         return np.zeros(len(run.tick), int)

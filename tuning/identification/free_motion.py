@@ -1,7 +1,7 @@
-"""Motion simulator from runs without contact: order, parameters, delay and unexplained residuals.
+"""Identification of the motion simulator from runs without contact: order, parameters and delay.
 
-The delay is the sum of the delays of the motion and of the position sensor. Neither a log nor a compensator
-with fixed gains can separate the two.
+The identified delay is the sum of the delays of the motion and of the position sensor. Neither a log nor a
+compensator with fixed gains can distinguish the two delays.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from tuning.identification.structure_choice import (
     compute_residual_ratio,
 )
 
-SETTLING_TIME_CONSTANTS = 10.0  # time constants that a transient lasts
-ASSUMED_TIME_CONSTANT = 0.05  # s, assumed time constant before the fit
-MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
-MODEL_ERROR_P_VALUE = (
-    1e-6  # p-value below which a model error is added; low, because it widens the intervals a lot
-)
-MODEL_ERROR_BANDS = 10  # frequency bands, in each of which the model error is constant
-MAX_MODEL_ERROR = 10.0  # largest relative model error
-MODEL_ERROR_ITERATIONS = 3  # iterations of the fit and the model error
+SETTLING_TIME_CONSTANTS = 10.0  # duration of a transient, in time constants
+ASSUMED_TIME_CONSTANT = 0.05  # s, time constant of the motion simulator that is assumed before the fit
+MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom; above it, the intervals are widened
+# p-value of the residual; below it, a model error is added. It is low, because a model error widens the
+# intervals.
+MODEL_ERROR_P_VALUE = 1e-6
+MODEL_ERROR_BANDS = 10  # number of frequency bands; the model error is constant in each band
+MAX_MODEL_ERROR = 10.0  # upper bound of the relative model error
+MODEL_ERROR_ITERATIONS = 3  # alternating estimates of the parameters and of the model error
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Motion simulator fitted to runs without contact."""
+    """Model of the motion simulator, fitted to runs without contact or compared with them."""
 
-    lines: SpectralLines  # with the measured noise
-    spectra: tuple[Spectrum, ...]  # one per run
+    lines: SpectralLines  # spectra of all runs, with the measured noise
+    spectra: tuple[Spectrum, ...]  # spectrum of each run
     chosen: StructureCandidate
     candidates: tuple[StructureCandidate, ...]
-    gain: tuple[float, float]  # measured over desired position, and its standard deviation
-    other_hold_gain: float  # decrease of the criterion with the other hold; negative: it rises
-    beyond: float = 0.0  # relative model error at each line in addition to the noise
+    gain: tuple[float, float]  # static gain from desired to measured position, and its standard deviation
+    other_hold_gain: float  # decrease of the information criterion if the other command hold is assumed
+    model_error: float = 0.0  # relative model error at each line, in addition to the noise
 
     @property
     def model(self) -> MotionModel:
@@ -56,30 +56,30 @@ class FreeMotion:
 
     @property
     def left(self) -> float:
-        """Return the residual power over the noise power."""
+        """Return chi-squared per degree of freedom: the residual power over the noise power."""
         error, noise = self.misfit()
         return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.freedom, 1)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the model's parameters, wider if the residual exceeds the noise."""
+        """Return the covariance of the model's parameters, inflated if the residual exceeds the noise."""
         unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
         return self.fit.covariance * (unexplained if unexplained > MAX_REDUCED_CHI_SQUARE else 1.0)
 
     @property
     def noise_std(self) -> float:
-        """Return the standard deviation of the position readings' noise [m]."""
+        """Return the noise of a position reading [m], the rms over all runs."""
         return float(np.sqrt(np.mean([spectrum.noise_std**2 for spectrum in self.spectra])))
 
     def lag(self, frequency: float) -> tuple[float, float]:
-        """Return the total phase delay [s] at a frequency [Hz], and its standard deviation."""
+        """Return the phase delay from command to reading at a frequency [Hz], and its std [s]."""
         s = np.array([2j * np.pi * frequency])
         slopes = np.imag(self.model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
         phase = np.angle(self.model.response(s)[0])
         return float(-phase / (2.0 * np.pi * frequency)), float(np.sqrt(slopes @ self.covariance @ slopes))
 
     def misfit(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the model's complex relative error at each line, and the noise's standard deviation."""
+        """Return the complex error over the model's output at each line, and the noise over this output."""
         predicted = self.model.predict(self.lines)
         return (self.lines.output - predicted) / predicted, self.lines.std / np.abs(predicted)
 
@@ -87,37 +87,47 @@ class FreeMotion:
 def fit_free_motion(
     runs: Sequence[LoggedRun], timing: CampaignTiming, order: int | None = None
 ) -> FreeMotion | None:
-    """Fit the motion simulator to all free runs together; return None if none is long enough."""
+    """Fit the motion simulator to all free runs together.
+
+    Args:
+        runs: Runs in free motion.
+        timing: Timing of commands and readings.
+        order: Order of the model, or None to choose the smallest order that explains the spectra.
+
+    Returns:
+        The fit, or None if no run is long enough.
+    """
     spectra = compute_spectra(runs, timing)
     if not spectra:
         return None
     lines = concatenate_lines(spectra, timing)
     chosen, candidates = choose_structure(lines, order)
-    # A model of one order more can compensate a wrong hold.
+    # A model whose order is higher by one can compensate for a wrong command hold.
     highest = chosen.fit.model.structure.order + 1
-    other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
+    lines_with_other_hold = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     other_hold = chosen.criterion - compute_criterion(
-        choose_structure(other_lines, order, highest)[0].fit, compute_residual_ratio(candidates)
+        choose_structure(lines_with_other_hold, order, highest)[0].fit, compute_residual_ratio(candidates)
     )
-    beyond, weighed = 0.0, lines
+    model_error, weighted = 0.0, lines
     for _ in range(MODEL_ERROR_ITERATIONS):
-        beyond = estimate_model_error(chosen.fit.model, lines)
-        if beyond == 0.0:
+        model_error = estimate_model_error(chosen.fit.model, lines)
+        if model_error == 0.0:
             break
         expected = np.abs(chosen.fit.model.predict(lines))
-        weighed = replace(lines, std=np.hypot(lines.std, beyond * expected))
-        chosen = replace(chosen, fit=fit_structure(chosen.fit.model.structure, weighed))
-    gain = estimate_static_gain(chosen.fit, weighed)
-    return FreeMotion(lines, tuple(spectra), chosen, tuple(candidates), gain, other_hold, beyond)
+        weighted = replace(lines, std=np.hypot(lines.std, model_error * expected))
+        chosen = replace(chosen, fit=fit_structure(chosen.fit.model.structure, weighted))
+    gain = estimate_static_gain(chosen.fit, weighted)
+    return FreeMotion(lines, tuple(spectra), chosen, tuple(candidates), gain, other_hold, model_error)
 
 
 def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
-    """Return the relative model error at each line (rms), or 0 if noise explains the residual.
+    """Return the rms relative error of the model at a line, or 0 if noise explains the residual.
 
-    A model error is smooth: all lines of a band share one error. It is therefore estimated from the means
-    over bands and multiplied by the root of the number of lines. Otherwise lines with little noise would
-    determine the error elsewhere. It is relative to the model's output, since a measured output without
-    response is noise.
+    A model error varies slowly with frequency, so all lines of a frequency band share the same error. The
+    error is therefore estimated from the mean residual of each band and multiplied by the square root of the
+    number of lines per band. Otherwise, a band with little noise would determine the error of the other
+    bands. The error is relative to the predicted output, because the measured output is only noise where the
+    response is small.
     """
     expected = model.predict(lines)
     size = np.abs(expected)
@@ -144,7 +154,7 @@ def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
 def compare_free_motion(
     runs: Sequence[LoggedRun], timing: CampaignTiming, model: MotionModel
 ) -> FreeMotion | None:
-    """Compare the free runs with a known model, without fitting; return None if no run is long enough."""
+    """Compare the free runs with a known model, without a fit; return None if no run is long enough."""
     spectra = compute_spectra(runs, timing)
     if not spectra:
         return None
@@ -154,15 +164,15 @@ def compare_free_motion(
         return SpectrumFit(model, np.zeros((size, size)), (model.predict(lines) - lines.output) / lines.std)
 
     lines = concatenate_lines(spectra, timing)
-    other_lines = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
+    lines_with_other_hold = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).freedom, 1))
     candidate = StructureCandidate(fit, compute_criterion(fit, inflation), "")
-    gain = candidate.criterion - compute_criterion(held(other_lines), inflation)
+    gain = candidate.criterion - compute_criterion(held(lines_with_other_hold), inflation)
     return FreeMotion(lines, tuple(spectra), candidate, (candidate,), estimate_static_gain(fit, lines), gain)
 
 
 def compute_spectra(runs: Sequence[LoggedRun], timing: CampaignTiming) -> list[Spectrum]:
-    """Return the spectra of the runs that are long enough."""
+    """Return the spectrum of each run that is long enough."""
     rest = round(SETTLING_TIME_CONSTANTS * ASSUMED_TIME_CONSTANT / timing.control_period)
     spectra = []
     for run in runs:
@@ -176,7 +186,7 @@ def compute_spectra(runs: Sequence[LoggedRun], timing: CampaignTiming) -> list[S
 
 
 def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> SpectralLines:
-    """Return the lines of several runs, concatenated."""
+    """Return the spectral lines of several runs in one record."""
     return SpectralLines(
         np.concatenate([spectrum.frequency for spectrum in spectra]),
         np.concatenate([spectrum.command for spectrum in spectra]),
@@ -190,8 +200,11 @@ def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> Sp
 
 
 def estimate_static_gain(fit: SpectrumFit, lines: SpectralLines) -> tuple[float, float]:
-    """Return the static gain if it were free, and its standard deviation, by one Newton step from 1."""
-    s, command = lines.copies
+    """Estimate the static gain, which the model fixes at 1; return it with its standard deviation.
+
+    One Newton step from the fit is taken, with the gain as an additional parameter.
+    """
+    s, command = lines.images
     scale = np.sqrt(2.0) / lines.std
     predicted = fit.model.predict(lines)
     slopes = np.sum(fit.model.slopes(s) * fit.model.response(s) * command, axis=1)

@@ -1,11 +1,13 @@
-"""Spectra of free motion: command and measured position at the excited lines, with the noise from the data.
+"""Spectra of command and measured position in free motion, with the noise estimated from the data.
 
-A periodic command (a multisine) is averaged over its periods. Differences between periods are noise. Power at
-lines without excitation is nonlinear distortion: odd lines show friction and dead bands, even lines show
-asymmetry (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2012). For any other
-command the local polynomial method separates transient and noise: around each line, response and transient
-are polynomials of degree 2 over 13 lines (Schoukens and others 2009). Lost rows are not used; a period is
-averaged over its available rows.
+If the command is periodic (a multisine), its periods are averaged. Differences between periods are noise.
+Power at frequency lines without excitation is nonlinear distortion: friction and dead bands appear at odd
+lines,
+    and
+asymmetry appears at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain Approach,
+2012). For any other command, the local polynomial method separates the response from the transient and the
+noise. Around each line, it fits response and transient by polynomials of degree 2 over 13 lines (Schoukens et
+al. 2009). Readings of lost rows are omitted.
 """
 
 from __future__ import annotations
@@ -15,50 +17,61 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-VARIANCE_SMOOTHING_LINES = 15  # lines over which the variance of the noise is averaged
-SIDE_LINES, POLYNOMIAL_DEGREE = (
-    6,
-    2,
-)  # local polynomial method: lines on either side, degree of the polynomials
-MAX_TRANSIENT_VARIANCE_RATIO = (
-    20.0  # ratio of the transient's variance to the noise's variance, above which a line is dropped
-)
-MIN_POWER_SHARE = 3e-3  # share of the largest power, above which a non-periodic command excites a line
-MIN_AMPLITUDE_SHARE = 1e-3  # share of the largest amplitude, above which a periodic command excites a line
+VARIANCE_SMOOTHING_LINES = 15  # number of lines over which the noise variance is averaged
+SIDE_LINES = 6  # local polynomial method: lines on either side of the estimated line
+POLYNOMIAL_DEGREE = 2  # local polynomial method: degree of response and transient
+# Variance of the estimated transient over the noise variance; a line with a larger ratio is omitted.
+MAX_TRANSIENT_VARIANCE_RATIO = 20.0
+MIN_POWER_SHARE = 3e-3  # share of the largest power; with less, a non-periodic command does not excite a line
+# share of the largest amplitude; with less, a periodic command does not excite a line
+MIN_AMPLITUDE_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Spectra of one run at its lines."""
+    """Spectra of command and position of one run, at the frequency lines that the command excites."""
 
-    frequency: np.ndarray  # Hz
-    command: np.ndarray  # complex amplitude [m]
-    output: np.ndarray  # complex amplitude [m], without the transient
-    std: np.ndarray  # m, of the output's complex noise
-    response: np.ndarray  # complex, output over command; smoothed over neighbours without periods
+    frequency: np.ndarray  # Hz, excited lines
+    command: np.ndarray  # m, complex amplitude of the commanded position
+    output: np.ndarray  # m, complex amplitude of the measured position, without the transient
+    std: np.ndarray  # m, standard deviation of the complex noise of `output`
+    response: np.ndarray  # complex, output over command; smoothed over adjacent lines if not periodic
     coherence: np.ndarray  # 0..1, share of the output's power that the command causes
-    noise_std: float  # m, noise of a single position reading
-    odd: float | None  # rms of the output at odd lines without excitation over that at excited lines
-    even: float | None  # the same for even lines
-    excess: tuple[float, float]  # power over noise power at odd and even lines without excitation
+    noise_std: float  # m, standard deviation of the noise of a single position reading
+    # odd distortion: rms output at odd lines without excitation, over that at excited lines
+    odd: float | None
+    # even distortion: rms output at even lines without excitation, over that at excited lines
+    even: float | None
+    excess: tuple[float, float]  # output power over noise power at odd and at even lines without excitation
     periods: int  # number of averaged periods; 0 for a non-periodic command
 
 
 def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
-    """Return the rows of one period, and the rows at which the command repeats the period before, or None.
+    """Find the period of a command and the rows at which the command equals that of one period earlier.
 
-    A command that differs during its fade-in repeats itself after it.
+    The command need not be periodic from its first row, because a multisine usually fades in.
+
+    Args:
+        command: Commanded position of each row.
+        valid: Flags of the rows that were not lost.
+        shortest: Shortest period to search for, in rows.
+
+    Returns:
+        The number of rows in one period and the range of repeating rows, or None if the command is not
+        periodic.
     """
     rows = len(command)
     centred = np.where(valid, command - command[valid].mean(), 0.0)
     size = 1 << int(np.ceil(np.log2(2 * rows)))
     spectrum = np.fft.rfft(centred, size)
-    likeness = np.fft.irfft(np.abs(spectrum) ** 2, size)[: rows // 2 + 1]
-    # Divide by the number of products, so that later repetitions are not smaller than the first one.
-    likeness = likeness / (rows - np.arange(len(likeness)))
-    peaks = 1 + np.flatnonzero((likeness[1:-1] >= likeness[:-2]) & (likeness[1:-1] > likeness[2:]))
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2, size)[: rows // 2 + 1]
+    # Divide the correlation by its number of products, so that it does not decrease with the lag.
+    correlation = correlation / (rows - np.arange(len(correlation)))
+    peaks = 1 + np.flatnonzero(
+        (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
+    )
     scale = np.std(command[valid])
-    for lag in peaks[(peaks >= shortest) & (likeness[peaks] > 0.5 * likeness[0])]:
+    for lag in peaks[(peaks >= shortest) & (correlation[peaks] > 0.5 * correlation[0])]:
         both_valid = valid[lag:] & valid[:-lag]
         same = (np.abs(command[lag:] - command[:-lag]) <= 1e-4 * scale) | ~both_valid
         first, length = _find_longest_run(same)
@@ -68,7 +81,7 @@ def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100)
 
 
 def _find_longest_run(flags: np.ndarray) -> tuple[int, int]:
-    """Return the start and the length of the longest sequence of true values."""
+    """Return the start and the length of the longest sequence of successive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     if not len(edges):
         return 0, 0
@@ -80,9 +93,17 @@ def _find_longest_run(flags: np.ndarray) -> tuple[int, int]:
 def compute_spectrum(
     command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float, rest: int
 ) -> Spectrum | None:
-    """Return the spectra of one run, by periods if the command repeats itself, else by local polynomials.
+    """Compute the spectra of one run, from averaged periods or else by the local polynomial method.
 
-    `rest` is the number of rows that a transient lasts after a gap. Returns None if the run is too short.
+    Args:
+        command: Commanded position of each row [m].
+        output: Measured position of each row [m].
+        valid: Flags of the rows that were not lost.
+        period: Control period [s].
+        rest: Number of rows after a lost row that a transient disturbs.
+
+    Returns:
+        The spectra, or None if the run is too short.
     """
     result = find_repetition(command, valid)
     if result is not None:
@@ -94,23 +115,23 @@ def compute_spectrum(
             return average_periods(
                 command[rows].reshape(shape), output[rows].reshape(shape), valid[rows].reshape(shape), period
             )
-    quiet = valid & ~_flag_rows_after_gaps(valid, rest)
-    first, length = _find_longest_run(quiet)
+    undisturbed = valid & ~_flag_rows_after_gaps(valid, rest)
+    first, length = _find_longest_run(undisturbed)
     if length < 50 * SIDE_LINES:
         return None
     return fit_local_polynomials(command[first : first + length], output[first : first + length], period)
 
 
 def _flag_rows_after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
-    """Return flags of the rows within `rest` rows after a lost one."""
+    """Return flags of the lost rows and of the `rest` rows after each of them."""
     last = np.maximum.accumulate(np.where(~valid, np.arange(len(valid)), -rest - 1))
     return np.arange(len(valid)) - last <= rest
 
 
 def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float) -> Spectrum:
-    """Return the spectra from arrays of shape (periods, rows) [m].
+    """Compute the spectra of a periodic command from arrays of shape (periods, rows) [m].
 
-    Every row of the period must be available in at least two periods.
+    Every row of the period must be valid in at least two periods.
     """
     count, size = command.shape
     valid_count = valid.sum(axis=0)
@@ -122,7 +143,7 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
     noise = float(np.sqrt(np.sum(rest**2) / max(freedom, 1.0)))
     U, Y = np.fft.rfft(input_mean) / size, np.fft.rfft(mean) / size
     spread = np.sum(np.abs(np.fft.rfft(rest, axis=1) / size) ** 2, axis=0)
-    # The variance of a mean over n periods is 1/n of one reading's.
+    # The variance of a mean over n periods is 1/n of the variance of a reading.
     variance = spread / max(freedom / size, 1e-9) * np.mean(1.0 / counted)
     variance = _smooth(variance)
     number = np.arange(len(U))
@@ -132,16 +153,16 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
 
 
 def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
-    """Return the spectrum with the distortion at lines without excitation."""
+    """Return the spectrum with the nonlinear distortion, measured at the lines without excitation."""
     number = np.arange(len(U))
     last = number[excited].max()
     rms = np.sqrt(np.mean(np.abs(Y[excited]) ** 2))
     levels, excess = [], []
     for parity in (1, 0):
-        silent = ~excited & (number % 2 == parity) & (number > 0) & (number <= last)
-        power = np.abs(Y[silent]) ** 2
+        unexcited = ~excited & (number % 2 == parity) & (number > 0) & (number <= last)
+        power = np.abs(Y[unexcited]) ** 2
         levels.append(float(np.sqrt(power.mean()) / rms) if len(power) else None)
-        excess.append(float(np.mean(power / variance[silent])) if len(power) else 1.0)
+        excess.append(float(np.mean(power / variance[unexcited])) if len(power) else 1.0)
     signal = np.abs(Y[excited]) ** 2
     return Spectrum(
         frequency=frequency[excited],
@@ -159,7 +180,7 @@ def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectru
 
 
 def _smooth(variance: np.ndarray) -> np.ndarray:
-    """Return the running mean over `VARIANCE_SMOOTHING_LINES` lines, without the line at 0 Hz."""
+    """Return the running mean over `VARIANCE_SMOOTHING_LINES` lines; the line at 0 Hz is unchanged."""
     window = min(VARIANCE_SMOOTHING_LINES, len(variance) - 1)
     half = window // 2
     padded = np.concatenate([variance[1 : half + 1][::-1], variance[1:], variance[-half:][::-1]])
@@ -168,14 +189,14 @@ def _smooth(variance: np.ndarray) -> np.ndarray:
 
 
 def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float) -> Spectrum:
-    """Return the spectra by the local polynomial method: output without transient, and its noise."""
+    """Compute the spectra of a non-periodic command by the local polynomial method."""
     size = len(command)
     level = command[0]
     U, Y = np.fft.rfft(command - level) / size, np.fft.rfft(output - level) / size
     power = _smooth(np.abs(U) ** 2)
     middle = np.arange(SIDE_LINES, len(U) - SIDE_LINES)
     middle = middle[power[middle] > MIN_POWER_SHARE * power[1:].max()]
-    # A periodic command with too few periods to average leaves every other line without power.
+    # If a periodic command has too few periods to average, every second line has no power.
     middle = middle[np.abs(U[middle]) ** 2 > MIN_POWER_SHARE * power[middle]]
     width = 2 * SIDE_LINES + 1
     r = np.arange(-SIDE_LINES, SIDE_LINES + 1) / SIDE_LINES
@@ -191,23 +212,23 @@ def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float
     left = right - np.einsum("lij,lj->li", q, projected)
     variance = np.sum(np.abs(left) ** 2, axis=1) / (width - 2 * (POLYNOMIAL_DEGREE + 1))
     output_line = Y[middle] - solved[:, POLYNOMIAL_DEGREE + 1]
-    # If the command's spectrum is smooth as well, transient and response cannot be separated.
+    # Transient and response cannot be separated if the spectrum of the command is smooth.
     row = np.zeros(basis.shape[2])
     row[POLYNOMIAL_DEGREE + 1] = 1.0
-    unsure = np.sum(
+    transient_variance = np.sum(
         np.abs(np.linalg.solve(triangle.conj().swapaxes(1, 2), row[:, None])[:, :, 0]) ** 2, axis=1
     )
     signal = np.abs(output_line) ** 2
-    coherent = signal / (signal + variance * (1.0 + unsure))
-    keep = (coherent > 0.5) & (unsure < MAX_TRANSIENT_VARIANCE_RATIO)
-    smoothed = np.maximum(_smooth(variance), 1e-300) * (1.0 + unsure)
+    coherence = signal / (signal + variance * (1.0 + transient_variance))
+    keep = (coherence > 0.5) & (transient_variance < MAX_TRANSIENT_VARIANCE_RATIO)
+    smoothed = np.maximum(_smooth(variance), 1e-300) * (1.0 + transient_variance)
     return Spectrum(
         frequency=middle[keep] / (size * period),
         command=U[middle][keep],
         output=output_line[keep],
         std=np.sqrt(smoothed[keep]),
         response=solved[keep, 0],
-        coherence=coherent[keep],
+        coherence=coherence[keep],
         noise_std=float(np.sqrt(np.mean(variance) * size)),
         odd=None,
         even=None,

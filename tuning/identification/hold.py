@@ -1,34 +1,37 @@
-"""Effect of the drives' hold on the commands between ticks, in the frequency domain.
+"""Frequency response of the command hold, which converts sampled commands to a continuous drive input.
 
-A command is one number per tick. The drives hold it (`zoh`) or interpolate linearly to it (`linear`). Its
-spectrum repeats at every multiple of the tick rate, and the hold weights these copies. The spectrum of the
-sensor readings at the ticks is the sum over the copies, each multiplied by the rig's response at the
-frequency of the copy:
+A command is one number per tick. The drives hold it (`zoh`) or interpolate linearly between commands
+(`linear`). The spectrum of the sampled command repeats at every multiple of the tick rate. The hold
+attenuates these spectral images. The spectrum of the sampled readings is the sum of all images, each
+multiplied by the response of the rig at the frequency of the image:
 
     Y(f) = X_d(f) sum_m H(2 pi j f_m) h(f_m),    f_m = f + m / T,
 
 with h = sinc^2(f T) e^{-s L T} for linear interpolation and h = sinc(f T) e^{-s (L - 1/2) T} for the
-zero-order hold, and a latency of L periods. Few copies matter, because a motion simulator passes little at
-the tick rate.
+zero-order hold, and a latency of L periods. Few images matter, because a motion simulator attenuates
+frequencies near the tick rate.
 """
 
 import numpy as np
 
-SPECTRAL_COPIES = 3  # on either side of the base band
+SPECTRAL_IMAGES = 3  # number of spectral images on either side of the base band
 
 
-def compute_copy_frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
-    """Return the frequency f + m / T [Hz] of every copy m, shape (copies, lines)."""
-    return frequency + np.arange(-SPECTRAL_COPIES, SPECTRAL_COPIES + 1)[:, None] / period
+def compute_image_frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
+    """Return the frequencies f + m / T [Hz] of the spectral images m of each line, shape (images, lines)."""
+    return frequency + np.arange(-SPECTRAL_IMAGES, SPECTRAL_IMAGES + 1)[:, None] / period
 
 
 def compute_hold_response(
     frequency: np.ndarray, period: float, hold: str, latency: int, shift: int = 0
 ) -> np.ndarray:
-    """Return the complex response h from the logged command to the drives' input at each frequency [Hz].
+    """Return the complex response from the logged command to the drives' input at each frequency [Hz].
 
-    It includes the `shift` [periods] by which the readings of a row lag its command.
+    The response includes the command latency [periods], and the `shift` [periods] by which the readings of a
+    row are older than its command.
     """
-    line = np.sinc(frequency * period)
+    attenuation = np.sinc(frequency * period)
     periods = latency + shift - (0.5 if hold == "zoh" else 0.0)
-    return (line if hold == "zoh" else line**2) * np.exp(-2j * np.pi * frequency * periods * period)
+    return (attenuation if hold == "zoh" else attenuation**2) * np.exp(
+        -2j * np.pi * frequency * periods * period
+    )

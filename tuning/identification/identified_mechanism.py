@@ -1,4 +1,4 @@
-"""Mechanism of an identification: the identified values replace those of the prior."""
+"""Mechanism file of an identification: identified values replace those of the prior."""
 
 from __future__ import annotations
 
@@ -26,10 +26,20 @@ def make_mechanism(
     model: MotionModel | None,
     contact: ContactFit | None,
     estimates: Sequence[Estimate],
-    found: Mapping[str, np.ndarray],
+    draws_by_key: Mapping[str, np.ndarray],
     options: IdentificationOptions,
 ) -> dict[str, Any]:
-    """Return the content of a mechanism file in which identified values replace those of the prior."""
+    """Return the content of a mechanism file in which identified values replace those of the prior.
+
+    Args:
+        campaign: Logs of the identification.
+        prior: Mechanism with the values that the logs do not determine, or None.
+        model: Model of the motion simulator, or None if it is unknown.
+        contact: Fit of the contact, or None if the prior's contact is used.
+        estimates: Estimates of all parameters.
+        draws_by_key: Posterior draws of the identified parameters.
+        options: Options of the identification.
+    """
     timing = campaign.timing
     document: dict[str, Any] = {"schema": "jaxhil/mechanism/1", "name": DEFAULT_MECHANISM_NAME}
     document |= {} if prior is None else to_plain_data(prior)
@@ -70,7 +80,7 @@ def make_mechanism(
     for section in ("force_sensor", "position_sensor"):
         sensor = {**rig.get(section, {})}
         if section == "force_sensor" and contact is not None:
-            # The estimated delay includes a lag that the contacts do not resolve.
+            # The estimated delay includes a sensor lag that the contacts do not determine.
             sensor = {k: v for k, v in sensor.items() if k not in ("time_constant", "dead_zone")}
         prefix = f"rig.{section}."
         sensor |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
@@ -78,14 +88,14 @@ def make_mechanism(
     if "rig.contact_plane" in values:
         rig["contact_plane"] = values["rig.contact_plane"]
     document["rig"] = rig
-    if found:
+    if draws_by_key:
         document.pop("correlation", None)
-    document |= _merge_uncertainty(document, found, options)
+    document |= _merge_uncertainty(document, draws_by_key, options)
     return document
 
 
 def compute_bound_excess(key: str, draws: np.ndarray) -> float:
-    """Return the file's value minus the mean of the draws, if the lower bound 0 raises it; else 0."""
+    """Return by how much the lower bound 0 of the file raises a parameter above the mean of its draws."""
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 
@@ -93,7 +103,10 @@ def compute_bound_excess(key: str, draws: np.ndarray) -> float:
 def _merge_uncertainty(
     document, draws_by_key: Mapping[str, np.ndarray], options: IdentificationOptions
 ) -> dict[str, Any]:
-    """Return the identified parameters' uncertainty and correlation, and the prior's for all others."""
+    """Return the tables `[uncertainty]` and `[correlation]` of the identified parameters.
+
+    Parameters that were not identified keep the prior's uncertainty.
+    """
     # A damping that is 0 in every draw has no uncertainty.
     keys = [key for key, draws in draws_by_key.items() if np.ptp(draws) > 0.0]
     if not keys:
@@ -104,9 +117,9 @@ def _merge_uncertainty(
         else 0.0
         for key in keys
     ])  # fmt: skip
-    off = np.array([compute_bound_excess(key, draws_by_key[key]) for key in keys])
-    tables = make_uncertainty_tables(keys, np.array([draws_by_key[key] for key in keys]).T, floors, off)
-    # An identified simulator or contact replaces all of the prior's entries of its section.
+    offsets = np.array([compute_bound_excess(key, draws_by_key[key]) for key in keys])
+    tables = make_uncertainty_tables(keys, np.array([draws_by_key[key] for key in keys]).T, floors, offsets)
+    # If the simulator or the contact was identified, the prior's entries for the whole section are dropped.
     sections = {f"{name.rsplit('.', 1)[0]}." for name in tables["uncertainty"]} & {
         SIMULATOR_PREFIX,
         "contact.",

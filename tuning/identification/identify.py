@@ -1,8 +1,9 @@
-"""Identification of a campaign in four stages: rest, free motion, contact, validation.
+"""Identification of a rig and its mechanism in four stages: rest, free motion, contact, validation.
 
-Each stage uses the results of the previous ones; without runs for a stage, the prior's values are used. The
-logs cannot determine the hold, the latency, the row convention, the mass, or the split of the motion's delay
-between the motion and the position sensor. These are taken as specified.
+Each stage uses the results of the previous stages. If the campaign has no runs for a stage, the prior's
+values are used. The logs cannot determine the command hold, the command latency, the row convention and the
+mass. They also determine only the sum of the delays of the motion and of the position sensor. The user must
+specify these values.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ from tuning.identification.result import Identification, find_confounded_pairs
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
 from tuning.identification.uncertainty_effect import compute_uncertainty_effect
 
-MIN_REST_ROWS = 200  # rows at rest that an estimate of the noise needs
+MIN_REST_ROWS = 200  # minimum number of rows at rest for an estimate of the noise
 ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
 CONTACT_KINDS = ("contact", "press", "tap")
-STAGE_COUNT = 3  # free motion, contact, validation; a bootstrap adds one for each chunk of its fits
+STAGE_COUNT = 3  # progress messages: free motion, contact, validation; a bootstrap adds one per chunk of fits
 ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
 STIFFNESS_PREFIX, POSITION_DELAY_KEY = "contact.stiffness.", "rig.position_sensor.delay"
-MIN_DELAY_SIGMAS = 2.0  # standard deviations between 0 and a force delay that would else be negative
+MIN_DELAY_SIGMAS = 2.0  # standard deviations above 0 to which a negative force delay is raised
 
 
 def _ignore_progress(text: str) -> None:
@@ -62,11 +63,13 @@ def identify(
     Args:
         campaign: Runs and their timing.
         prior: Mechanism with the values that the logs do not determine, or None.
-        options: Options of the caller.
-        say: Function that receives the name of each stage (at most `STAGE_COUNT`) and bootstrap chunk.
+        options: Options of the identification, or None for the defaults.
+        say: Function that receives a progress message at the start of each stage and after each bootstrap
+            chunk.
 
     Returns:
-        Estimates, draws, checks and the mechanism, or a bad verdict if a required value is unknown.
+        Estimates, posterior draws, checks and the mechanism. The verdict is bad, without a mechanism, if a
+        required value is unknown.
 
     Raises:
         InputError: If the options are invalid.
@@ -84,16 +87,18 @@ def identify(
     touching = [] if model is None else _select_runs_in_contact(campaign, model)
     contact, left_out = _fit_and_check_contact(touching, model, campaign, force, dead_zone, options, say)
     frequency = _estimate_frequency(contact, campaign.equivalent_mass)
-    apart = None if contact is None else contact.drift
-    share = _choose_position_delay(motion, None if apart else contact, prior, options)
+    clock_drift = None if contact is None else contact.drift
+    share = _choose_position_delay(motion, None if clock_drift else contact, prior, options)
     draws = _draw_parameters(motion, contact, model, frequency, share, options.seed)
-    first = KEYS_FIXED_BEFORE_FIT if apart is None else (*KEYS_FIXED_BEFORE_FIT, FORCE_DELAY_KEY)
-    draws, later, denied = _condition_draws(draws, first, frequency, prior, options)
-    fixed = {**_select_fixed_before_fit(first, share, prior, options), **later}
+    used_keys = KEYS_FIXED_BEFORE_FIT if clock_drift is None else (*KEYS_FIXED_BEFORE_FIT, FORCE_DELAY_KEY)
+    draws, conditioned, contradictions = _condition_draws(draws, used_keys, frequency, prior, options)
+    fixed = {**_select_fixed_before_fit(used_keys, share, prior, options), **conditioned}
     draws, vague = _drop_undetermined_entries(draws)
     used = contact if any(key.startswith(STIFFNESS_PREFIX) for key in (*draws, *fixed)) else None
     numbers = make_estimates(draws, motion, used, force, position, fixed)
-    missing = _list_missing_parameters(prior, model, used, apart is not None and FORCE_DELAY_KEY not in fixed)
+    missing = _list_missing_parameters(
+        prior, model, used, clock_drift is not None and FORCE_DELAY_KEY not in fixed
+    )
     mechanism = None if missing else make_mechanism(campaign, prior, model, used, numbers, draws, options)
     mechanism, lines = _check_result(mechanism, campaign, motion, contact, model, touching, options)
     table = np.array(list(draws.values())).T if draws else np.zeros((POSTERIOR_DRAWS, 0))
@@ -101,7 +106,7 @@ def identify(
         estimates=numbers,
         draws=table,
         combinations=estimate_combinations(
-            draws | {k: np.full(POSTERIOR_DRAWS, v) for k, v in later.items()}, used
+            draws | {k: np.full(POSTERIOR_DRAWS, v) for k, v in conditioned.items()}, used
         ),
         confounded=find_confounded_pairs(list(draws), table),
         lines=(*lines, *left_out),
@@ -110,7 +115,7 @@ def identify(
         notes=(
             *collect_notes(motion, contact, used, force, vague),
             *note_absent_dead_zone(contact, dead_zone),
-            *(*_note_shifted_delay(fixed, options), *_note_clipped_values(draws), *denied),
+            *(*_note_shifted_delay(fixed, options), *_note_clipped_values(draws), *contradictions),
         ),
         missing=missing,
         motion=motion,
@@ -121,7 +126,7 @@ def identify(
 
 
 def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[LoggedRun]:
-    """Return the runs in contact, divided into segments of similar length."""
+    """Return the runs in contact; long runs are divided into segments."""
     period = campaign.timing.control_period
     runs = contacts.exclude_rows_after_gaps(
         [run for run in campaign.runs if run.kind in CONTACT_KINDS], model, period
@@ -130,7 +135,7 @@ def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[Logg
 
 
 def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:
-    """Return the contact frequency [Hz]."""
+    """Return the contact frequency [Hz], or an assumed value if the logs have no contact."""
     return (
         ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
     )
@@ -138,31 +143,40 @@ def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:
 
 def _condition_draws(
     draws: dict[str, np.ndarray],
-    first: Sequence[str],
+    used_keys: Sequence[str],
     frequency: float,
     prior: Mechanism | None,
     options: IdentificationOptions,
 ) -> tuple[dict[str, np.ndarray], dict[str, float], list[str]]:
-    """Condition the draws on the prior and on the fixed parameters that are not in `first`.
+    """Condition the draws on the prior, and on the fixed parameters that the fits have not used yet.
+
+    Args:
+        draws: Posterior draws by key.
+        used_keys: Keys of the fixed parameters that the fits have used.
+        frequency: Contact frequency [Hz].
+        prior: Prior mechanism, or None.
+        options: Options of the identification.
 
     Returns:
-        The draws of the other parameters, these fixed parameters by key, and notes on contradictions.
+        The draws without those of fixed parameters, the values that were conditioned on by key, and notes on
+        fixed values that contradict the logs.
     """
     if options.bayes and prior is not None:
         draws = conditioning.condition_on_prior(draws, prior, frequency, options.seed)
-    later = {key: value for key, value in options.fixed.items() if key not in first}
-    later = conditioning.split_lists(later, list(draws))
-    draws, denied = conditioning.condition_on_fixed(draws, later)
-    return draws, later, denied
+    fixed = {key: value for key, value in options.fixed.items() if key not in used_keys}
+    fixed = conditioning.split_lists(fixed, list(draws))
+    draws, contradictions = conditioning.condition_on_fixed(draws, fixed)
+    return draws, fixed, contradictions
 
 
 def _drop_undetermined_entries(
     draws_by_key: dict[str, np.ndarray],
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Drop the entries of the contact lists whose stiffness is hardly determined.
+    """Drop the entries of the contact lists whose stiffness the logs hardly determine.
 
     Returns:
-        The remaining draws, without any contact key if no entry is determined; and the vague stiffness keys.
+        The remaining draws, and the keys of the dropped stiffnesses. If the logs determine no entry, all
+        draws of the contact are dropped.
     """
     keys = [key for key in draws_by_key if key.startswith(STIFFNESS_PREFIX)]
     vague = [
@@ -175,30 +189,30 @@ def _drop_undetermined_entries(
             for key, draws in draws_by_key.items()
             if vague == [] or key.startswith(SIMULATOR_PREFIX)
         }, vague
-    # The remaining entries determine a damping that all entries share.
+    # If all entries share one damping, the remaining entries determine it.
     shared = sum(key.startswith("contact.damping.") for key in draws_by_key) == 1
     lists = (STIFFNESS_PREFIX,) if shared else (STIFFNESS_PREFIX, "contact.damping.")
     dropped = tuple(f"{name}{entry}" for name in lists for entry in entries)
-    left = {
+    remaining = {
         k: v
         for k, v in draws_by_key.items()
         if not any(k == key or k.startswith(f"{key}.") for key in dropped)
     }
-    return left, vague
+    return remaining, vague
 
 
 def _list_missing_parameters(
-    prior: Mechanism | None, model: MotionModel | None, contact: ContactFit | None, untold: bool
+    prior: Mechanism | None, model: MotionModel | None, contact: ContactFit | None, delay_is_unknown: bool
 ) -> tuple[str, ...]:
-    """Return the parameters that neither the logs nor the prior determine, each with the run that would.
+    """Return the parameters that neither the logs nor the prior determine, each with a remedy in words.
 
-    `untold` says that the force delay is one of them.
+    `delay_is_unknown` states that the logs do not determine the force delay and the user did not fix it.
     """
-    missing = ["rig.simulator (a run of kind free would)"] if model is None else []
-    if prior is None and untold:
-        missing.append(f"{FORCE_DELAY_KEY} (--fix would: of two clocks nobody knows the constant)")
+    missing = ["rig.simulator (add a run of kind free)"] if model is None else []
+    if prior is None and delay_is_unknown:
+        missing.append(f"{FORCE_DELAY_KEY} (specify it with --fix: the offset of the two clocks is unknown)")
     if prior is None and contact is None:
-        missing.append("contact.stiffness (a run of kind contact or press would)")
+        missing.append("contact.stiffness (add a run of kind contact or press)")
     return tuple(missing)
 
 
@@ -209,9 +223,9 @@ def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
 def _estimate_sensor_noise(
     runs: Mapping[str, Sequence[LoggedRun]],
 ) -> tuple[SensorNoise | None, SensorNoise | None]:
-    """Return the noise of the force and position sensors at rest.
+    """Return the noise of the force sensor and of the position sensor from runs at rest, or None.
 
-    The noise of the force sensor comes from free motion if no run is at rest.
+    If no run is at rest, the noise of the force sensor comes from free motion.
     """
     force = position = None
     for run in (*runs["rest"], *runs["free"]):
@@ -239,18 +253,22 @@ def _fit_and_check_contact(
     options: IdentificationOptions,
     say: ReportProgress,
 ) -> tuple[ContactFit | None, list[validation.CheckResult]]:
-    """Fit all contacts, and check a fit to most of them on those left out; None without contacts."""
+    """Fit the contact law to all contacts, and test a fit to some contacts on the others.
+
+    Returns:
+        The fit to all contacts, or None if there are none; and the checks of the test.
+    """
     if model is None or not runs:
         return None, []
     plane = options.fixed.get("rig.contact_plane")
-    say(f"fitting the contact to {len(runs)} touches")
+    say(f"fitting the contact to {len(runs)} runs")
     fit = contacts.fit_contact(
         runs, model, campaign.timing, force, options.law, plane, options.seed, dead_zone
     )
     if options.bootstrap:
-        say(f"fitting {options.bootstrap} times to contacts drawn again")
+        say(f"fitting {options.bootstrap} bootstrap samples of the contacts")
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
-    say("judging the fit by touches left out of it")
+    say("evaluating a fit on contacts that it does not use")
     left_out = select_held_out_contacts(runs, options.hold_out)
     if not left_out.any():
         return fit, []
@@ -267,18 +285,22 @@ def _check_result(
     touching: list[LoggedRun],
     options: IdentificationOptions,
 ) -> tuple[dict[str, Any] | None, list[validation.CheckResult]]:
-    """Return the mechanism, or None if its file is invalid, and the checks of that file or of the fits."""
-    written, refused = _parse_written_mechanism(mechanism)
+    """Check the mechanism file or, if none can be checked, the fits.
+
+    Returns:
+        The mechanism, or None if its file would be invalid; and the checks.
+    """
+    written, errors = _parse_written_mechanism(mechanism)
     lines = _check_written_file(campaign, written, motion if options.order is None else None)
     if lines is None:
-        lines = [*refused, *_check_fits(motion, contact, model, touching, campaign.equivalent_mass, written)]
-    return None if refused else mechanism, lines
+        lines = [*errors, *_check_fits(motion, contact, model, touching, campaign.equivalent_mass, written)]
+    return None if errors else mechanism, lines
 
 
 def _parse_written_mechanism(
     mechanism: dict[str, Any] | None,
 ) -> tuple[Mechanism | None, list[validation.CheckResult]]:
-    """Return the mechanism as its file would contain it, or that file's error as a line of the verdict."""
+    """Return the mechanism as read from its file, or a failed check if the file would be invalid."""
     if mechanism is None:
         return None, []
     try:
@@ -290,9 +312,15 @@ def _parse_written_mechanism(
 def _check_written_file(
     campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
 ) -> list[validation.CheckResult] | None:
-    """Check the written mechanism, as `identify --check` does.
+    """Compare the logs with the written mechanism, as `identify --check` does.
 
-    `motion` is fitted with any order. Returns None if no file is written or the file cannot be checked.
+    Args:
+        campaign: The logs.
+        written: The mechanism as read from its file, or None.
+        motion: Fit of the motion simulator without a specified order, or None.
+
+    Returns:
+        The checks, or None if there is no file or the logs cannot be compared with it.
     """
     if written is None or campaign.timing.two_clocks:
         return None
@@ -312,7 +340,7 @@ def _check_fits(
     mass: float,
     written: Mechanism | None,
 ) -> list[validation.CheckResult]:
-    """Check the fits themselves, if there is no file that can be checked."""
+    """Return the checks of the fits to free motion and contact."""
     frequency, lines = _estimate_frequency(contact, mass), []
     if motion is not None:
         lines = [
@@ -334,28 +362,32 @@ def _check_fits(
 
 
 def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a note for each parameter that is 0 in the file because the logs indicate a negative value."""
+    """Return a note for each parameter whose estimate is negative and therefore 0 in the file."""
     notes = []
     for key, draws in draws_by_key.items():
         if compute_bound_excess(key, draws) > 0.0:
-            interval = f"the logs say {draws.mean():.4g} +- {draws.std():.2g}, {get_unit(key)}"
+            estimate = f"the logs give {draws.mean():.4g} +- {draws.std():.2g}, {get_unit(key)}"
             notes.append(
-                f"{key}: {interval}: the file has its least value, 0, and the difference as uncertainty"
+                f"{key}: {estimate}: the file has the smallest allowed value, 0, and an uncertainty that "
+                "includes the difference"
             )
     return notes
 
 
 def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndarray:
-    """Return a flag for each run that is left out of a fit: a `share` of the contacts of each speed.
+    """Select the contacts that a test fit does not use: about a `share` of those at each approach speed.
 
-    At least one contact of each speed is left out if there are three or more.
+    If there are at least three contacts at a speed, at least one of them is selected.
+
+    Returns:
+        One flag per run, True if the run is selected.
     """
     flags = np.zeros(len(runs), bool)
     speeds = [round(1e4 * (run.speed or 0.0)) if run.kind == "contact" else -1 for run in runs]
     for speed in set(speeds) - {-1}:
         members = [i for i, speed_of_run in enumerate(speeds) if speed_of_run == speed]
         count = max(1, round(share * len(members))) if share > 0.0 and len(members) >= 3 else 0
-        # At regular intervals, so that contacts of every entry of the lists remain in the fit.
+        # Regular intervals leave contacts with every entry of the contact lists in the fit.
         for i in members[1 :: max(1, len(members) // max(count, 1))][:count]:
             flags[i] = True
     return flags
@@ -369,9 +401,15 @@ def _draw_parameters(
     share: float,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Return draws of every parameter by its key, in the key's unit.
+    """Return posterior draws of all parameters by key, in SI units.
 
-    `share` [s] is the part of the delays that belongs to the position sensor.
+    Args:
+        motion: Fit of the motion simulator, or None.
+        contact: Fit of the contact, or None.
+        model: Model of the motion simulator, or None.
+        frequency: Contact frequency [Hz].
+        share: Delay of the position sensor [s], which is part of the fitted delays.
+        seed: Seed of the random numbers.
     """
     result, lag = {}, np.zeros(POSTERIOR_DRAWS)
     if motion is not None and model is not None:
@@ -380,7 +418,8 @@ def _draw_parameters(
             model, motion.covariance, frequency, POSTERIOR_DRAWS, rng
         )
     if contact is not None:
-        # The force delay is relative to the motion, so an error of the motion's lag enters with a minus.
+        # The fit determines the sum of the motion's lag and the force delay, so their errors have opposite
+        # signs.
         result |= parameters.convert_contact_draws(contact)
         result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] - lag
     if motion is not None:
@@ -388,7 +427,7 @@ def _draw_parameters(
     if contact is not None:
         result[FORCE_DELAY_KEY] = result[FORCE_DELAY_KEY] + share
         if contact.drift is not None:
-            # No log shows the constant between two clocks, which adds to the force delay.
+            # The unknown offset between two clocks adds to the force delay, so the logs do not determine it.
             del result[FORCE_DELAY_KEY]
     return result
 
@@ -396,11 +435,11 @@ def _draw_parameters(
 def _select_fixed_before_fit(
     keys: Sequence[str], share: float, prior: Mechanism | None, options: IdentificationOptions
 ) -> dict[str, float]:
-    """Return the fixed parameters, and the position sensor's delay if it differs from the prior."""
-    first = {key: options.fixed[key] for key in keys if key in options.fixed}
+    """Return the fixed parameters among `keys`, and a position sensor delay that differs from the prior."""
+    fixed = {key: options.fixed[key] for key in keys if key in options.fixed}
     if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
-        first[POSITION_DELAY_KEY] = share
-    return first
+        fixed[POSITION_DELAY_KEY] = share
+    return fixed
 
 
 def _choose_position_delay(
@@ -409,7 +448,7 @@ def _choose_position_delay(
     prior: Mechanism | None,
     options: IdentificationOptions,
 ) -> float:
-    """Return the position sensor's delay [s]; it is raised if the force delay would be negative."""
+    """Return the position sensor's delay [s]: as specified, but increased if the force delay is negative."""
     if POSITION_DELAY_KEY in options.fixed:
         return options.fixed[POSITION_DELAY_KEY]
     specified = 0.0 if prior is None else prior.rig.position_sensor.delay
@@ -422,8 +461,10 @@ def _choose_position_delay(
 
 
 def _note_shifted_delay(fixed: Mapping[str, float], options: IdentificationOptions) -> list[str]:
-    """Return a note if an unspecified part of the motion's delay was assigned to the position sensor."""
+    """Return a note if the position sensor's delay was increased (see `_choose_position_delay`)."""
     if POSITION_DELAY_KEY not in fixed or POSITION_DELAY_KEY in options.fixed:
         return []
-    share = f"{1e3 * fixed[POSITION_DELAY_KEY]:.3g} ms of the motion's delay were taken as its"
-    return [f"the position sensor lags more than the force sensor: {share}"]
+    share = f"{1e3 * fixed[POSITION_DELAY_KEY]:.3g} ms of the motion's delay"
+    return [
+        f"the position sensor lags more than the force sensor: {share} are attributed to the position sensor"
+    ]

@@ -1,7 +1,8 @@
-"""Posterior of a contact behind a sensor with a lag, over delays that are approximately known.
+"""Posterior of the contact parameters for a force sensor with a first-order lag.
 
-A lag blurs the jump at the onset of damped contact, so no row causes a step in the likelihood as in
-`contact_profile`. At each delay the surface and the coefficients are then normal, by linear least squares.
+The lag smooths the jump of the force at the onset of damped contact. The likelihood therefore has no steps,
+unlike in `contact_profile`. At each force delay, linear least squares give a normal distribution of the
+surface position and the coefficients.
 """
 
 from __future__ import annotations
@@ -15,12 +16,19 @@ from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.normal_draws import factorise_covariance
 
-MAX_SURFACE_STD = 0.01  # m, largest standard deviation of the surface
-MAX_REDRAWS = 50  # at drawing damping coefficients >= 0
+MAX_SURFACE_STD = 0.01  # m, largest standard deviation of the surface position
+MAX_REDRAWS = 50  # repetitions of draws that contain a negative damping coefficient
 
 
 def compute_posterior_near(problem: ContactProblem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
-    """Return the posterior over evenly spaced delays [s], near a surface [m]."""
+    """Compute the posterior over a grid of force delays, starting from an approximate surface position.
+
+    Args:
+        problem: Contact problem with the lag of the sensor.
+        delays: Evenly spaced force delays [s].
+        plane: Approximate surface position [m].
+        seed: Seed of the random numbers.
+    """
     step, free = delays[1] - delays[0], problem.plane is None
     surfaces, fits, deviations, changes, heights = [], [], [], [], []
     for delay in delays:

@@ -1,14 +1,15 @@
-"""Choice of the contact law: the simplest law that predicts contacts to which it was not fitted.
+"""Choice of the contact law: the simplest law that predicts the contacts which were not used to fit it.
 
-Every law is fitted to the odd contacts and evaluated on the even ones, and vice versa (cross-validation), by
-the log likelihood of whole contacts. Acceptable laws lie within two standard errors of the best one, contact
-by contact; the law that the Bayesian information criterion prefers over all rows is also acceptable. The
-acceptable law with the fewest parameters is chosen. With fewer than four contacts only the criterion counts.
+Each law is fitted to the odd contacts and evaluated on the even contacts, and vice versa (cross-validation).
+The measure is the log likelihood of each contact. A law is acceptable if its total log likelihood is within
+two standard errors of that of the best law. The law with the best Bayesian information criterion is
+acceptable, too. Among the acceptable laws, the law with the fewest parameters is chosen. With fewer than four
+contacts, the information criterion replaces cross-validation.
 
-A law without damping is chosen only if the user names it. To first order a contact shows damping minus
-stiffness times the age of the force. Without damping, the delay absorbs this difference and gets an interval
-that is much too narrow. The Kelvin-Voigt law contains the linear one. For the same reason a law whose damping
-increases with the depth is chosen only if the contacts exclude damping at the onset.
+A law without damping is chosen only if the user names it. To first order, a contact determines only damping
+minus stiffness times force delay. A law without damping attributes this whole difference to the delay, whose
+interval is then much too narrow. The Kelvin-Voigt law includes the linear law. For the same reason, a law
+whose damping is zero at zero depth is chosen only if the contacts exclude damping at the onset.
 """
 
 from __future__ import annotations
@@ -29,26 +30,24 @@ from tuning.identification.deep_contact import representative
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 
-MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # contacts that cross-validation needs
-MAX_LIKELIHOOD_DEFICIT_ERRORS = (
-    2.0  # standard errors of the likelihood difference, within which laws are equally good
-)
-ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # standard errors beyond which damping at the onset is excluded
-ONSET_MARGIN = 1e-3  # s, time on either side of an onset or a release that the evaluation omits
+MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-validation
+# Standard errors of the difference in log likelihood; laws within it are equally good.
+MAX_LIKELIHOOD_DEFICIT_ERRORS = 2.0
+ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # standard errors; a larger deficit excludes damping at the onset
+ONSET_MARGIN = 1e-3  # s, time before and after an onset or a release that the evaluation omits
 
 
 @dataclass(frozen=True)
 class EvaluatedLaw:
-    """Contact law with its fit and its evaluation."""
+    """Contact law with its best fit and its log likelihood in cross-validation."""
 
     law: Law
-    delay: float  # s
-    plane: float  # m
-    misfit: float  # chi-squared over all contacts
-    likelihood: np.ndarray  # log likelihood of each contact under the fit to the others
-    likelihood_deficit: tuple[
-        float, float
-    ]  # deficit of the total log likelihood to the best law, and its standard error
+    delay: float  # s, force delay of the best fit
+    plane: float  # m, surface position of the best fit
+    misfit: float  # chi-squared of all contacts
+    likelihood: np.ndarray  # log likelihood of each contact under a fit that does not use it
+    # Total log likelihood of the best law minus that of this law, and the standard error of this difference.
+    likelihood_deficit: tuple[float, float]
 
 
 def choose_contact_law(
@@ -84,7 +83,7 @@ def choose_contact_law(
     preferred = min(results, key=lambda fit: fit.misfit + np.log(max(rows, 2)) * fit.law.complexity)
     # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
     damped = [fit for fit in results if "damping" in fit.law.names] or results
-    # The delay also absorbs damping at the onset if the law's damping starts at zero depth with zero.
+    # The delay also replaces damping at the onset if the damping of the law is zero at zero depth.
     least = min(fit.misfit for fit in results)
     at_once = [fit for fit in damped if has_onset_damping(fit.law)]
     if any(
@@ -100,7 +99,7 @@ def choose_contact_law(
         or fit.likelihood_deficit[0] <= MAX_LIKELIHOOD_DEFICIT_ERRORS * fit.likelihood_deficit[1] + 1e-9
     ]
     good = good or [min(damped, key=lambda fit: fit.likelihood_deficit[0])]
-    # Among laws of equal complexity the first one in the list wins: with the misfit, noise would decide.
+    # Among laws of equal complexity, the first one is chosen; the misfits would depend on noise.
     taken = min(good, key=lambda fit: fit.law.complexity)
     return [
         taken,
@@ -119,28 +118,34 @@ def _for_all(problem: ContactProblem, result: CoarseFit, lanes: np.ndarray) -> C
 
 
 def has_onset_damping(law: Law) -> bool:
-    """Return whether the law has a force at the surface that is proportional to the rate."""
+    """Return whether the law has damping at zero depth, so that the force jumps at the onset of contact."""
     surface, rate = np.zeros(1), np.ones(1)
     return any(
         np.any(value != 0.0) for value in (*law.entry_functions(surface, rate), *law.shared(surface, rate))
     )
 
 
-CoarseFit = tuple[float, float, float]  # delay, plane, misfit
-# Names of the laws that can be fitted, in the order of `list_law_families`.
+CoarseFit = tuple[float, float, float]  # delay [s], surface position [m], and chi-squared
+# Names of the laws that can be fitted to logs, in the order of `list_law_families`.
 FITTABLE_LAW_NAMES = tuple(name for name, law in CONTACT_LAWS.items() if law.families(1.0, 1))
 
 
 def list_law_families(
     deepest: float, entries: int, names: Sequence[str] | None = None
 ) -> list[RegressionFamily]:
-    """Return the families of all laws, or of those named; `deepest`: greatest depth of all contacts [m]."""
+    """Return the families of all laws that can be fitted to logs, or of the named laws.
+
+    Args:
+        deepest: Largest depth of all contacts [m].
+        entries: Number of entries in the contact lists.
+        names: Names of the laws, or None for all laws.
+    """
     laws = [CONTACT_LAWS[name] for name in FITTABLE_LAW_NAMES if names is None or name in names]
     return [family for law in laws for family in law.families(deepest, entries)]
 
 
 def _fit_shape(family: RegressionFamily, fit: Callable[[Law], CoarseFit]) -> tuple[Law, CoarseFit]:
-    """Return the law of the family that fits best, and its fit."""
+    """Return the best-fitting law of a family with a free shape parameter, and its fit."""
     if family.low == family.high:
         law = family.make(family.low)
         return law, fit(law)
@@ -150,22 +155,25 @@ def _fit_shape(family: RegressionFamily, fit: Callable[[Law], CoarseFit]) -> tup
         method="bounded",
         options={"xatol": 0.001 * (family.high - family.low)},
     )
-    # A common value of the exponent or shape is preferred if it fits nearly as well.
+    # A common value of the shape parameter is preferred if it fits nearly as well as the best value.
     as_good = (value for value in family.preferred if fit(family.make(value))[2] - optimum.fun < 4.0)
     law = family.make(next(as_good, float(optimum.x)))
     return law, fit(law)
 
 
 def _fit_coarsely(motion, readings, law, plane, guess: CoarseFit | None) -> CoarseFit:
-    """Return delay [s], surface [m] and misfit of the best fit, without the posterior."""
+    """Fit a law near a guess, or over all delays without a guess (see `search_coarsely`)."""
     problem = ContactProblem(motion, readings, law, plane)
     return search_coarsely(problem, guess)
 
 
 def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, reach: int = 4) -> CoarseFit:
-    """Return the best delay and surface from a coarse search.
+    """Return the force delay [s], surface position [m] and chi-squared of the best fit in a coarse search.
 
-    The search covers `reach` coarse steps on either side of a guess, or all delays without a guess.
+    Args:
+        problem: Contact problem.
+        guess: Approximate delay and surface position, or None to search all delays.
+        reach: Number of coarse delay steps on either side of the guess.
     """
     if guess is None:
         start = (
@@ -191,10 +199,10 @@ def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, rea
 
 
 def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess: CoarseFit) -> np.ndarray:
-    """Return a flag for each row within `ONSET_MARGIN` of an onset or a release, shape (rows, lanes).
+    """Return flags of the rows within `ONSET_MARGIN` of an onset or a release, shape (rows, lanes).
 
-    The force of a damped contact jumps there; the side on which a row falls carries no information on the
-    law.
+    The force of a damped contact jumps there. These rows are not used to compare laws, because their
+    residuals depend on the exact time of the jump.
     """
     delay, plane, _ = guess
     shortest = -max(motion.delay, 0.0)
@@ -205,7 +213,10 @@ def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess:
 
 
 def _cross_validate(motion, readings, judging: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
-    """Return the log likelihood of each contact under the fit to the contacts of the other parity."""
+    """Return the log likelihood of each odd contact under a fit to the even contacts, and vice versa.
+
+    With too few contacts, the result is one value: minus half the information criterion.
+    """
     lanes = readings.force.shape[1]
     if lanes < MIN_CONTACTS_FOR_CROSS_VALIDATION:
         size = law.complexity * np.log(max(readings.counts.sum(), 2)) / 2.0
@@ -224,6 +235,6 @@ def _cross_validate(motion, readings, judging: ForceReadings, law, plane, start:
 def compute_contact_misfits(
     problem: ContactProblem, readings: ForceReadings, delay, plane, coefficients
 ) -> np.ndarray:
-    """Return the sum of squared whitened residuals of each contact."""
+    """Return chi-squared of each contact: the sum of its squared residuals, whitened and normalized."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

@@ -1,4 +1,4 @@
-"""Check of logs against a mechanism file: its model is compared with every run; nothing is estimated."""
+"""Comparison of logs with a mechanism file, without estimating any parameter."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from tuning.identification.result import (
 )
 from tuning.identification.uncertainty_effect import UncertaintyEffect, compute_uncertainty_effect
 
-MIN_DELAY_STD = 2e-5  # s, least standard deviation of any delay
+MIN_DELAY_STD = 2e-5  # s, minimum standard deviation of a delay
 ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
 
 
 def check_against_mechanism(
     campaign: Campaign, mechanism: Mechanism, limit: float = 0.01, fitted: FreeMotion | None = None
 ) -> Identification:
-    """Compare logs with a mechanism, without estimating anything.
+    """Check whether a mechanism explains the logs of a rig, without estimating any parameter.
 
-    The noise of the force sensor comes from runs at rest or in free motion, else from the mechanism.
+    The noise of the force sensor is taken from runs at rest or in free motion, or else from the mechanism.
 
     Args:
         campaign: The logs.
         mechanism: Mechanism that the logs are compared with.
-        limit: Largest allowed effect on e and on e - e*.
-        fitted: Motion simulator fitted to the free runs with any order, if it is available. Only a fit
-            reveals a wrong hold or latency that the mechanism's delay compensates.
+        limit: Largest allowed effect of all defects on the restitution e, and on its error e - e*.
+        fitted: Motion simulator fitted to the free runs without a specified order, if available. Only a fit
+            reveals a wrong hold or latency for which the mechanism's delay compensates.
 
     Returns:
-        An identification without estimates.
+        An identification with checks and a verdict but without estimates.
 
     Raises:
         InputError: If the logs have neither free motion nor contact, or the contact law cannot be compared
@@ -63,7 +63,7 @@ def check_against_mechanism(
     mass, period = campaign.equivalent_mass, campaign.timing.control_period
     touches = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
     touches = contacts.exclude_rows_after_gaps(touches, model, period) if touches else []
-    touching = [piece for run in touches for piece in contacts.split_long_run(run, period)]
+    touching = [segment for run in touches for segment in contacts.split_long_run(run, period)]
     motion = free_motion.compare_free_motion(free, campaign.timing, model)
     contact = None
     if touching:
@@ -104,15 +104,23 @@ def check_against_mechanism(
 
 
 def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
-    """Return whether the dead zone is less certain than a reading: edges of contact are not predicted."""
+    """Return whether the dead zone's standard deviation exceeds the noise.
+
+    The readings at the onset and release of contact are then unpredictable.
+    """
     stated = mechanism.uncertainty.get("rig.force_sensor.dead_zone")
     return stated is not None and (stated.std or 0.0) > mechanism.rig.force_sensor.noise_std
 
 
 def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[validation.CheckResult]:
-    """Return a check of the effect of the file's own uncertainty, with advice for further runs.
+    """Check the effect of the parameters' uncertainty in a mechanism file on the restitution.
 
-    The list is empty if the file does not come from an identification.
+    Args:
+        effect: Effect of the uncertainty on e and on e - e*.
+        pressed: Whether the logs contain a press run.
+
+    Returns:
+        One check that recommends a further experiment; none if the file has no identified parameters.
     """
     if not effect.parts:
         return []
@@ -122,7 +130,7 @@ def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[val
         advice = suggest_experiment(*largest)
         if pressed and advice == PRESS_EXPERIMENT:
             advice = "a longer or stronger press run with a multisine to 45 Hz"
-        finding += f"; {advice} would tell them better"
+        finding += f"; {advice} would determine them better"
     return [
         validation.CheckResult(UNCERTAINTY_CHECK, finding, True, effect.restitution, on_error=effect.error)
     ]
@@ -131,37 +139,37 @@ def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[val
 def _make_contact_fit(
     runs: Sequence[LoggedRun], model: MotionModel, campaign: Campaign, mechanism: Mechanism
 ) -> ContactFit:
-    """Return the mechanism's contact in the form of a fit."""
+    """Return the mechanism's contact model as a `ContactFit`, so that the checks of fits apply to it."""
     rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
     law = mechanism_models.make_regression_law(contact)
     delay = rig.force_sensor.delay - rig.position_sensor.delay
     plane, lag = rig.contact_plane, rig.force_sensor.time_constant
     motion = MotionResponse(model, runs, campaign.timing, max(MAX_FORCE_DELAY, delay) + period)
     noise = _estimate_force_noise(campaign.runs)
-    hidden = rig.force_sensor.dead_zone > 0.0
+    has_dead_zone = rig.force_sensor.dead_zone > 0.0
     std, whitening = rig.force_sensor.noise_std, (1.0,)
     if noise is not None and not noise.silent:
         std, whitening = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
-    if hidden or not std:
+    if has_dead_zone or not std:
         whitening = (1.0,)
-    readings = ForceReadings.of(runs, std or 1.0, whitening, std if hidden else 0.0)
-    numbers = [
-        number
+    readings = ForceReadings.of(runs, std or 1.0, whitening, std if has_dead_zone else 0.0)
+    coefficients = [
+        coefficient
         for entry in readings.entries
-        for number in mechanism_models.get_regression_coefficients(contact, entry)
+        for coefficient in mechanism_models.get_regression_coefficients(contact, entry)
     ]
-    numbers.append(-rig.force_sensor.dead_zone if hidden else rig.force_sensor.bias)
-    values = np.array(numbers)
+    coefficients.append(-rig.force_sensor.dead_zone if has_dead_zone else rig.force_sensor.bias)
+    values = np.array(coefficients)
     if not std:
         std = _estimate_row_noise(ContactProblem(motion, readings, law, plane, lag), delay, plane, values)
         readings = ForceReadings.of(runs, std)
-    if hidden:
+    if has_dead_zone:
         predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
         readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))
     problem = ContactProblem(motion, readings, law, plane, lag)
     inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _draw_delay_and_surface(mechanism)
-    # The motion is only computed up to this delay.
+    # The motion is computed only up to the longest delay of the search.
     delays = np.clip(delays, problem.min_delay, max(MAX_FORCE_DELAY, delay))
     posterior = Posterior(
         ["delay", "plane", *problem.names],
@@ -171,11 +179,14 @@ def _make_contact_fit(
         (delay, plane, inner),
     )
     error = 0.0 if noise is None or noise.silent else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, (), problem, posterior, len(problem.kept), error, hidden)
+    return ContactFit(law, (), problem, posterior, len(problem.kept), error, has_dead_zone)
 
 
 def _estimate_force_noise(runs: Sequence[LoggedRun]) -> SensorNoise | None:
-    """Return the force sensor's noise at rest, else in free motion; None for fewer than 200 readings."""
+    """Return the force sensor's noise from the first run at rest, or else in free motion, with 200 readings.
+
+    Returns None if no run has as many readings.
+    """
     for kind in ("rest", "free"):
         for run in runs:
             if run.kind == kind and run.force_measured is not None:
@@ -186,14 +197,17 @@ def _estimate_force_noise(runs: Sequence[LoggedRun]) -> SensorNoise | None:
 
 
 def _estimate_row_noise(problem: ContactProblem, delay: float, plane: float, values: np.ndarray) -> float:
-    """Return the standard deviation [N] of the force that the law leaves unexplained, from row to row."""
-    left = problem.readings.force - problem.force(delay, plane, values)
-    steps = np.diff(left, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
+    """Return the noise of the force readings [N], estimated from differences of successive residuals."""
+    residual = problem.readings.force - problem.force(delay, plane, values)
+    steps = np.diff(residual, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
     return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)
 
 
 def _draw_delay_and_surface(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws of the relative force delay [s] and the surface [m] from the mechanism's uncertainty."""
+    """Draw the force delay and the surface position [m] from the mechanism's uncertainty.
+
+    The force delay [s] is relative to the delay of the position sensor.
+    """
     count, rig = validation.CONTACT_STATE_DRAWS, mechanism.rig
     drawn = draw(mechanism, count, 0)
 

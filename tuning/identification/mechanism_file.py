@@ -1,4 +1,4 @@
-"""Mechanism file of an identification: TOML text, with uncertainty and correlation."""
+"""Text of a mechanism file with the uncertainty and correlation of identified parameters."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from typing import Any
 
 import numpy as np
 
-MIN_CORRELATION_EIGENVALUE = 1e-6  # of the written correlation, which rounding must not make singular
+# least eigenvalue of the correlation matrix in the file, so that rounding does not make it singular
+MIN_CORRELATION_EIGENVALUE = 1e-6
 FILE_DIGITS = 12  # significant digits of numbers in the file
 
 
 def make_uncertainty_tables(
     keys: list[str], draws: np.ndarray, floors: np.ndarray, off: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Return `[uncertainty]` and `[correlation]` from draws.
+    """Return the tables `[uncertainty]` and `[correlation]` of a mechanism file from posterior draws.
 
-    The entries of a list have one standard deviation and are drawn independently; the correlation has one row
-    for all of them.
+    All entries of a list have the same standard deviation and one common row in the correlation matrix.
 
     Args:
-        keys: Dotted keys, with indices for entries of lists.
-        draws: Draws of the parameters, (draws, keys).
-        floors: Least standard deviation of each key.
-        off: Difference between the file's value and the mean of the draws for each key; it adds to the
-            uncertainty.
+        keys: Dotted keys of the parameters; the key of a list entry ends in its index.
+        draws: Draws of the parameters, shape (draws, keys).
+        floors: Minimum standard deviation of each parameter.
+        off: Value in the file minus the mean of the draws, for each key. It increases the uncertainty.
     """
     covariance = np.atleast_2d(np.cov(draws.T))
     covariance = covariance if off is None else covariance + np.outer(off, off)
@@ -67,7 +66,7 @@ def _strip_index(key: str) -> str:
 
 
 def set_value(document: dict[str, Any], key: str, value: float) -> None:
-    """Set the value of a dotted key, with indices for list entries, in a mechanism in form of tables."""
+    """Set the value at a dotted key in nested tables; the key of a list entry ends in its index."""
     *path, last = [int(part) if part.isdigit() else part for part in key.split(".")]
     table: Any = document
     for part in path:
@@ -76,7 +75,7 @@ def set_value(document: dict[str, Any], key: str, value: float) -> None:
 
 
 def to_toml(document: dict[str, Any], comment: str = "") -> str:
-    """Return a mechanism from `jaxhil.mechanism.file.to_builtins` as TOML text."""
+    """Return the TOML text of a mechanism in nested tables (`to_plain_data`), after an optional comment."""
     lines = [f"# {line}" for line in comment.splitlines()]
     tables: list[tuple[str, dict[str, Any]]] = []
 

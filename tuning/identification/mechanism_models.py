@@ -1,4 +1,4 @@
-"""Conversion of a mechanism file to the models that logs are compared with; nothing is estimated here."""
+"""Conversion of a mechanism file to the models of motion and contact that are compared with logs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
 from tuning.identification.contact_laws import Law
 from tuning.identification.rational import MotionModel, SimulatorStructure
 
-REAL_POLE_TOLERANCE = 1e-9  # imaginary part over magnitude of a pole, below which it is rounding
+# imaginary part over magnitude; a pole with a smaller ratio is real except for rounding
+REAL_POLE_TOLERANCE = 1e-9
 
 
 def make_motion_model(mechanism: Mechanism) -> MotionModel:
-    """Return the model from the command to the measured position, with the position sensor's delay."""
+    """Return the model from the commanded to the measured position, including the position sensor's delay."""
     simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
     numerator, denominator = _get_transfer_function(simulator)
     poles = np.roots(denominator)
@@ -32,7 +33,7 @@ def make_motion_model(mechanism: Mechanism) -> MotionModel:
 
 
 def _get_transfer_function(simulator: Simulator) -> tuple[list[float], list[float]]:
-    """Return numerator and denominator of G(s) in descending powers of s."""
+    """Return the coefficients of the numerator and denominator of G(s) in descending powers of s."""
     if simulator.model == "first_order" and simulator.time_constant:
         return [1.0], [simulator.time_constant, 1.0]
     if simulator.model == "second_order" and simulator.natural_frequency and simulator.damping_ratio:
@@ -46,16 +47,18 @@ def _get_transfer_function(simulator: Simulator) -> tuple[list[float], list[floa
 
 
 def make_regression_law(contact: Contact) -> Law:
-    """Return the law with its shape; each entry of the contact lists has separate coefficients.
+    """Return the contact law as a linear regression on functions of depth and rate.
+
+    Each entry of the contact lists has separate coefficients.
 
     Raises:
-        InputError: If the force of the law is not a sum of known functions of depth and rate.
+        InputError: If the law's force is not a linear combination of known functions of depth and rate.
     """
     chosen = laws.find_contact_law(contact.law)
     fitted = [
         name for name, law in laws.CONTACT_LAWS.items() if type(law).regression is not ContactLaw.regression
     ]
-    # A user-registered law is used in any case: its error names the missing method.
+    # A user-registered law without a regression raises an error that names the missing method.
     if contact.law not in fitted and type(chosen).__module__.startswith("jaxhil."):
         raise InputError(f"contact.law: found {format_value(contact.law)}, expected {', '.join(fitted)}")
     law = chosen.regression(contact)
@@ -67,7 +70,7 @@ def make_regression_law(contact: Contact) -> Law:
 
 
 def get_regression_coefficients(contact: Contact, entry: int) -> list[float]:
-    """Return the coefficients of `make_regression_law` for an entry of the contact's lists."""
+    """Return the coefficients of the law from `make_regression_law` for one entry of the contact lists."""
     stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
     damping = contact.damping[min(entry, len(contact.damping) - 1)]
     return laws.find_contact_law(contact.law).coefficients(contact, stiffness, damping)

@@ -1,10 +1,11 @@
-"""Motion of the mechanism at the times of the sensor readings, from the model and the logged commands.
+"""Motion of the mechanism at the times of the sensor readings, computed from the logged commands.
 
 The response of a linear motion simulator to held or linearly interpolated commands is known exactly at any
-time. A delay of any fraction of a period is therefore one row of coefficients times the state and the
-commands at both ends of a period (Van Loan 1978), as in `jaxhil.simulation.motion_curves` within the loop.
-All runs advance together, one per lane; before its first row, the command of a run moved uniformly. The
-resulting position and velocity have no noise.
+time. Within a control period it is a linear function of the state and of the commands at both ends of the
+period (Van Loan 1978). The position at any delay, also at a fraction of a period, is therefore exact and
+without noise. The loop's simulation uses the same method (`jaxhil.simulation.motion_curves`). All runs are
+computed together, one per lane (column of the arrays). The command of each run is assumed to move uniformly
+before its first row.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ import numpy as np
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
-TICK_TOLERANCE = 1e-9  # periods, distance within which a time counts as a tick
+TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the tick
 
 
 class MotionResponse:
-    """Response of one model to the commands of several runs."""
+    """Position and velocity of the mechanism in several runs, predicted from the commands by one model."""
 
     def __init__(
         self,
@@ -34,11 +35,12 @@ class MotionResponse:
         """Compute the states of the model at all ticks.
 
         Args:
-            model: Motion simulator.
+            model: Model of the motion simulator.
             runs: Runs, one per lane.
             timing: Timing of commands and readings.
-            longest: Longest delay after the model's own [s] that `at` receives.
-            late: Delay that a separate clock adds to each run [s]; `Run.force_late` is subtracted.
+            longest: Longest sensor delay [s] that `at` must accept, in addition to the model's delay.
+            late: Delay that a separate clock adds to the readings of each run [s], or None. The mean of
+                `LoggedRun.force_late` is subtracted from it.
         """
         self.delay, self.period = model.delay, timing.control_period
         if any(run.force_late is not None for run in runs):
@@ -53,18 +55,21 @@ class MotionResponse:
         self.A, self.B, self.C = _make_companion_form(numerator, denominator, self.period)
         longest = max(self.delay, 0.0) + longest + most
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
-        # Rows with readings of later ticks, and negative delays, need the commands of later ticks.
+        # If rows contain readings of later ticks, or a delay is negative, commands of later ticks are needed.
         ahead = max(1, -self.shift) + int(np.ceil((max(-self.delay, 0.0) - least) / self.period))
         command = self._commands(runs, ahead)
         latency = timing.command_latency
         self.end = command[1 : len(command) - latency]
         self.start = self.end if timing.command_hold == "zoh" else command[: len(command) - 1 - latency]
-        # Interval k of `start` and `end` spans ticks k + latency - history to the next.
+        # Interval k of `start` and `end` begins at tick k + latency - history and lasts one period.
         self.offset = self.history - latency
         self.states = self._advance(timing.command_hold)
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and velocity [m/s] that a sensor with this delay [s] reads, (rows, lanes)."""
+        """Return the position [m] and velocity [m/s] that a sensor with this delay [s] reads.
+
+        Both have the shape (rows, lanes).
+        """
         if self.late is None:
             return self._at(delay, slice(None))
         lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
@@ -76,7 +81,7 @@ class MotionResponse:
         fraction = min(1.0, 1.0 - (lag - whole_periods))
         first = self.offset - 1 - whole_periods
         if first < 0:
-            raise ValueError(f"a delay of {delay:g} s is longer than the history kept")
+            raise ValueError(f"delay: found {delay:g} s, expected at most `longest`")
         taken = slice(first, first + self.rows)
         start, end, states = self.start[taken, lanes], self.end[taken, lanes], self.states[taken, :, lanes]
         state, from_start, from_end = self._after(fraction)
@@ -96,7 +101,7 @@ class MotionResponse:
         return x, v
 
     def at_row_times(self) -> MotionResponse:
-        """Return the same motion at the times of the rows, without the times of the force readings."""
+        """Return the motion at the times of the log's rows instead of the times of the force readings."""
         rows = copy(self)
         rows.late = None
         return rows
@@ -111,9 +116,9 @@ class MotionResponse:
         return result
 
     def _commands(self, runs: Sequence[LoggedRun], ahead: int) -> np.ndarray:
-        """Return the commands with history and continuation, (history + rows + ahead, lanes).
+        """Return the commands before, during and after the runs, shape (history + rows + ahead, lanes).
 
-        The last command of a run is held.
+        After the last row of a run, its last command is held.
         """
         lanes = []
         for run in runs:
@@ -129,7 +134,10 @@ class MotionResponse:
         return np.array(lanes).T
 
     def _after(self, fraction: float):
-        """Return the matrices from state and both inputs of a period to the state after a fraction of it."""
+        """Return the matrices that advance the state by a fraction of a period.
+
+        They multiply the state, the input at the start of the period and the input at its end.
+        """
         n = self.order
         system = np.zeros((n + 2, n + 2))
         system[:n, :n], system[:n, n], system[n, n + 1] = self.A, self.B, 1.0
@@ -137,7 +145,7 @@ class MotionResponse:
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def _advance(self, hold: str) -> np.ndarray:
-        """Return the states at the start of every interval, (intervals + 1, order, lanes)."""
+        """Return the states at the start of every interval, shape (intervals + 1, order, lanes)."""
         state, from_start, from_end = self._after(1.0)
         lanes = self.end.shape[1]
         states = np.empty((len(self.end) + 1, self.order, lanes))
@@ -146,7 +154,7 @@ class MotionResponse:
         drive = from_start[:, None] * self.start[:, None] + from_end[:, None] * self.end[:, None]
         closed = np.eye(self.order) - state
         from_both = from_start + from_end
-        # A uniform motion, whose input grows by one step per period, has the state z = alpha + beta n.
+        # In uniform motion, the input grows by one step per period and the state is z = alpha + beta n.
         step = self.end[1] - self.end[0]
         beta = np.linalg.solve(closed, np.outer(from_both, step))
         ahead = from_both if hold == "zoh" else from_end
@@ -158,7 +166,10 @@ class MotionResponse:
 
 
 def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period: float):
-    """Return (A, B, C) with time in periods, from descending powers of s; empty for order 0."""
+    """Return the companion form (A, B, C) of a transfer function, with time in periods.
+
+    The coefficients are in descending powers of s. For order 0 the matrices are empty.
+    """
     order = len(denominator) - 1
     scale = period ** np.arange(order, -1.0, -1.0)
     below = denominator / scale
@@ -175,8 +186,7 @@ def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period:
 def compute_matrix_exponential(matrix: np.ndarray) -> np.ndarray:
     """Return the matrix exponential by scaling, Taylor series and squaring, accurate to rounding.
 
-    There are hundreds of small matrices; the general routine's choice of a method would take longer than the
-    method.
+    For hundreds of small matrices this is faster than SciPy's routine, which first chooses a method.
     """
     halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
     scaled, total = matrix / 2.0**halvings, np.eye(len(matrix))

@@ -1,9 +1,10 @@
-"""Noise of sensors at rest: level, bias, quantum, dead zone and colour.
+"""Noise statistics of a sensor at rest: mean, standard deviation, quantum, dead zone and autocorrelation.
 
-A reading that is rounded to a quantum only bounds the signal. Mean and standard deviation maximize the
-likelihood of the counts of each multiple, which remains correct if the noise is smaller than the quantum.
-Coloured noise is modelled as an autoregression (Yule-Walker equations, order by the Bayesian information
-criterion); its inverse whitens the residuals.
+A reading that is rounded to a quantum determines only an interval of the signal. The mean and the standard
+deviation therefore maximize the likelihood of the number of readings at each multiple of the quantum. This
+remains correct if the noise is smaller than the quantum. Coloured noise is modelled as an autoregression
+(Yule-Walker equations, order by the Bayesian information criterion); the inverse of the model whitens the
+residuals.
 """
 
 from __future__ import annotations
@@ -15,41 +16,43 @@ from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
 MAX_AUTOREGRESSION_ORDER = 8  # highest order of the autoregression
-MIN_READINGS_BEYOND_DEAD_ZONE = 20  # readings beyond a dead zone that an estimate needs
-MAX_DISTINCT_SHARE = 0.2  # ratio of distinct values to readings, below which the readings may be rounded
-MIN_EXCESS_ZERO_SHARE = 0.02  # share of exact zeros beyond those of rounding that indicates a dead zone
-MAX_LEAST_TO_MEAN_RATIO = 0.3  # largest ratio of least to mean reading of this kind of dead zone
+MIN_READINGS_BEYOND_DEAD_ZONE = 20  # minimum number of nonzero readings to estimate a dead zone
+MAX_DISTINCT_SHARE = 0.2  # distinct values per reading; readings with more distinct values are not rounded
+MIN_EXCESS_ZERO_SHARE = 0.02  # share of exact zeros, beyond those from rounding, that indicates a dead zone
+# Smallest over mean magnitude of the nonzero readings; a larger ratio excludes a dead zone that is
+# subtracted.
+MAX_LEAST_TO_MEAN_RATIO = 0.3
 MIN_ZERO_SHARE = 0.5  # share of exact zeros that indicates a dead zone without further tests
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of one sensor while nothing moves."""
+    """Noise statistics of one sensor, estimated from readings at rest and in the unit of the readings."""
 
-    mean: float  # of the readings, in their unit
-    std: float  # standard deviation, in the same unit
+    mean: float  # mean of the readings; 0 if a dead zone hides it
+    std: float  # standard deviation of the noise before rounding
     mean_std: float  # standard error of the mean
     std_std: float  # standard error of the standard deviation
     quantum: float  # step of rounded readings; 0 if they are not rounded
-    silent: bool  # whether a dead zone hides readings; the mean is then unknown
-    filter: tuple[float, ...]  # whitening filter, first coefficient 1
-    number: int  # of readings
-    drift: float = 0.0  # from the first to the last reading; 0 if it is below the noise
-    dead_zone: tuple[float, float] | None = None  # dead zone minus bias, and its standard error
+    silent: bool  # whether a dead zone hides the noise; the mean is then unknown
+    filter: tuple[float, ...]  # coefficients of the whitening filter; the first one is 1
+    number: int  # number of readings
+    drift: float = 0.0  # change from the first to the last reading; 0 if it is smaller than the noise
+    dead_zone: tuple[float, float] | None = None  # dead zone for a bias of 0, and its standard error
 
     @property
     def pole(self) -> float:
-        """Return the largest magnitude of the noise's poles; 0 for white noise."""
+        """Return the largest magnitude of the poles of the noise model; 0 for white noise."""
         return float(max(np.abs(np.roots(self.filter)), default=0.0))
 
     @property
     def innovation(self) -> float:
-        """Return the standard deviation of the whitened noise, in the unit of the readings."""
+        """Return the standard deviation of the noise after whitening, in the unit of the readings."""
         return self.std * float(np.sqrt(compute_whitened_share(self.filter)))
 
 
 def estimate_noise(readings: np.ndarray) -> SensorNoise:
-    """Return the noise of at least 20 finite readings on successive ticks."""
+    """Estimate the noise statistics of a sensor from at least 20 finite readings at successive ticks."""
     quantum = detect_quantum(readings)
     number = len(readings)
     if _has_excess_zeros(readings, quantum):
@@ -59,10 +62,10 @@ def estimate_noise(readings: np.ndarray) -> SensorNoise:
     readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
     rounded = quantum and not drift
     mean, std = _fit_rounded_normal(readings, quantum) if rounded else (readings.mean(), readings.std(ddof=1))
-    colour = fit_whitening_filter(readings - mean)
-    # The standard error of correlated readings follows from the noise spectrum at 0 Hz.
-    at_zero = np.sqrt(compute_whitened_share(colour)) / abs(np.sum(colour))
-    effective = 1.0 + 2.0 * np.sum(_autocorrelate(colour) ** 2)
+    whitening = fit_whitening_filter(readings - mean)
+    # The standard error of the mean of correlated readings follows from the noise spectrum at 0 Hz.
+    at_zero = np.sqrt(compute_whitened_share(whitening)) / abs(np.sum(whitening))
+    effective = 1.0 + 2.0 * np.sum(_autocorrelate(whitening) ** 2)
     # Rounding adds to the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
     return SensorNoise(
@@ -72,14 +75,14 @@ def estimate_noise(readings: np.ndarray) -> SensorNoise:
         float(width * np.sqrt(effective / (2.0 * number))),
         quantum,
         False,
-        colour,
+        whitening,
         number,
         drift,
     )
 
 
 def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
-    """Return whether more readings are exactly 0 than noise and rounding explain."""
+    """Return whether more readings are exactly 0 than noise and rounding can explain."""
     zero = readings == 0.0
     if np.mean(zero) > MIN_ZERO_SHARE and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return True
@@ -89,10 +92,14 @@ def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
 
 
 def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
-    """Return the noise's standard deviation, and the dead zone with its standard error.
+    """Estimate the noise and the dead zone of a sensor from readings at rest, assuming a bias of 0.
 
-    A normal value n is read as sign(n) max(|n| - D, 0). Dead zone D and standard deviation maximize the
-    likelihood, for a bias of 0. Readings with a gap around 0 have a dead zone of another kind.
+    The sensor is assumed to read a normal value n as sign(n) max(|n| - D, 0). The dead zone D and the
+    standard deviation maximize the likelihood.
+
+    Returns:
+        The standard deviation, and the dead zone with its standard error. They are 0 and None if too few
+        readings differ from 0, or if a gap around 0 shows a dead zone that is not subtracted.
     """
     size = np.abs(readings[readings != 0.0])
     zeros, number = len(readings) - len(size), len(size)
@@ -101,8 +108,8 @@ def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | N
 
     def cost(parameters):
         dead_zone, std = np.exp(parameters)
-        hidden = special.log_ndtr(-dead_zone / std)
-        inside = np.log(-np.expm1(np.log(2.0) + hidden)) if hidden < -np.log(2.0) else -np.inf
+        log_tail = special.log_ndtr(-dead_zone / std)
+        inside = np.log(-np.expm1(np.log(2.0) + log_tail)) if log_tail < -np.log(2.0) else -np.inf
         return -zeros * inside + 0.5 * np.sum(((size + dead_zone) / std) ** 2) + number * np.log(std)
 
     start = np.log([size.mean(), 2.0 * size.mean()])
@@ -121,19 +128,19 @@ def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | N
 
 
 def _estimate_drift(readings: np.ndarray) -> float:
-    """Return the linear drift from the first to the last reading, or 0 if the scatter is larger."""
+    """Return the linear drift from the first to the last reading, or 0 if it is smaller than the noise."""
     time = np.linspace(-0.5, 0.5, len(readings))
     drift = float(time @ (readings - readings.mean()) / (time @ time))
     return drift if abs(drift) > np.std(readings - drift * time) else 0.0
 
 
 def detect_quantum(readings: np.ndarray) -> float:
-    """Return the quantum to which readings are rounded, or 0 if they are not."""
+    """Return the quantum to which readings are rounded, or 0 for readings that are not rounded."""
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 2 or len(values) > MAX_DISTINCT_SHARE * len(readings):
         return 0.0
     scale = np.abs(values).max()
-    # A dead zone shifts the multiples on either side of 0 apart.
+    # A dead zone shifts positive and negative readings, so both signs are treated separately.
     sides = [values[values > 1e-12 * scale], values[values < -1e-12 * scale]]
     gaps = np.concatenate([np.diff(side) for side in sides])
     gaps = gaps[gaps > 1e-9 * scale]
@@ -146,7 +153,7 @@ def detect_quantum(readings: np.ndarray) -> float:
 
 
 def _fit_rounded_normal(readings: np.ndarray, quantum: float) -> tuple[float, float]:
-    """Return the maximum likelihood mean and standard deviation of rounded normal readings."""
+    """Return the maximum likelihood mean and standard deviation of normal values that were rounded."""
     values, counts = np.unique(np.round(readings / quantum), return_counts=True)
     middle, spread = np.average(values, weights=counts), readings.std() / quantum
 
@@ -167,7 +174,7 @@ def _fit_rounded_normal(readings: np.ndarray, quantum: float) -> tuple[float, fl
 
 
 def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
-    """Return the coefficients (1, -a1, -a2, ...) of the filter that whitens the values."""
+    """Fit an autoregressive model (a1, a2, ...) and return its whitening filter (1, -a1, -a2, ...)."""
     number = len(values)
     size = 1 << int(np.ceil(np.log2(2 * number)))
     power = np.abs(np.fft.rfft(values, size)) ** 2
@@ -184,21 +191,21 @@ def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in chosen)
 
 
-def _autocorrelate(colour: tuple[float, ...], longest: int = 200) -> np.ndarray:
-    """Return the autocorrelation of the noise at lags 1, 2, ... ."""
-    if len(colour) == 1:
+def _autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarray:
+    """Return the autocorrelation at lags 1 to `longest` of the noise with this whitening filter."""
+    if len(whitening) == 1:
         return np.zeros(1)
     impulse = np.zeros(4 * longest)
     impulse[0] = 1.0
 
-    answer = lfilter([1.0], colour, impulse)
-    correlation = np.correlate(answer, answer, "full")[len(answer) - 1 :]
+    response = lfilter([1.0], whitening, impulse)
+    correlation = np.correlate(response, response, "full")[len(response) - 1 :]
     return correlation[1 : longest + 1] / correlation[0]
 
 
-def compute_whitened_share(colour: tuple[float, ...]) -> float:
-    """Return the variance after the whitening filter over the variance before it."""
-    if len(colour) == 1:
+def compute_whitened_share(whitening: tuple[float, ...]) -> float:
+    """Return the variance of the noise after its whitening filter, divided by the variance before it."""
+    if len(whitening) == 1:
         return 1.0
-    rho = np.concatenate([[1.0], _autocorrelate(colour)])[: len(colour)]
-    return float(1.0 + np.asarray(colour[1:]) @ rho[1:])
+    rho = np.concatenate([[1.0], _autocorrelate(whitening)])[: len(whitening)]
+    return float(1.0 + np.asarray(whitening[1:]) @ rho[1:])

@@ -1,4 +1,4 @@
-"""Notes on an identification: assumptions and observations that are no estimates."""
+"""Notes on an identification: assumptions, and observations that no estimate expresses."""
 
 from __future__ import annotations
 
@@ -20,13 +20,21 @@ def collect_notes(
     force: SensorNoise | None,
     vague: Sequence[str],
 ) -> list[str]:
-    """Return notes on missing runs, vague parameters, and the noise and dead zone of the force."""
+    """Return notes on missing runs, on undetermined parameters, and on the force sensor.
+
+    Args:
+        motion: Fit of the motion simulator, or None.
+        contact: Fit of the contact, or None.
+        used: Fit of the contact if the mechanism file uses it, or None.
+        force: Noise of the force sensor at rest, or None.
+        vague: Keys of the stiffness entries that the logs hardly determine.
+    """
     notes = []
     if vague:
         taken = "the contact is the prior's" if used is None else "taken as the entry before it"
         notes.append(
             f"{', '.join(vague)}: known to {100 * MAX_RELATIVE_STD:.0f} % at best: {taken}; "
-            "more touches or deeper ones would tell it"
+            "more or deeper contacts would determine it"
         )
     if motion is None:
         notes.append("no free motion: the motion simulator is the prior's")
@@ -34,11 +42,11 @@ def collect_notes(
         notes.append("no contact: the contact and the force delay are the prior's")
     elif contact.drift is not None:
         rate, std = 1e6 * contact.drift.rate, 1e6 * contact.drift.std
-        gains = f"the forces' clock gains {rate:.3g} +- {std:.2g} ppm on the drives'"
-        notes.append(f"{gains}; a constant between them and {FORCE_DELAY_KEY} are one number: it is as told")
+        gains = f"the force clock gains {rate:.3g} +- {std:.2g} ppm on the drives' clock"
+        notes.append(f"{gains}; the logs do not show its offset, so {FORCE_DELAY_KEY} is as specified")
     if contact is not None and not contact.problem.damping_indices:
         notes.append(
-            f"law {contact.law.name}: without damping, as asked for; a damping b with a force delay longer "
+            f"law {contact.law.name}: without damping, as specified; a damping b with a force delay longer "
             "by b over the stiffness may explain the logs as well"
         )
     if contact is not None and contact.resampled:
@@ -46,19 +54,21 @@ def collect_notes(
     if force is not None and force.drift:
         notes.append(f"the force drifts at rest, by {force.drift:.3g} N from the first row to the last")
     if force is not None and force.pole > 0.5:
-        notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning weighs it as white")
+        notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning treats it as white")
     if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
-        notes.append(f"of the contact lists only entries {', '.join(map(str, entries))} were met")
+        notes.append(f"the logs contain only entries {', '.join(map(str, entries))} of the contact lists")
     if contact is not None and contact.dead_zone and contact.problem.plane is not None:
         spread = 1e3 * contacts.UNKNOWN_SURFACE_STD
         assumed = f"to be at 0 +- {spread:g} mm; --fix rig.contact_plane=VALUE specifies it"
-        taken = "as told" if contact.has_specified_surface else assumed
+        taken = "as specified" if contact.has_specified_surface else assumed
         notes.append(f"the force has a dead zone: the contact plane was taken {taken}")
     return notes
 
 
 def note_absent_dead_zone(contact: ContactFit | None, specified: float) -> list[str]:
-    """Return a note if a dead zone was specified but the readings show none."""
+    """Return a note if a dead zone [N] was specified but readings at rest do not show it."""
     if contact is None or contact.dead_zone or not specified:
         return []
-    return [f"{DEAD_ZONE_KEY}: {specified:g} N were told, but readings at rest show none: taken as none"]
+    return [
+        f"{DEAD_ZONE_KEY}: {specified:g} N specified, but readings at rest show no dead zone: none is used"
+    ]

@@ -17,25 +17,24 @@ from tuning.identification.rational import STRUCTURES
 class IdentificationOptions:
     """Options of an identification that the caller sets."""
 
-    order: int | None = None  # of the motion simulator; None: the smallest order that explains the lines
-    law: str | None = None  # contact law; None: the simplest law that predicts the contacts
-    fixed: Mapping[str, Any] = field(default_factory=dict)  # specified parameters by key, also lists
-    bayes: bool = False  # whether the prior's normal marginals are combined with the logs
-    hold_out: float = 0.2  # share of the contacts that are left out to evaluate the fit
-    bootstrap: int = 0  # number of bootstrap fits; 0: none
-    limit: float = 0.01  # largest effect of all defects on the restitution
-    calibration: float = 0.001  # relative uncertainty of the force sensor's scale
-    clock: float = 2e-5  # s, least uncertainty of a delay: no log shows an error of the clock
-    seed: int = 0
+    # order of the motion simulator; None: the smallest order that explains the spectra
+    order: int | None = None
+    law: str | None = None  # name of the contact law; None: the simplest law that predicts the contacts
+    fixed: Mapping[str, Any] = field(default_factory=dict)  # fixed parameters by key: numbers or lists
+    bayes: bool = False  # whether to combine the logs with the normal marginals of the prior
+    hold_out: float = 0.2  # share of the contacts that a test fit omits and is evaluated on
+    bootstrap: int = 0  # number of bootstrap fits; 0: no bootstrap
+    limit: float = 0.01  # largest allowed effect of all defects on the restitution
+    calibration: float = 0.001  # relative standard uncertainty of the force sensor's scale
+    clock: float = 2e-5  # s, minimum standard uncertainty of a delay: no log reveals an error of its clock
+    seed: int = 0  # seed of the random numbers
     scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
     kept: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap
 
 
-MIN_BOOTSTRAP_FITS = 20  # bootstrap fits that an estimate of the scatter needs
-KEYS_FIXED_BEFORE_FIT = (
-    "rig.contact_plane",
-    "rig.position_sensor.delay",
-)  # values that are used before the first fit
+MIN_BOOTSTRAP_FITS = 20  # minimum number of fits that determine the scatter
+# If these parameters are fixed, the first fit uses their values; all others are conditioned on afterwards.
+KEYS_FIXED_BEFORE_FIT = ("rig.contact_plane", "rig.position_sensor.delay")
 
 
 def check_options(options: IdentificationOptions, prior: Mechanism | None) -> None:

@@ -1,4 +1,4 @@
-"""Conversion of a fit's parameters and draws to the keys of a mechanism file."""
+"""Conversion of fitted parameters and posterior draws to the keys of a mechanism file."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ SIMULATOR_PREFIX = "rig.simulator."
 
 
 def make_simulator_section(model: MotionModel) -> dict[str, Any]:
-    """Return the section `rig.simulator` of a mechanism file."""
-    many, values = model.structure, np.exp(model.parameters[: model.structure.order])
+    """Return the section `rig.simulator` of a mechanism file that describes the model."""
+    structure, values = model.structure, np.exp(model.parameters[: model.structure.order])
     delay = {"delay": float(max(model.delay, 0.0))}
-    if many.order == 0:
+    if structure.order == 0:
         return {"model": "ideal", **delay}
-    if many.name == "first_order":
+    if structure.name == "first_order":
         return {"model": "first_order", "time_constant": float(values[0]), **delay}
-    if many.name == "second_order":
+    if structure.name == "second_order":
         natural = {"natural_frequency": float(values[0] / (2.0 * np.pi)), "damping_ratio": float(values[1])}
         return {"model": "second_order", **natural, **delay}
     numerator, denominator = model.fraction
-    if many.name == "third_order":
+    if structure.name == "third_order":
         return {
             "model": "third_order",
             "coefficients": [float(value) for value in denominator[-2::-1]],
@@ -45,10 +45,20 @@ def make_simulator_section(model: MotionModel) -> dict[str, Any]:
 def draw_simulator_parameters(
     model: MotionModel, covariance: np.ndarray, frequency: float, count: int, rng
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return draws by key, and the deviation of the lag at a frequency [Hz] in each draw [s].
+    """Draw the parameters of the motion simulator from a normal distribution.
 
-    First- and second-order models have keys for all their parameters. For other models only the delay is
-    uncertain: it takes the deviation of the lag at the contact frequency.
+    For first- and second-order models, all parameters are drawn. For other models, only the delay is drawn;
+    it takes the whole deviation of the phase delay at the contact frequency.
+
+    Args:
+        model: Fitted model.
+        covariance: Covariance of the model's parameters.
+        frequency: Contact frequency [Hz].
+        count: Number of draws.
+        rng: Random number generator.
+
+    Returns:
+        Draws by key, and the deviation of the phase delay at the contact frequency in each draw [s].
     """
     deviations = rng.standard_normal((count, len(covariance))) @ factorise_covariance(covariance).T
     s = np.array([2j * np.pi * frequency])
@@ -71,7 +81,7 @@ def draw_simulator_parameters(
 
 
 def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
-    """Return draws by key; the key of an entry of a list ends in its index."""
+    """Return the posterior draws of the contact by key; the key of a list entry ends in its index."""
     draws = contact.draws()
     draws_by_name = dict(zip(contact.posterior.names, draws.T, strict=True))
     result = {"rig.force_sensor.delay": draws_by_name["delay"]}
@@ -94,7 +104,7 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
 
 
 def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
-    """Return the section `contact` of a mechanism file from values by key."""
+    """Return the section `contact` of a mechanism file for a law with the given values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
     stiffness = _collect_entries(values, "contact.stiffness.")
     segmented = find_contact_law(law.name).segmented
@@ -105,7 +115,7 @@ def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
 
 
 def _collect_entries(values: dict[str, float], prefix: str) -> list[list[float]]:
-    """Return the values of a list's entries in order; a missing entry repeats the one before it."""
+    """Return the list entries whose keys begin with `prefix`; a missing entry repeats the previous entry."""
     entries: dict[int, list[float]] = {}
     for key in sorted(key for key in values if key.startswith(prefix)):
         entries.setdefault(int(key[len(prefix) :].split(".")[0]), []).append(values[key])

@@ -1,7 +1,8 @@
-"""Surface position of a press that never leaves the contact, from the force sensor's bias.
+"""Surface position from a press run that never leaves the contact, by means of the force sensor's bias.
 
-Within such a contact, a bias b and a surface that is further away by b / K have the same readings. A run at
-rest or in free motion determines the bias. Without one the surface is not observable.
+In such a run, a bias b has the same effect on the readings as a surface that is closer by b / K, with the
+stiffness K. The surface position is therefore observable only if a run at rest or in free motion determines
+the bias.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import SensorNoise
 from tuning.identification.records import LoggedRun
 
-TYPICAL_FORCE_DELAY = 0.005  # s, typical delay of a force sensor, accurate enough to detect a release
-SHALLOW_ROW_SHARE = 0.01  # share of the least deep rows, at which a press may leave the contact
-MIN_MEAN_ROWS = 20  # rows for a mean
-RELEASE_FORCE_SHARE = 0.2  # share of the range of the force above the line through deeper readings: release
-MIN_BIAS_STD_RATIO = 0.1  # least standard deviation of the bias from run to run, over the noise
+TYPICAL_FORCE_DELAY = 0.005  # s, typical delay of a force sensor; accurate enough to detect a release
+SHALLOW_ROW_SHARE = 0.01  # share of the rows with the smallest depth, at which a press may leave the contact
+MIN_MEAN_ROWS = 20  # minimum number of rows for a mean
+# Force above the line through deeper readings, over the range of the force; a larger ratio shows a release.
+RELEASE_FORCE_SHARE = 0.2
+MIN_BIAS_STD_RATIO = 0.1  # minimum standard deviation of the bias between runs, over that of the noise
 
 
 def find_bias_prior(
     runs: Sequence[LoggedRun], motion: MotionResponse, noise: SensorNoise | None, plane: float | None
 ) -> tuple[float, float] | None:
-    """Return the bias of the force sensor and its standard deviation [N] if the runs cannot determine it.
+    """Return a prior of the force sensor's bias if the runs in contact cannot determine the bias.
 
     Args:
         runs: Runs in contact.
@@ -34,7 +36,8 @@ def find_bias_prior(
         plane: Position of the surface [m], if it is specified.
 
     Returns:
-        None if a run leaves the contact or the surface is specified; the readings then determine the bias.
+        Mean and standard deviation of the bias [N]; or None if a run leaves the contact or the surface is
+        specified, so that the readings determine the bias.
 
     Raises:
         InputError: If neither the runs nor readings at rest determine the bias.
@@ -44,9 +47,9 @@ def find_bias_prior(
     if noise is None:
         names = ", ".join(dict.fromkeys(to_one_line(run.source) for run in runs))
         raise InputError(
-            f"{names}: force_measured: found a press that never leaves the contact, which does not tell the "
-            "sensor's bias from the surface's place, expected touches, or a run of kind rest or free with "
-            "this channel, or --fix rig.contact_plane=..."
+            f"{names}: force_measured: found a press that never leaves the contact, which cannot distinguish "
+            "the sensor's bias from the surface position, expected also contacts, a run of kind rest or free "
+            "with this channel, or --fix rig.contact_plane=..."
         )
     return noise.mean, float(np.hypot(np.hypot(noise.mean_std, noise.drift), MIN_BIAS_STD_RATIO * noise.std))
 
@@ -54,9 +57,9 @@ def find_bias_prior(
 def find_surface_of_press(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return the position [m] at which the line through the forces of a press equals the bias.
+    """Return the surface position [m]: where the line through the forces of a press reaches the bias.
 
-    Returns None if the line does not rise.
+    Returns None if the force does not increase with the position.
     """
     x, f = position[counts], force[counts] - bias[0]
     slope, at_zero = _fit_line(x, f)
@@ -64,7 +67,7 @@ def find_surface_of_press(
 
 
 def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
-    """Return whether the least deep readings lie above the line through deeper ones: a release."""
+    """Return whether a press leaves the contact, so that forces at small depths exceed the linear trend."""
     position, _ = motion.at(TYPICAL_FORCE_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):
@@ -83,7 +86,7 @@ def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
 
 
 def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return slope and value at 0 of the least-squares line through points."""
+    """Return the slope of the least-squares line through points, and its value at x = 0."""
     away = x - np.mean(x)
     power = float(away @ away)
     slope = float(away @ y) / power if power else 0.0

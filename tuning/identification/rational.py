@@ -1,12 +1,12 @@
-"""Motion simulators as products of first- and second-order sections with a delay, fitted to spectra.
+"""Models of the motion simulator: first- and second-order sections with a delay, fitted to spectra.
 
     H(s) = N(s) e^{-s tau} / (prod (1 + T s) prod (1 + 2 zeta s/w + s^2/w^2)),  N = 1 + c1 s + c2 s^2
 
-Time constants, natural frequencies and damping ratios are fitted as logarithms, so that they remain positive
-and the model stable. The maximum likelihood fit weights every line by its noise (Pintelon and Schoukens,
-System Identification: A Frequency Domain Approach, 2012). The model includes the hold, so the covariance of a
-fit refers to the parameters of the rig itself. Linear fits over a grid of delays give the starting values
-(Sanathanan and Koerner 1963). Only NumPy and SciPy are used.
+The logarithms of time constants, natural frequencies and damping ratios are fitted, so that the model remains
+stable. The maximum likelihood fit weights every spectral line by its noise (Pintelon and Schoukens, System
+Identification: A Frequency Domain Approach, 2012). The model includes the command hold, so that the fitted
+parameters are those of the rig itself. The starting values come from linear fits over a grid of delays
+(Sanathanan and Koerner 1963).
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
-MIN_TIME_CONSTANT = 1e-6  # s, least time constant
+MIN_TIME_CONSTANT = 1e-6  # s; faster poles cannot be resolved
 
 
 @dataclass(frozen=True)
 class SimulatorStructure:
-    """Numbers of sections of each kind in a model."""
+    """Structure of a model: number of first-order sections, second-order sections and zeros."""
 
     name: str
-    first: int  # sections 1 + T s
-    second: int  # sections 1 + 2 zeta s/w + s^2/w^2
+    first: int  # number of sections 1 + T s
+    second: int  # number of sections 1 + 2 zeta s/w + s^2/w^2
     zeros: int  # degree of N(s)
 
     @property
@@ -39,7 +39,7 @@ class SimulatorStructure:
 
     @property
     def size(self) -> int:
-        """Return the number of parameters, delay included."""
+        """Return the number of parameters, including the delay."""
         return self.order + self.zeros + 1
 
 
@@ -56,21 +56,21 @@ STRUCTURES = (
 
 @dataclass(frozen=True)
 class SpectralLines:
-    """Spectra at the excited lines, and the conversion of the command to the drives' input."""
+    """Measured spectra of command and position at the excited frequency lines, with the command timing."""
 
     frequency: np.ndarray  # Hz
-    command: np.ndarray  # complex
-    output: np.ndarray  # complex, in the command's unit
-    std: np.ndarray  # of the output's complex noise: E|n|^2 = std^2
+    command: np.ndarray  # complex amplitude of the commanded position
+    output: np.ndarray  # complex amplitude of the measured position, in the command's unit
+    std: np.ndarray  # standard deviation of the output's complex noise n: E|n|^2 = std^2
     period: float  # s, control period
     hold: str  # "zoh" or "linear"
-    latency: int  # periods
-    shift: int = 0  # periods by which readings lag the command of their row
+    latency: int  # periods, latency of the command
+    shift: int = 0  # periods by which the readings of a row are older than its command
 
     @cached_property
-    def copies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return s of every copy of each line, and the command there after the hold."""
-        frequencies = holds.compute_copy_frequencies(self.frequency, self.period)
+    def images(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return s = 2 pi j f and the drive input at every spectral image of each line, (images, lines)."""
+        frequencies = holds.compute_image_frequencies(self.frequency, self.period)
         return 2j * np.pi * frequencies, self.command * holds.compute_hold_response(
             frequencies, self.period, self.hold, self.latency, self.shift
         )
@@ -81,7 +81,10 @@ class SpectralLines:
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Structure with its parameters: [log T ..., log w, log zeta ..., c ..., delay]."""
+    """Model of the motion simulator: a structure with values of its parameters.
+
+    The parameters are [log T ..., log w, log zeta ..., c ..., delay], with T, 1/w and the delay in s.
+    """
 
     structure: SimulatorStructure
     parameters: np.ndarray
@@ -101,7 +104,7 @@ class MotionModel:
 
     @cached_property
     def sections(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return N and the sections of the denominator, coefficients in ascending powers of s."""
+        """Return the coefficients of N and of each denominator section, in ascending powers of s."""
         many, values = self.structure, np.asarray(self.parameters, float)
         parts = [np.array([1.0, time]) for time in np.exp(values[: many.first])]
         for w, zeta in np.exp(values[many.first : many.order]).reshape(-1, 2):
@@ -110,7 +113,7 @@ class MotionModel:
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return numerator and denominator in descending powers of s, as in mechanism files."""
+        """Return the coefficients of numerator and denominator in descending powers of s."""
         numerator, parts = self.sections
         denominator = np.array([1.0])
         for part in parts:
@@ -118,12 +121,12 @@ class MotionModel:
         return numerator[::-1], denominator[::-1]
 
     def response(self, s: np.ndarray) -> np.ndarray:
-        """Return H(s), delay included."""
+        """Return H(s), including the delay."""
         numerator, denominator = self.fraction
         return np.polyval(numerator, s) / np.polyval(denominator, s) * np.exp(-s * self.delay)
 
     def slopes(self, s: np.ndarray) -> np.ndarray:
-        """Return d log H / d parameter, shape (parameters, *s)."""
+        """Return the derivatives of log H(s) with respect to the parameters, shape (parameters, *s.shape)."""
         numerator, parts = self.sections
         many, rows = self.structure, []
         for part in parts[: many.first]:
@@ -136,12 +139,12 @@ class MotionModel:
         return np.array([*rows, -s])
 
     def predict(self, lines: SpectralLines) -> np.ndarray:
-        """Return the spectrum of the output."""
-        s, command = lines.copies
+        """Return the predicted complex amplitude of the measured position at each line."""
+        s, command = lines.images
         return np.sum(self.response(s) * command, axis=0)
 
     def bandwidth(self) -> float:
-        """Return the lowest frequency [Hz] at which |H| has fallen by 3 dB; inf for an ideal simulator."""
+        """Return the -3 dB bandwidth [Hz]; infinite for an ideal motion simulator."""
         if self.structure.order == 0:
             return np.inf
         poles = np.abs(np.roots(self.fraction[1]))
@@ -159,15 +162,15 @@ class MotionModel:
 
 @dataclass(frozen=True)
 class SpectrumFit:
-    """Model fitted to lines."""
+    """Model fitted to measured spectra, with the covariance of its parameters and the residuals."""
 
     model: MotionModel
-    covariance: np.ndarray  # of the parameters, from the curvature at the stated noise
-    residual: np.ndarray  # complex, whitened: E|r|^2 = 1
+    covariance: np.ndarray  # covariance of the parameters, from the curvature of the likelihood
+    residual: np.ndarray  # complex residual r at each line over its noise: E|r|^2 = 1
 
     @property
     def chi2(self) -> float:
-        """Return chi-squared, with as many degrees of freedom as real numbers in the residual."""
+        """Return chi-squared: the sum of squares of real and imaginary residuals of unit variance."""
         return float(2.0 * np.sum(np.abs(self.residual) ** 2))
 
     @property
@@ -180,22 +183,22 @@ class SpectrumFit:
 
 
 def fit_structure(structure: SimulatorStructure, lines: SpectralLines) -> SpectrumFit:
-    """Return the maximum likelihood fit, by Levenberg-Marquardt from the best linear start."""
+    """Fit a structure to spectra by maximum likelihood (Levenberg-Marquardt from the best linear fit)."""
     candidates = sorted(
         (_fit_linear_start(structure, lines, delay) for delay in _make_delay_grid(lines)), key=lambda c: c[0]
     )
-    # Neighbouring starts converge to the same minimum; the best start with a distant delay may not.
-    tried = [_refine_fit(structure, candidates[0][1], lines)]
+    # Starting values with similar delays converge to the same minimum, so the second one has a distant delay.
+    fits = [_refine_fit(structure, candidates[0][1], lines)]
     for _, start in candidates[1:]:
         if structure.order > 1 and abs(start[-1] - candidates[0][1][-1]) > 2.0 * lines.period:
-            tried.append(_refine_fit(structure, start, lines))
+            fits.append(_refine_fit(structure, start, lines))
             break
-    return min(tried, key=lambda candidate: candidate.chi2)
+    return min(fits, key=lambda candidate: candidate.chi2)
 
 
 def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: SpectralLines) -> SpectrumFit:
-    """Return the fit that Levenberg-Marquardt reaches from a start."""
-    s, command = lines.copies
+    """Fit a structure by the Levenberg-Marquardt method from the starting parameters `start`."""
+    s, command = lines.images
     scale = np.sqrt(2.0) / lines.std
 
     def split(values):
@@ -225,13 +228,13 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
 
 
 def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters with unresolvable poles, those beyond 1/SHORTEST, moved there."""
+    """Return the parameters with all poles limited to a magnitude of 1 / `MIN_TIME_CONSTANT`."""
     first, order = structure.first, structure.order
     times = np.maximum(parameters[:first], np.log(MIN_TIME_CONSTANT))
     sections = []
     fastest = -np.log(MIN_TIME_CONSTANT)
     for frequency, ratio in parameters[first:order].reshape(-1, 2):
-        if ratio > 0.0:  # two real poles, here by their logarithms
+        if ratio > 0.0:  # damping ratio above 1: two real poles, as logarithms
             slower = frequency - ratio - np.log1p(np.sqrt(1.0 - np.exp(-2.0 * ratio)))
             faster, slower = min(2.0 * frequency - slower, fastest), min(slower, fastest)
             frequency = 0.5 * (slower + faster)
@@ -242,14 +245,14 @@ def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> 
 
 
 def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
-    """Return a grid of delays [s] from 0 to the largest one that the phase of the lowest lines allows."""
-    s, command = lines.copies
+    """Return a grid of delays [s] from 0 to the largest delay that the phase of the lowest lines allows."""
+    s, command = lines.images
     middle = len(s) // 2
     phase = np.unwrap(np.angle(lines.output / command[middle]))
-    few = slice(0, max(3, len(lines) // 8))
-    weight = np.abs(command[middle][few]) / lines.std[few]
-    f = lines.frequency[few]
-    slope = -np.sum(weight**2 * f * phase[few]) / np.sum(weight**2 * f**2) / (2.0 * np.pi)
+    lowest = slice(0, max(3, len(lines) // 8))
+    weight = np.abs(command[middle][lowest]) / lines.std[lowest]
+    f = lines.frequency[lowest]
+    slope = -np.sum(weight**2 * f * phase[lowest]) / np.sum(weight**2 * f**2) / (2.0 * np.pi)
     longest = max(slope, lines.period)
     return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
 
@@ -257,8 +260,11 @@ def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
 def _fit_linear_start(
     structure: SimulatorStructure, lines: SpectralLines, delay: float
 ) -> tuple[float, np.ndarray]:
-    """Return chi-squared and parameters of the linear fit with a given delay, without the copies."""
-    s, command = lines.copies
+    """Fit a structure with a given delay by linear least squares; return chi-squared and the parameters.
+
+    The fit neglects the spectral images.
+    """
+    s, command = lines.images
     s, command = s[len(s) // 2], command[len(s) // 2]
     unit = 1.0 / np.abs(s).mean()
     p = s * unit
@@ -274,10 +280,10 @@ def _fit_linear_start(
             scaled = (weight / np.abs(below))[:, None]
             left, right = basis * scaled, (1.0 - target)[:, None] * scaled
             table = np.concatenate([left.real, left.imag])
-            aim = np.concatenate([right.real, right.imag])[:, 0]
+            right_side = np.concatenate([right.real, right.imag])[:, 0]
             size = np.linalg.norm(table, axis=0)
             normal = table.T @ table / np.outer(size, size) + 1e-12 * np.eye(len(size))
-            solved = np.linalg.solve(normal, table.T @ aim / size) / size
+            solved = np.linalg.solve(normal, table.T @ right_side / size) / size
             below = 1.0 + sum(solved[zeros + i - 1] * p**i for i in range(1, order + 1))
         above = solved[:zeros] * unit ** np.arange(1, zeros + 1)
         polynomial_below = np.array([1.0, *solved[zeros:]])
@@ -287,7 +293,13 @@ def _fit_linear_start(
 
 
 def _convert_sections(structure: SimulatorStructure, denominator: np.ndarray, unit: float) -> list[float]:
-    """Return the logarithms of the sections' parameters, from a denominator in rising powers of s `unit`."""
+    """Return the logarithms of the sections' parameters.
+
+    Args:
+        structure: Structure of the model.
+        denominator: Coefficients in ascending powers of s times `unit`.
+        unit: Unit of time of the coefficients [s].
+    """
     roots = polynomial.polyroots(denominator)
     poles = np.where(roots.real > 0.0, -roots.conj(), roots) / unit
     poles = np.where(

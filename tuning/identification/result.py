@@ -1,4 +1,4 @@
-"""Result of an identification: estimates, their uncertainty and correlation, and the verdict."""
+"""Result of an identification: estimates with their uncertainty, checks, and the verdict."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.noise import SensorNoise
 from tuning.identification.validation import CheckResult
 
-UNCERTAINTY_CHECK = "uncertainty of the numbers"  # name of a check
-MIN_CONFOUNDED_CORRELATION = 0.95  # magnitude of a correlation, above which two parameters are confounded
+UNCERTAINTY_CHECK = "uncertainty of the numbers"  # name of the check of the parameters' uncertainty
+MIN_CONFOUNDED_CORRELATION = 0.95  # magnitude of the correlation; above it, two parameters are confounded
 
 PRESS_EXPERIMENT = "a press run with a multisine to 45 Hz"
 WIDER_MULTISINE = "a multisine to 1.5 times the bandwidth or more"
-# Experiments that separate a pair of parameters, by its keys.
+# Experiments that separate two confounded parameters, by the keys of both.
 EXPERIMENTS = {
     ("rig.force_sensor.delay", "contact.damping"): PRESS_EXPERIMENT,
     ("rig.force_sensor.time_constant", "contact.damping"): PRESS_EXPERIMENT,
@@ -35,30 +35,59 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of one parameter of the mechanism file."""
+    """Estimate of one parameter of the mechanism file, with its uncertainty.
 
-    key: str  # dotted path; for an entry of a list it ends in the index
+    Attributes:
+        key: Dotted path of the parameter; the path of a list entry ends in its index.
+        value: Estimate, in `unit`.
+        std: Standard deviation, in `unit`; 0 if the value was specified.
+        low: Lower end of the 95 % interval, in `unit`.
+        high: Upper end of the 95 % interval, in `unit`.
+        unit: SI unit.
+        is_fixed: Whether the user or the prior specified the value.
+    """
+
+    key: str
     value: float
-    std: float  # in the key's unit; 0 if it was specified
-    low: float  # lower end of the 95 % interval
-    high: float  # upper end
+    std: float
+    low: float
+    high: float
     unit: str
-    is_fixed: bool = False  # whether the prior or the caller specified it
+    is_fixed: bool = False
 
 
 @dataclass(frozen=True)
 class Identification:
-    """Complete result of an identification."""
+    """Complete result of an identification.
+
+    Attributes:
+        estimates: Estimates of all parameters.
+        draws: Posterior draws of the parameters that were not specified, in the order of `estimates`, shape
+            (draws, parameters).
+        combinations: Parameter combinations that the logs determine better than the single parameters.
+        confounded: Pairs of confounded parameters: two keys, their correlation, and the experiment that
+            separates
+            them.
+        lines: Results of the checks.
+        mechanism: Content of a mechanism file, or None if a value is missing or invalid.
+        limit: Largest allowed sum of the defects' effects, on the restitution e and on its error e - e*.
+        notes: Remarks in words.
+        missing: Parameters that neither the logs nor the prior determine, each with a remedy.
+        motion: Fit of the motion simulator, or None.
+        contact: Fit of the contact, or None.
+        force_noise: Noise of the force sensor at rest, or None.
+        position_noise: Noise of the position sensor at rest, or None.
+    """
 
     estimates: tuple[Estimate, ...]
-    draws: np.ndarray  # (draws, estimates that were not specified), in their order
-    combinations: tuple[Estimate, ...]  # combinations that the logs determine better than their parts
-    confounded: tuple[tuple[str, str, float, str], ...]  # two keys, correlation, separating experiment
+    draws: np.ndarray
+    combinations: tuple[Estimate, ...]
+    confounded: tuple[tuple[str, str, float, str], ...]
     lines: tuple[CheckResult, ...]
-    mechanism: dict[str, Any] | None  # content of a mechanism file; None if something is missing
-    limit: float  # largest allowed sum of effects, on e and on e - e*
+    mechanism: dict[str, Any] | None
+    limit: float
     notes: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()  # parameters in neither logs nor prior, each with a suitable run
+    missing: tuple[str, ...] = ()
     motion: FreeMotion | None = field(default=None, repr=False)
     contact: ContactFit | None = field(default=None, repr=False)
     force_noise: SensorNoise | None = field(default=None, repr=False)
@@ -66,42 +95,41 @@ class Identification:
 
     @property
     def effect(self) -> float:
-        """Return the effect on e of all detected defects and of the parameters' uncertainty."""
+        """Return the effect of all detected defects and of the parameters' uncertainty on e."""
         return float(sum(line.counted for line in self.lines))
 
     @property
     def effect_on_error(self) -> float:
-        """Return the effect on e - e* of the same."""
+        """Return the effect of all detected defects and of the parameters' uncertainty on e - e*."""
         return float(sum(line.counted_error for line in self.lines))
 
     @property
     def good(self) -> bool:
-        """Return whether both effects are below the limit and at least one check was made."""
+        """Return whether no value is missing and the checks found only effects below `limit`."""
         return not self.missing and bool(self.lines) and max(self.effect, self.effect_on_error) < self.limit
 
     @property
     def worst(self) -> CheckResult | None:
-        """Return the line with the largest effect, or None."""
-        present = [line for line in self.lines if line.there and line.counts]
-        return max(present, key=lambda line: max(line.counted, line.counted_error), default=None)
+        """Return the check whose defect has the largest effect, or None if there is no defect."""
+        defects = [line for line in self.lines if line.there and line.counts]
+        return max(defects, key=lambda line: max(line.counted, line.counted_error), default=None)
 
     @property
     def verdict(self) -> str:
         if self.missing:
-            return f"Bad: neither the logs nor a prior tell {' and '.join(self.missing)}; no file is written"
+            return f"Bad: no file is written: logs and prior do not determine {' and '.join(self.missing)}"
         if not self.lines:
-            return "Bad: neither free motion nor contact is in the logs: nothing shows that the file is right"
+            return "Bad: the logs have neither free motion nor contact, so that the file cannot be checked"
         change = f"can change e by {self.effect:.2g} and e - e* by {self.effect_on_error:.2g}"
         if self.good:
             return (
-                f"Good: what the model leaves and the numbers' uncertainty {change}, "
-                f"expected below {self.limit:g}"
+                f"Good: model errors and the parameters' uncertainty {change}, expected below {self.limit:g}"
             )
         worst = self.worst
         assert worst is not None
         if worst.name == UNCERTAINTY_CHECK:
             return (
-                f"Bad: the numbers are too uncertain: {worst.finding}; "
+                f"Bad: the parameters are too uncertain: {worst.finding}; "
                 f"all together {change}, expected below {self.limit:g}"
             )
         location = f" ({worst.where})" if worst.where else ""
@@ -111,7 +139,7 @@ class Identification:
         )
 
     def __getitem__(self, key: str) -> Estimate:
-        """Return the estimate of a key, or of a combination by its name."""
+        """Return the estimate of the parameter or combination with this key."""
         for estimate in (*self.estimates, *self.combinations):
             if estimate.key == key:
                 return estimate
@@ -119,9 +147,17 @@ class Identification:
 
 
 def find_confounded_pairs(keys: list[str], draws: np.ndarray) -> tuple[tuple[str, str, float, str], ...]:
-    """Return the pairs that the logs hardly separate, their correlation, and a suitable experiment."""
-    moving = np.ptp(draws, axis=0) > 0.0
-    keys, draws = [key for key, varies in zip(keys, moving, strict=True) if varies], draws[:, moving]
+    """Find pairs of parameters that the logs hardly distinguish.
+
+    Args:
+        keys: Keys of the parameters.
+        draws: Posterior draws of the parameters, shape (draws, keys).
+
+    Returns:
+        For each pair, the two keys, their correlation, and the experiment that separates them.
+    """
+    varying = np.ptp(draws, axis=0) > 0.0
+    keys, draws = [key for key, varies in zip(keys, varying, strict=True) if varies], draws[:, varying]
     if len(keys) < 2:
         return ()
     correlation = np.corrcoef(draws.T)
@@ -136,6 +172,8 @@ def find_confounded_pairs(keys: list[str], draws: np.ndarray) -> tuple[tuple[str
 
 
 def suggest_experiment(one: str, other: str) -> str:
-    """Return the experiment that separates two parameters; indices of list entries are ignored."""
+    """Return the experiment, in words, that separates two confounded parameters, given by their keys."""
     one, other = (key.rstrip("0123456789").rstrip(".") for key in (one, other))
-    return EXPERIMENTS.get((one, other)) or EXPERIMENTS.get((other, one), "longer runs, or wider ones")
+    return EXPERIMENTS.get((one, other)) or EXPERIMENTS.get(
+        (other, one), "longer runs, or a wider range of speeds and frequencies"
+    )

@@ -1,8 +1,8 @@
-"""First-order lag of a force sensor over one control period, in closed form.
+"""Response of a force sensor with a first-order lag over one control period, in closed form.
 
-The lag integrates the force between two readings. A smooth force is approximated by the parabola through its
-values at both ends and in the middle. At an onset of damped contact the force jumps; before the onset it is
-0.
+The sensor's lag integrates the force between two readings. A smooth force is approximated by the parabola
+through its values at the beginning, in the middle and at the end of the period. At the onset of damped
+contact, the force jumps from 0.
 """
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ import numpy as np
 
 
 def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
-    """Return the pole of a sampled first-order lag and the weights of the force in a period.
+    """Return the pole of a sampled first-order lag, and the weights of the force during a control period.
 
-    The weights are exact if the force is a parabola.
+    The new reading is the pole times the previous reading, plus the weighted sum of three forces. The result
+    is exact if the force is a parabola in time.
 
     Args:
-        rate: Control period over the time constant.
+        rate: Control period divided by the time constant.
 
     Returns:
         The pole, and the weights of the force at the end, in the middle and at the beginning of the period.
     """
     pole = float(np.exp(-rate))
-    # Moments of rate exp(-(1 - s) rate) over s = 0..1.
+    # Moments of order 0, 1 and 2 of rate exp(-(1 - s) rate) over s = 0..1.
     first = 1.0 - pole
     second = 1.0 - first / rate
     third = 1.0 - 2.0 * second / rate
@@ -33,13 +34,14 @@ def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]
 
 
 def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of the force just after an onset and at the end of the period.
+    """Return the weights of two forces in the reading at the end of a period with an onset of contact.
 
-    The force is 0 before the onset and linear in time after it.
+    The two forces are those just after the onset and at the end of the period. The force is 0 before the
+    onset and linear in time after the onset.
 
     Args:
-        rate: Control period over the time constant.
-        left: Shares of the period that remain after the onset.
+        rate: Control period divided by the time constant.
+        left: Share of the period after the onset.
     """
     total = -np.expm1(-rate * left)
     end = 1.0 - total / (rate * left)
@@ -49,10 +51,15 @@ def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np
 def compute_onset_shares(
     last: np.ndarray, half: np.ndarray, now: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
-    """Return the share of the period after the position crosses the surface; 0 without a crossing.
+    """Return the share of a control period after the onset of contact; 0 without an onset.
 
-    `last`, `half` and `now` are positions [m] at the beginning, in the middle and at the end of the period,
-    with linear motion between them.
+    The motion is linear in each half of the period.
+
+    Args:
+        last: Position at the beginning of the period [m].
+        half: Position in the middle of the period [m].
+        now: Position at the end of the period [m].
+        plane: Position of the surface [m].
     """
     late = half <= plane
     start, stop = np.where(late, half, last), np.where(late, now, half)

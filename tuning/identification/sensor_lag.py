@@ -1,10 +1,11 @@
-"""First-order lag of the force sensor in addition to its delay.
+"""Estimation of a first-order lag of the force sensor, in addition to its delay.
 
-To first order a lag is a delay, so slow contacts determine only the sum of both, which is also what the loop
-experiences. A lag is added if it improves the Bayesian information criterion by 6. If the contacts neither
-require nor exclude a lag, it remains part of the delay; the draws of delay and damping then average over it
-(Bayesian model averaging, Hoeting et al. 1999). This matters because a lag blurs the onset, and only the
-onset separates the delay from the damping.
+To first order, a lag acts like a delay. Slow contacts therefore determine only the sum of lag and delay,
+which also determines the effect on the loop. A lag is estimated if it improves the Bayesian information
+criterion by at least 6. If the contacts neither require nor exclude a lag, it is treated as part of the
+delay. The draws of delay and damping then average over the models with and without a lag (Bayesian model
+averaging, Hoeting et al. 1999). The average is needed because a lag smooths the force at the onset of
+contact, and only the onset distinguishes delay from damping.
 """
 
 from __future__ import annotations
@@ -21,23 +22,19 @@ from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.lag_profile import compute_posterior_near
 from tuning.identification.law_choice import CoarseFit, search_coarsely
 
-MAX_TIME_CONSTANT = 0.005  # s, longest time constant
+MAX_TIME_CONSTANT = 0.005  # s, longest time constant of a lag
 TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # s, time constants of a first search
-MIN_CRITERION_GAIN = 6.0  # of the Bayesian information criterion, required for a lag
-LAG_GRID_SIZE, LAG_HALF_WIDTH_SIGMAS = (
-    9,
-    3.5,
-)  # lags of the grid, and its half width in standard deviations of the lag
-DELAY_GRID_SIZE, DELAY_HALF_WIDTH_SIGMAS = (
-    21,
-    5.0,
-)  # delays at each lag, and half width in standard deviations of the delay
-MIN_DELAY_STD = 5e-5  # s, lower bound of that standard deviation
-SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # size of the grid if a lag is not required
+MIN_CRITERION_GAIN = 6.0  # improvement of the Bayesian information criterion that is required for a lag
+# Number of time constants in the grid, and half width of the grid in standard deviations of the time
+# constant.
+LAG_GRID_SIZE, LAG_HALF_WIDTH_SIGMAS = 9, 3.5
+# Number of delays at each time constant, and half width of this range in standard deviations of the delay.
+DELAY_GRID_SIZE, DELAY_HALF_WIDTH_SIGMAS = 21, 5.0
+MIN_DELAY_STD = 5e-5  # s, minimum standard deviation of the delay for the width of the grid
+SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # size of the grid if the readings do not require a lag
 PRIOR_LAG_PROBABILITY = 0.8  # prior probability of a lag: nearly every amplifier has a filter
-EXCLUSION_LIKELIHOOD_DROP = (
-    8.0  # drop of the log likelihood below its maximum, beyond which a lag is excluded
-)
+# Drop of the log likelihood below its maximum; a lag with a larger drop is excluded.
+EXCLUSION_LIKELIHOOD_DROP = 8.0
 
 # Function that returns the problem with a lag [s] and its best delay, surface and misfit.
 FitAt = Callable[[float], tuple[ContactProblem, CoarseFit]]
@@ -45,15 +42,25 @@ FitAt = Callable[[float], tuple[ContactProblem, CoarseFit]]
 
 @dataclass(frozen=True)
 class SensorLag:
-    """Time constant of the force sensor, with the posterior of all parameters."""
+    """Estimate of the force sensor's lag, with the posterior of all contact parameters."""
 
-    value: float  # s, at the greatest posterior density; 0 if the lag remains part of the delay
-    posterior: Posterior  # if value > 0, its last name is "time_constant" and its best fit is at `value`
-    evidence: float  # log evidence of both models together, as `Posterior.evidence`
+    value: float  # s, most probable time constant; 0 if the lag is treated as part of the delay
+    # if value > 0, the last parameter is "time_constant", and `best` is the fit at `value`
+    posterior: Posterior
+    evidence: float  # log evidence of the models with and without a lag together
 
 
 def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> SensorLag | None:
-    """Estimate the time constant if the readings require a lag; return None if they exclude one."""
+    """Estimate the sensor's lag, or average over models with and without a lag if it is uncertain.
+
+    Args:
+        problem: Contact problem without a lag.
+        posterior: Posterior without a lag.
+        seed: Seed of the random numbers.
+
+    Returns:
+        The lag with the posterior, or None if the readings exclude a lag.
+    """
     delay, plane, inner = posterior.best
     fits: dict[float, tuple[ContactProblem, CoarseFit]] = {}
 
@@ -97,7 +104,8 @@ def _average_over_lag(
 ) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
-    The lag has a uniform prior up to `MAX_TIME_CONSTANT` and is added to the delay.
+    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. In the result, it is added to the
+    delay.
     """
     heights = (
         np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
@@ -120,7 +128,13 @@ def _average_over_lag(
 
 
 def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -> tuple[float, float]:
-    """Return the posterior probability of a lag and the evidence of both models; `step` between lags [s]."""
+    """Return the posterior probability of a lag, and the log evidence of both models together.
+
+    Args:
+        posterior: Posterior without a lag.
+        posteriors: Posteriors at evenly spaced time constants.
+        step: Step between the time constants [s].
+    """
     integral: Any = special.logsumexp([node.evidence for node in posteriors])
     with_lag = float(integral) + np.log(PRIOR_LAG_PROBABILITY * step / MAX_TIME_CONSTANT)
     without = posterior.evidence + np.log(1.0 - PRIOR_LAG_PROBABILITY)
@@ -137,10 +151,14 @@ def _compute_posteriors(
 def compute_posterior_at_lag(
     problem: ContactProblem, best: CoarseFit, like: Posterior, seed: int, count: int = SMALL_DELAY_GRID_SIZE
 ) -> Posterior:
-    """Return the posterior at the problem's lag about the best fit, over `count` delays.
+    """Compute the posterior for a given lag, over a grid of delays around a best fit.
 
-    The half width of the grid is `DELAY_HALF_WIDTH_SIGMAS` standard deviations of the delay in the posterior
-    `like`.
+    Args:
+        problem: Contact problem with the lag.
+        best: Best fit with this lag.
+        like: Similar posterior; the standard deviation of its delay determines the width of the grid.
+        seed: Seed of the random numbers.
+        count: Number of delays in the grid.
     """
     reach = DELAY_HALF_WIDTH_SIGMAS * max(float(like.draws[:, 0].std()), MIN_DELAY_STD)
     low, high = np.clip([best[0] - reach, best[0] + reach], problem.min_delay, MAX_FORCE_DELAY)
@@ -150,9 +168,10 @@ def compute_posterior_at_lag(
 def _draw_between_lags(
     nodes: np.ndarray, posteriors: list[Posterior], seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws over evenly spaced lags, and the lag [s] of each draw.
+    """Return draws from the posteriors at evenly spaced time constants, and each draw's time constant [s].
 
-    Each lag contributes draws by its weight; they are interpolated between the lags.
+    The number of draws at a time constant is proportional to its posterior probability. The draws are then
+    interpolated between the time constants.
     """
     evidence = np.array([node.evidence for node in posteriors])
     weights = np.exp(evidence - evidence.max())

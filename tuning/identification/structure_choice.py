@@ -1,9 +1,9 @@
-"""Choice of the motion simulator's order: the smallest one that explains the lines.
+"""Choice of the motion simulator's model structure: the smallest one that explains the measured spectra.
 
-The Bayesian information criterion (Schwarz 1978) compares the candidates. If even the best candidate leaves
-more than the noise (chi-squared per degree of freedom above 1), this excess inflates the noise for all
-candidates, so that poles do not explain nonlinear friction. Excluded are candidates with a pole on a zero, or
-with a parameter that the lines hardly determine, since a smaller one is equivalent.
+The Bayesian information criterion (Schwarz 1978) compares the candidates. If chi-squared per degree of
+freedom exceeds 1 even for the best candidate, the noise variance of all candidates is multiplied by it.
+Otherwise, additional poles would fit nonlinear friction. A candidate is excluded if a zero cancels a pole, or
+if the spectra hardly determine one of its parameters, because a smaller structure is then equivalent.
 """
 
 from __future__ import annotations
@@ -15,28 +15,36 @@ from scipy import stats
 
 from tuning.identification.rational import STRUCTURES, SpectralLines, SpectrumFit, fit_structure
 
-POLE_ZERO_TOLERANCE = 0.05  # a pole and a zero nearer than this, relative to the pole, cancel
-MAX_RELATIVE_STD = 0.3  # relative standard deviation, above which a parameter is not determined
-NOISE_P_VALUE = 0.01  # p-value above which the residual is noise and larger candidates are not fitted
-NEGATIVE_DELAY_SIGMAS = 3.0  # standard deviations below 0 that make a delay negative
-MAX_CRITERION_DEFICIT = (
-    2.0  # distance of the criterion to its best value, within which the smallest candidate wins
-)
+POLE_ZERO_TOLERANCE = 0.05  # distance over the pole's magnitude; a closer zero cancels the pole
+MAX_RELATIVE_STD = 0.3  # relative standard deviation; a parameter with a larger one is not determined
+NOISE_P_VALUE = 0.01  # p-value; above it, noise explains the residual, and no larger structure is fitted
+NEGATIVE_DELAY_SIGMAS = 3.0  # standard deviations; a delay further below 0 is significantly negative
+# Difference of the criterion from its best value; the smallest structure within it is chosen.
+MAX_CRITERION_DEFICIT = 2.0
 
 
 @dataclass(frozen=True)
 class StructureCandidate:
-    """Fit of one structure and its evaluation."""
+    """Fit of one model structure, with its information criterion and the reason to exclude it."""
 
     fit: SpectrumFit
     criterion: float  # Bayesian information criterion
-    fault: str  # reason for its exclusion, or empty
+    fault: str  # reason to exclude the structure; empty if there is none
 
 
 def choose_structure(
     lines: SpectralLines, order: int | None = None, highest: int | None = None
 ) -> tuple[StructureCandidate, list[StructureCandidate]]:
-    """Return the chosen candidate and all candidates: those of one `order`, or those up to the `highest`."""
+    """Fit model structures of the motion simulator and choose the smallest one that explains the spectra.
+
+    Args:
+        lines: Measured spectra.
+        order: Order of the structures to fit, or None for all orders.
+        highest: Highest order to fit if `order` is None, or None for no limit.
+
+    Returns:
+        The chosen candidate, and all candidates.
+    """
     fits = []
     for structure in STRUCTURES:
         if structure.order == order or (order is None and (highest is None or structure.order <= highest)):
@@ -48,35 +56,39 @@ def choose_structure(
         StructureCandidate(result, compute_criterion(result, inflation), find_fault(result, inflation))
         for result in fits
     ]
-    sound = [candidate for candidate in candidates if not candidate.fault] or candidates
-    best = min(candidate.criterion for candidate in sound)
+    usable = [candidate for candidate in candidates if not candidate.fault] or candidates
+    best = min(candidate.criterion for candidate in usable)
     return next(
-        candidate for candidate in sound if candidate.criterion <= best + MAX_CRITERION_DEFICIT
+        candidate for candidate in usable if candidate.criterion <= best + MAX_CRITERION_DEFICIT
     ), candidates
 
 
 def compute_residual_ratio(candidates: list[StructureCandidate]) -> float:
-    """Return the residual power of the best candidate over the noise power, at least 1."""
+    """Return the smallest chi-squared per degree of freedom of all candidates, at least 1."""
     return max(1.0, min(candidate.fit.chi2 / max(candidate.fit.freedom, 1) for candidate in candidates))
 
 
-def compute_criterion(one: SpectrumFit, inflation: float) -> float:
-    """Return the Bayesian information criterion for a noise power `inflation` times that of the lines."""
-    return one.chi2 / inflation + one.model.structure.size * float(np.log(2 * len(one.residual)))
+def compute_criterion(fit: SpectrumFit, inflation: float) -> float:
+    """Return the Bayesian information criterion after multiplying the noise variance by `inflation`."""
+    return fit.chi2 / inflation + fit.model.structure.size * float(np.log(2 * len(fit.residual)))
 
 
-def find_fault(one: SpectrumFit, inflation: float = 1.0) -> str:
-    """Return the reason why a smaller structure is equivalent to the fit, or an empty string."""
-    numerator, denominator = one.model.fraction
+def find_fault(fit: SpectrumFit, inflation: float = 1.0) -> str:
+    """Return the reason to exclude a fit in favour of a smaller structure, or an empty string.
+
+    The noise variance is multiplied by `inflation`.
+    """
+    numerator, denominator = fit.model.fraction
     poles, zeros = np.roots(denominator), np.roots(numerator)
     for zero in zeros:
         if np.any(np.abs(poles - zero) < POLE_ZERO_TOLERANCE * np.abs(poles)):
             return "a zero cancels a pole"
-    relative = one.std * np.sqrt(inflation)
-    if one.model.delay < -NEGATIVE_DELAY_SIGMAS * relative[-1] and one.model.structure.order:
+    relative = fit.std * np.sqrt(inflation)
+    if fit.model.delay < -NEGATIVE_DELAY_SIGMAS * relative[-1] and fit.model.structure.order:
         return "its delay is negative"
-    for name, std, value in zip(one.model.names, relative, one.model.parameters, strict=True):
-        # The standard deviation of a logarithm is already relative; that of a zero's coefficient is not.
+    for name, std, value in zip(fit.model.names, relative, fit.model.parameters, strict=True):
+        # Logarithms are fitted, so their standard deviations are relative already; coefficients of zeros are
+        # not.
         share = std / abs(value) if name.startswith("zero") else 0.0 if name == "delay" else std
         if not share < MAX_RELATIVE_STD:
             return f"{name} is not determined"

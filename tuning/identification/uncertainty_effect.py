@@ -1,19 +1,19 @@
 """Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
 
-e* is the restitution of the ideal contact, e that of the rig. To first order a change dF of the contact force
-changes the rebound by its mechanical work,
+e* is the restitution of the ideal contact, and e is the restitution on the rig. To first order, the
+mechanical work of a change dF of the contact force changes the restitution by
 
-    d e* = -(integral of dF v dt) / (M v_0^2 e*),
+    d e* = -(integral of dF v dt) / (M v_0^2 e*).
 
-and an additional delay tau of the force adds the energy tau times the integral of F^2 / M:
+An additional delay tau of the force adds the energy tau times the integral of F^2 / M, so that
 
-    e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*),
+    e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*).
 
-which is (pi/2) w tau for a linear spring. Damping and delay of the force thus cancel in e, but not in e - e*:
-gains tuned with too little damping reproduce a contact with too little damping.
+For a linear spring, J tau is (pi/2) w tau. Errors of damping and force delay can cancel in e, but not in e -
+e*: gains that are tuned with too little damping reproduce a contact with too little damping.
 
-Without compensation a rig rebounds faster by the factor c = 1 + J tau / e*, and d e = c (d e* + J d tau).
-With gains that compensate the delay, c = 1. The larger of both effects counts.
+Without compensation, the rebound on the rig is faster by the factor c = 1 + J tau / e*, and d e = c (d e* + J
+d tau). With gains that compensate for the delay, c = 1. The larger effect is stated.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import mechanism_models
 from tuning.identification.contact_laws import Law
 
-EFFECT_DRAWS = 1024
+EFFECT_DRAWS = 1024  # number of draws from the uncertainty of the file
 EFFECT_PROBABILITY = 0.99  # probability that the effect is smaller than stated
-CONTACT_STEPS = 400  # integration steps in the estimated duration of a contact
-MAX_CONTACT_DURATION_RATIO = 4.0  # times the estimated duration, after which the integration stops
-RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences by a parameter of the motion simulator
-MAX_DEPTH = 1.0  # m; a deeper contact is taken to have no rebound
+CONTACT_STEPS = 400  # integration steps within the estimated duration of a contact
+# simulated time over the estimated duration; a longer contact has no rebound
+MAX_CONTACT_DURATION_RATIO = 4.0
+RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences for a parameter of the motion simulator
+MAX_DEPTH = 1.0  # m; a deeper contact is treated as a contact without rebound
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 IDENTIFIED_SOURCE_PREFIX = "identified from"  # beginning of the `source` of an identified file
-FORCE_AGE_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
+FORCE_DELAY_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
 CONTACT_KEYS = (
     *("contact.stiffness", "contact.damping"),
     *(f"contact.{key.name}" for key in CONTACT_KEYS.values() if key.default is None),
@@ -46,29 +47,31 @@ CONTACT_KEYS = (
 
 
 class UncertaintyEffect(NamedTuple):
-    """Effects of the uncertainty that are not exceeded with a probability of 99 %."""
+    """Bounds on the effects of uncertain parameters, which the effects exceed with a probability of 1 %."""
 
-    restitution: float  # change of e
-    error: float  # change of e - e*
-    parts: dict[str, float]  # change of e or e - e* by each key alone
+    restitution: float  # bound on the change of e
+    error: float  # bound on the change of e - e*
+    parts: dict[str, float]  # bound on the change of e due to each parameter alone, by key
 
 
 class _IdealContact(NamedTuple):
-    """Nominal contact of the file and its sensitivities."""
+    """Restitution of the ideal contact with nominal parameters, and its sensitivities."""
 
     restitution: float  # e*
-    coefficient_sensitivity: np.ndarray  # slopes of e*
-    age_sensitivity: float  # slope of e - e* [1/s]
+    coefficient_sensitivity: np.ndarray  # derivatives of e* with respect to the coefficients of the law
+    delay_sensitivity: float  # 1/s, derivative of e - e* with respect to the force delay
 
 
 def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
-    """Compute by how much the identified parameters may change e and e - e*.
+    """Compute how much the uncertainty of identified parameters can change e and e - e*.
 
-    The parameters are those of the file's `[correlation]`, or, without it, the normal entries of
-    `[uncertainty]`. Other entries of the file describe variations, not the uncertainty of the identification.
+    The identified parameters are those in the file's `[correlation]` or, without this table, the normal
+    entries of `[uncertainty]`. Other entries of `[uncertainty]` describe variations, not the uncertainty of
+    an identification.
 
     Returns:
-        The 99 % quantiles of the effects, for the entry of the contact lists where they are largest.
+        The 99 % quantiles of the effects, for the entry of the contact lists with the largest effects. They
+        are 0 if the file does not come from an identification.
     """
     keys = _list_identified_keys(mechanism)
     if not keys:
@@ -86,7 +89,12 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
         changes = {
             key: _compute_change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys
         }
-        gain = 1.0 + contact.age_sensitivity * _compute_force_age(mechanism, frequency) / contact.restitution
+        gain = (
+            1.0
+            + contact.delay_sensitivity
+            * _compute_total_force_delay(mechanism, frequency)
+            / contact.restitution
+        )
         ideal, error = np.sum(list(changes.values()), axis=0)
         entry_effect = UncertaintyEffect(
             gain * _compute_effect_quantile(ideal + error),
@@ -99,7 +107,7 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
 
 
 def _list_identified_keys(mechanism: Mechanism) -> list[str]:
-    """Return the keys whose uncertainty comes from an identification."""
+    """Return the keys of the parameters whose uncertainty comes from an identification."""
     if not mechanism.source.startswith(IDENTIFIED_SOURCE_PREFIX):
         return []
     if mechanism.correlation is not None:
@@ -107,35 +115,44 @@ def _list_identified_keys(mechanism: Mechanism) -> list[str]:
     else:
         keys = [key for key, entry in mechanism.uncertainty.items() if entry.distribution == "normal"]
     return [
-        key for key in keys if key in (*FORCE_AGE_KEYS, *CONTACT_KEYS) or key.startswith(SIMULATOR_PREFIX)
+        key for key in keys if key in (*FORCE_DELAY_KEYS, *CONTACT_KEYS) or key.startswith(SIMULATOR_PREFIX)
     ]
 
 
 def _compute_change(
     mechanism: Mechanism, contact: _IdealContact, entry: int, frequency: float, key: str, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes of e* and of e - e* for draws of one parameter."""
-    nothing = np.zeros(len(values))
+    """Return the changes of e* and of e - e* for each draw of one parameter.
+
+    Args:
+        mechanism: Mechanism with the nominal parameters.
+        contact: Ideal contact and its sensitivities.
+        entry: Index into the contact lists.
+        frequency: Contact frequency [Hz].
+        key: Key of the parameter.
+        values: Draws of the parameter.
+    """
+    no_change = np.zeros(len(values))
     if key in CONTACT_KEYS:
         nominal = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
         name = key.removeprefix("contact.")
         contacts = [_replace_contact_value(mechanism.contact, name, value) for value in values.tolist()]
         moved = np.array([mechanism_models.get_regression_coefficients(one, entry) for one in contacts])
-        return (moved - nominal) @ contact.coefficient_sensitivity, nothing
-    if key in FORCE_AGE_KEYS:
-        older = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])
-        return nothing, older * contact.age_sensitivity
+        return (moved - nominal) @ contact.coefficient_sensitivity, no_change
+    if key in FORCE_DELAY_KEYS:
+        added_delay = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])
+        return no_change, added_delay * contact.delay_sensitivity
     name = key.removeprefix(SIMULATOR_PREFIX)
     value = getattr(mechanism.rig.simulator, name)
     if not isinstance(value, float):
-        return nothing, nothing
+        return no_change, no_change
     low, high = (
         _compute_motion_lag(_replace_simulator_value(mechanism, name, value + side), frequency)
         for side in (0.0, RELATIVE_DIFFERENCE_STEP * max(value, 1e-3))
     )
-    return nothing, (values - value) * (high - low) / (
+    return no_change, (values - value) * (high - low) / (
         RELATIVE_DIFFERENCE_STEP * max(value, 1e-3)
-    ) * contact.age_sensitivity
+    ) * contact.delay_sensitivity
 
 
 def _replace_contact_value(contact: Contact, name: str, value: Any) -> Contact:
@@ -149,14 +166,14 @@ def _replace_simulator_value(mechanism: Mechanism, name: str, value: float) -> M
 
 
 def _compute_motion_lag(mechanism: Mechanism, frequency: float) -> float:
-    """Return the delay of the motion's phase at a frequency [Hz], in s, with the position sensor's delay."""
+    """Return the phase delay from the command to the position reading at a frequency [Hz], in s."""
     model = mechanism_models.make_motion_model(mechanism)
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return -angle / (2.0 * np.pi * frequency)
 
 
-def _compute_force_age(mechanism: Mechanism, frequency: float) -> float:
-    """Return the total delay of the force relative to the command at a frequency [Hz], in s."""
+def _compute_total_force_delay(mechanism: Mechanism, frequency: float) -> float:
+    """Return the total delay from the command to the force reading at a frequency [Hz], in s."""
     sensor = mechanism.rig.force_sensor
     total = _compute_motion_lag(mechanism, frequency) + sensor.delay + sensor.time_constant
     return max(total - mechanism.rig.position_sensor.delay, 0.0)
@@ -167,7 +184,11 @@ def _compute_effect_quantile(values: np.ndarray) -> float:
 
 
 def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_IdealContact | None, float]:
-    """Return the ideal contact of one entry of the lists and its frequency [Hz]; None without a rebound."""
+    """Simulate the ideal contact of one entry of the contact lists.
+
+    Returns:
+        The contact, or None if there is no rebound; and the contact frequency [Hz].
+    """
     mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
     coefficients = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
 
@@ -186,7 +207,7 @@ def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple
         if states[-1][0] <= 0.0:
             break
     depth, rate = np.array(states).T
-    # The last step ends out of contact; only its share in contact counts.
+    # The last step ends out of contact; only the part of the step in contact is integrated.
     last, past = depth[-2:]
     weights = np.full(len(depth) - 1, step)
     weights[-1] *= min(last / max(last - past, 1e-300), 1.0)
@@ -202,12 +223,12 @@ def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple
     touching = np.ones(len(middle), bool) if law.pulls else total > 0.0
     scale = mass * speed**2 * restitution
     by_coefficient = -(columns * touching) @ (moving * weights) / scale
-    by_age = float(np.sum(np.where(touching, total, 0.0) ** 2 * weights)) / mass / scale
-    return _IdealContact(restitution, by_coefficient, by_age), speed / deepest / (2.0 * np.pi)
+    by_delay = float(np.sum(np.where(touching, total, 0.0) ** 2 * weights)) / mass / scale
+    return _IdealContact(restitution, by_coefficient, by_delay), speed / deepest / (2.0 * np.pi)
 
 
 def _find_max_depth(force: Any, energy: float) -> float | None:
-    """Return the depth at which the undamped force has absorbed `energy` [J], to 1e-3, or None."""
+    """Return the depth [m] at which the undamped force has absorbed `energy` [J]; None above `MAX_DEPTH`."""
     depth, work = 1e-9, 0.0
     while work < energy:
         work += force(1.005 * depth, 0.0) * 0.01 * depth
@@ -220,7 +241,7 @@ def _find_max_depth(force: Any, energy: float) -> float | None:
 def _take_runge_kutta_step(
     force: Any, mass: float, state: tuple[float, float], step: float
 ) -> tuple[float, float]:
-    """Return the depth [m] and rate [m/s] after one Runge-Kutta step."""
+    """Return the depth [m] and rate [m/s] after one Runge-Kutta step of `step` [s]."""
     depth, rate = state
     k1 = -force(depth, rate) / mass
     k2 = -force(depth + 0.5 * step * rate, rate + 0.5 * step * k1) / mass

@@ -1,10 +1,10 @@
-"""Checks of the model against the logs; each defect is measured by its effect on a contact's restitution.
+"""Checks of the model against the logs; every defect is expressed as its effect on the restitution.
 
-With thousands of readings some test rejects every model. Therefore each line states how large the effect on
-the restitution e can be, and the test only decides whether the defect is present. The effects are of first
-order and in closed form. A phase error phi of the motion at the contact frequency w is a delay of phi/w, and
-a delay tau changes e by (pi/2) w tau. An unexplained force r changes the rebound by -(integral of r v dt)/(M
-v_0 e), from the balance of momentum and energy over one contact.
+With thousands of readings, a significance test rejects every model. Therefore each check states how much the
+defect can change the restitution e; the test only decides whether the defect is present. The effects are
+first-order formulas. A phase error phi of the motion at the contact frequency w is a delay of phi/w, and a
+delay tau changes e by (pi/2) w tau. An unexplained force r changes the rebound speed by -(integral of r v
+dt)/(M v_0 e), according to the balance of momentum and energy during the contact.
 """
 
 from __future__ import annotations
@@ -21,44 +21,55 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import compute_contact_misfits
 from tuning.identification.records import LoggedRun
 
-MIN_HOLD_CRITERION_GAIN = 2.0  # gain of the information criterion that shows a wrong hold
-DEFECT_P_VALUE = 1e-3  # p-value below which a defect is present
-MAX_FREQUENCY_RATIO = 4.0  # multiple of the contact frequency, up to which the motion affects a contact
-CONTACT_STATE_DRAWS = 40  # posterior draws that must agree on whether a row is in contact
-MAX_DELAY_SHARE = 0.93  # share of the longest force delay in the search
-MIN_CONTACTS_FOR_DEAD_ZONE = 5  # contacts that a check of small readings needs
-MAX_NONZERO_SHARE = 0.8  # share of readings other than 0, above which there is no dead zone
-CUTTING_DEAD_ZONE_P_VALUE = 0.01  # p-value below which a dead zone without offset is present
-MIN_SMALL_READING_SIGMAS = 3.0  # standard deviations of the noise; smaller readings exclude such a dead zone
-MISFIT_SMOOTHING_LINES = 5  # lines over which the motion's misfit is averaged
+MIN_HOLD_CRITERION_GAIN = 2.0  # decrease of the information criterion that shows a wrong command hold
+DEFECT_P_VALUE = 1e-3  # p-value; below it, a defect is present
+MAX_FREQUENCY_RATIO = 4.0  # multiple of the contact frequency; the motion at higher frequencies is irrelevant
+CONTACT_STATE_DRAWS = 40  # number of posterior draws that must agree on whether a row is in contact
+MAX_DELAY_SHARE = 0.93  # share of the search range of the force delay; a longer delay fails the check
+MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
+MAX_NONZERO_SHARE = 0.8  # share of nonzero readings; above it, there is no dead zone
+CUTTING_DEAD_ZONE_P_VALUE = 0.01  # p-value; below it, a dead zone that is not subtracted is present
+# standard deviations of the noise; a smaller reading excludes such a dead zone
+MIN_SMALL_READING_SIGMAS = 3.0
+MISFIT_SMOOTHING_LINES = 5  # number of frequency lines over which the misfit of the motion is averaged
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check."""
+    """Result of checking the model or the logs for one kind of defect.
+
+    Attributes:
+        name: Name of the check.
+        finding: Result in words and numbers.
+        there: Whether the defect is statistically significant.
+        effect: Effect of the defect on the restitution e.
+        where: Frequency of the largest error, or log file and time of the worst contact.
+        on_error: Effect of the defect on e - e*, or None if it equals `effect`.
+        counts: Whether the verdict includes this check.
+    """
 
     name: str
-    finding: str  # result in words and numbers
-    there: bool  # whether the defect exceeds chance
-    effect: float  # effect on e if the defect is present
-    where: str = ""  # worst frequency, or file and time
-    on_error: float | None = None  # effect on e - e* if it differs from that on e
-    counts: bool = True  # whether the verdict includes it
+    finding: str
+    there: bool
+    effect: float
+    where: str = ""
+    on_error: float | None = None
+    counts: bool = True
 
     @property
     def counted(self) -> float:
-        """Return the effect on e in the sum of the verdict."""
+        """Return the effect on e that the verdict adds up: 0 if the defect is absent or not included."""
         return self.effect if self.there and self.counts else 0.0
 
     @property
     def counted_error(self) -> float:
-        """Return the effect on e - e* in the sum of the verdict."""
+        """Return the effect on e - e* that the verdict adds up: 0 if the defect is absent or not included."""
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.there and self.counts else 0.0
 
 
 def check_motion_model(motion: FreeMotion, frequency: float) -> list[CheckResult]:
-    """Check the model of the motion simulator at a contact frequency [Hz]."""
+    """Check the model of the motion simulator for defects that matter at a contact frequency [Hz]."""
     lines = [
         _check_motion_misfit(motion, frequency),
         _check_position_gain(motion),
@@ -75,17 +86,17 @@ def _check_motion_misfit(motion: FreeMotion, frequency: float) -> CheckResult:
     kernel = np.ones(width) / width
     smooth = np.abs(np.convolve(error, kernel, "valid"))
     chance = np.sqrt(np.convolve(noise**2, kernel, "valid") / width)
-    beyond = np.sqrt(np.maximum(smooth**2 - chance**2, 0.0))
+    excess = np.sqrt(np.maximum(smooth**2 - chance**2, 0.0))
     middle = np.convolve(at, kernel, "valid")
     near = middle <= max(MAX_FREQUENCY_RATIO * frequency, middle[0])
-    worst = int(np.argmax(beyond * near))
+    worst = int(np.argmax(excess * near))
     freedom = max(motion.fit.freedom, 1)
     probability = stats.chi2.sf(motion.left * freedom, freedom)
     return CheckResult(
         "motion model",
-        f"leaves {motion.left:.3g} times the noise's power, {beyond[worst]:.2g} of the motion near contacts",
+        f"leaves {motion.left:.3g} times the noise's power, {excess[worst]:.2g} of the motion near contacts",
         bool(probability < DEFECT_P_VALUE),
-        float(np.pi / 2.0 * beyond[worst]),
+        float(np.pi / 2.0 * excess[worst]),
         f"{middle[worst]:.3g} Hz",
     )
 
@@ -113,11 +124,11 @@ def _check_command_hold(motion: FreeMotion, frequency: float) -> CheckResult:
 
 
 def check_delay_sign(motion: FreeMotion, frequency: float) -> CheckResult:
-    """Check that a fitted delay of the motion is not negative."""
+    """Check that the fitted delay of the motion is not negative."""
     delay, std = motion.model.delay, float(np.sqrt(motion.covariance[-1, -1]))
     return CheckResult(
         "sign of the motion's delay",
-        f"{1e3 * delay:.4f} +- {1e3 * std:.2g} ms: negative where latency, hold or row are told wrongly",
+        f"{1e3 * delay:.4f} +- {1e3 * std:.2g} ms: negative if the specified latency, hold or row is wrong",
         delay < -4.0 * std - 1e-6,
         float(np.pi**2 * frequency * abs(delay)),
     )
@@ -141,33 +152,42 @@ def _check_distortion(motion: FreeMotion) -> list[CheckResult]:
 
 
 def check_contact_model(
-    contact: ContactFit, runs: list[LoggedRun], mass: float, frequency: float, lag: float, held: np.ndarray
+    contact: ContactFit, runs: list[LoggedRun], mass: float, frequency: float, lag: float, flags: np.ndarray
 ) -> list[CheckResult]:
-    """Check the contact model on the contacts flagged in `held`."""
+    """Check a contact model against the contacts that `flags` selects.
+
+    Args:
+        contact: Contact model.
+        runs: Runs in contact.
+        mass: Equivalent mass of the numerical model [kg].
+        frequency: Contact frequency [Hz].
+        lag: Phase delay from the command to the force reading [s].
+        flags: Flag of each run.
+    """
     lines = [
-        _check_law_residual(contact, runs, held),
+        _check_law_residual(contact, runs, flags),
         *_check_delay_in_search_range(contact),
         *_check_cutting_dead_zone(contact, runs),
     ]
     if contact.drift is None:
         errors, stds = estimate_restitution_errors(contact, runs, mass)
-        usable = held & np.isfinite(errors)
+        usable = flags & np.isfinite(errors)
         if usable.any():
             lines.append(_check_restitution(contact, runs, errors, stds, usable))
     return [*lines, *_check_trends(contact, len(runs), frequency, lag)]
 
 
 def check_held_out_contacts(
-    contact: ContactFit, runs: list[LoggedRun], mass: float, held: np.ndarray
+    contact: ContactFit, runs: list[LoggedRun], mass: float, held_out: np.ndarray
 ) -> list[CheckResult]:
-    """Check the fit on the contacts flagged in `held`, which it did not use.
+    """Check a fit against the contacts that it did not use, which `held_out` flags.
 
-    The verdict excludes these lines, because the written file uses all contacts.
+    The verdict excludes these checks, because the mechanism file comes from a fit to all contacts.
     """
-    left = _check_law_residual(contact, runs, held)
-    lines = [replace(left, name="contact law, touches not fitted", counts=False)]
+    residual_check = _check_law_residual(contact, runs, held_out)
+    lines = [replace(residual_check, name="contact law, touches not fitted", counts=False)]
     errors, stds = estimate_restitution_errors(contact, runs, mass)
-    usable = held & np.isfinite(errors)
+    usable = held_out & np.isfinite(errors)
     if contact.drift is None and usable.any():
         line = _check_restitution(contact, runs, errors, stds, usable)
         lines.append(replace(line, name="restitution of touches not fitted", counts=False))
@@ -175,15 +195,17 @@ def check_held_out_contacts(
 
 
 def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray) -> CheckResult:
-    delay, plane, inner = contact.posterior.best
+    delay, plane, coefficient_fit = contact.posterior.best
     readings = contact.readings
     readings = replace(readings, counts=readings.counts & flag_certain_rows(contact))
-    misfit = compute_contact_misfits(contact.problem, readings, delay, plane, inner.coefficients)[chosen]
+    misfit = compute_contact_misfits(contact.problem, readings, delay, plane, coefficient_fit.coefficients)[
+        chosen
+    ]
     count = np.maximum(readings.counts.sum(axis=0)[chosen], 1)
     ratio = float(misfit.sum() / count.sum())
-    # The effect on e is at most the rms error of the force over its rms.
+    # The effect on e is at most the rms error of the force over the rms force.
     force = np.where(readings.counts, readings.force, 0.0)[:, chosen]
-    beyond = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
+    excess = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
     return CheckResult(
         "contact law",
         f"leaves {ratio:.3g} times the noise's power",
@@ -191,15 +213,16 @@ def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.n
             special.ndtr(-(ratio - 1.0) / np.hypot(np.sqrt(2.0 / count.sum()), 2.0 * contact.noise_error))
             < DEFECT_P_VALUE
         ),
-        float(np.sqrt(beyond)),
+        float(np.sqrt(excess)),
         _locate_worst(contact, runs, chosen, misfit / count),
     )
 
 
 def flag_certain_rows(contact: ContactFit) -> np.ndarray:
-    """Return the rows whose contact state is the same for all delays and surfaces within their uncertainty.
+    """Return flags of the rows whose contact state is certain, shape (rows, lanes).
 
-    The force of damped contact jumps at the onset; a row on its other side carries no information on the law.
+    A row is certain if it is in contact in all posterior draws of delay and surface position, or in none. An
+    uncertain row does not show an error of the law, because the force of damped contact jumps at the onset.
     """
     count = len(contact.problem.names)
     flags = [
@@ -210,63 +233,65 @@ def flag_certain_rows(contact: ContactFit) -> np.ndarray:
 
 
 def check_stiffness_sign(contact: ContactFit) -> CheckResult:
-    """Check that no stiffness is negative."""
+    """Check that no fitted stiffness is negative."""
     names = contact.posterior.names
     values = [
         contact.posterior.mean[i] for i, name in enumerate(names) if name.startswith(("stiffness", "slope"))
     ]
     return CheckResult(
         "sign of the force",
-        f"least stiffness {min(values):.4g}: negative where the force's sign is told wrongly",
+        f"least stiffness {min(values):.4g}: negative if the specified sign of the force is wrong",
         min(values) <= 0.0,
         1.0,
     )
 
 
 def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
-    """Return a failed check if the delay is at the upper end of the search."""
+    """Return a failed check if the fitted force delay is at the upper end of the search range."""
     delay = contact.posterior.mean[0]
     if delay < MAX_DELAY_SHARE * MAX_FORCE_DELAY:
         return []
-    finding = f"{1e3 * delay:.4g} ms, the longest that was looked for"
+    finding = f"{1e3 * delay:.4g} ms, the longest in the search"
     return [CheckResult("force delay", finding, True, 1.0)]
 
 
 def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
-    """Check that the readings of contacts that are 0 out of contact begin and end near 0.
+    """Check for a dead zone that passes large forces unchanged.
 
-    If no reading is small, a dead zone suppresses small forces and passes the others unchanged. The dead zone
-    of mechanism files differs: it is subtracted from every force.
+    Only contacts with readings of 0 out of contact are evaluated. If no other reading is small, the sensor
+    replaces small forces by 0. The dead zone of mechanism files differs: it is also subtracted from larger
+    forces.
     """
     smallest, steps, peaks = [], [], []
     for lane, run in enumerate(runs):
         force = np.abs(contact.readings.force[: len(run.tick), lane])
-        (felt,) = np.nonzero(force)
-        if run.kind == "contact" and len(felt) > 1 and len(felt) < MAX_NONZERO_SHARE * len(force):
-            smallest.append(force[felt].min())
-            steps.append(abs(force[felt[-1]] - force[felt[-2]]))
+        (nonzero,) = np.nonzero(force)
+        if run.kind == "contact" and len(nonzero) > 1 and len(nonzero) < MAX_NONZERO_SHARE * len(force):
+            smallest.append(force[nonzero].min())
+            steps.append(abs(force[nonzero[-1]] - force[nonzero[-2]]))
             peaks.append(force.max())
     if len(smallest) < MIN_CONTACTS_FOR_DEAD_ZONE:
         return []
     least, std = min(smallest), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
-    # The last reading of a smooth release is uniform between 0 and the last step.
+    # During a smooth release, the last reading is uniformly distributed between 0 and the last step.
     probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
     if least <= max(MIN_SMALL_READING_SIGMAS * std, 2.5 * quantum) or probability > CUTTING_DEAD_ZONE_P_VALUE:
         return []
-    finding = f"no reading lies between 0 and {least:.2g} N, as behind a dead zone that cuts"
+    finding = f"no reading lies between 0 and {least:.2g} N, as with a dead zone that is not subtracted"
     return [CheckResult("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
 
 
 def estimate_restitution_errors(
     contact: ContactFit, runs: list[LoggedRun], mass: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of e by the unexplained force in each contact, and its standard deviation by noise.
+    """Return the error of e in each contact due to the unexplained force, and its standard deviation.
 
-    Both are NaN if the numerical model was not a free body, did not rebound, or the log is incomplete.
+    The standard deviation is due to the noise. Both are NaN if the numerical model is not a free body or does
+    not rebound, or if the log of the contact is incomplete.
     """
-    delay, plane, inner = contact.posterior.best
-    predicted = contact.problem.force(delay, plane, inner.coefficients)
+    delay, plane, coefficient_fit = contact.posterior.best
+    predicted = contact.problem.force(delay, plane, coefficient_fit.coefficients)
     readings, period = contact.readings, contact.problem.motion.period
     errors, stds = np.full(len(runs), np.nan), np.full(len(runs), np.nan)
     for lane, run in enumerate(runs):
@@ -283,10 +308,10 @@ def estimate_restitution_errors(
         if before <= 0.0 or after >= 0.0 or not run.valid[0] or run.position_desired[-1] > plane:
             continue
         touching = counts & (run.position_desired > plane - abs(before) * 0.02)
-        left = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
+        residual = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
-        errors[lane] = -float(np.sum(left * speed)) * period / scale / before
-        # Only the low frequencies of coloured noise add up.
+        errors[lane] = -float(np.sum(residual * speed)) * period / scale / before
+        # The impulse depends only on the low-frequency part of coloured noise.
         slow = readings.std / abs(float(np.sum(readings.whitening)))
         stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
     return errors, stds
@@ -307,17 +332,19 @@ def _check_restitution(
 
 
 def _locate_worst(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray, values: np.ndarray) -> str:
-    """Return file and time of the run with the largest of the values, which are those of the chosen runs."""
+    """Return log file and time of the chosen run with the largest of `values`."""
     run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
     first = run.tick[int(np.argmax(run.valid))]
     return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"
 
 
 def _check_trends(contact: ContactFit, touches: int, frequency: float, lag: float) -> list[CheckResult]:
-    """Check that neither the scale of the force nor its delay changes from contact to contact."""
-    delay, plane, inner = contact.posterior.best
+    """Check that the scale and the delay of the force do not drift from the first to the last contact."""
+    delay, plane, coefficient_fit = contact.posterior.best
     problem, std = contact.problem, contact.readings.std
-    predicted = np.where(contact.readings.counts, problem.force(delay, plane, inner.coefficients), 0.0)
+    predicted = np.where(
+        contact.readings.counts, problem.force(delay, plane, coefficient_fit.coefficients), 0.0
+    )
     force = np.where(contact.readings.counts, contact.readings.force, 0.0)
     predicted, force = (problem.whiten(value) for value in (predicted, force))
     power = np.sum(predicted**2, axis=0)
@@ -326,23 +353,23 @@ def _check_trends(contact: ContactFit, touches: int, frequency: float, lag: floa
         return []
     number = np.flatnonzero(used) / max(touches - 1, 1)
     share = np.sum(predicted * force, axis=0)[used] / power[used]
-    grown, grown_std = fit_weighted_slope(share, power[used] / std**2, number)
-    delay_changes, variance = estimate_residual_delays(problem, delay, plane, inner.coefficients)
-    later, later_std = fit_weighted_slope(delay_changes[used], 1.0 / variance[used], number)
+    scale_drift, scale_drift_std = fit_weighted_slope(share, power[used] / std**2, number)
+    delay_changes, variance = estimate_residual_delays(problem, delay, plane, coefficient_fit.coefficients)
+    delay_drift, delay_drift_std = fit_weighted_slope(delay_changes[used], 1.0 / variance[used], number)
     angle = 2.0 * np.pi * frequency
     first = "from the first touch to the last"
     return [
         CheckResult(
             "drift from touch to touch",
-            f"force {100 * grown:+.2g} +- {100 * grown_std:.2g} % {first}",
-            _is_significant(grown, grown_std),
-            float(np.pi / 4.0 * angle * lag * abs(grown)),
+            f"force {100 * scale_drift:+.2g} +- {100 * scale_drift_std:.2g} % {first}",
+            _is_significant(scale_drift, scale_drift_std),
+            float(np.pi / 4.0 * angle * lag * abs(scale_drift)),
         ),
         CheckResult(
             "drift of the force delay",
-            f"{1e3 * later:+.2g} +- {1e3 * later_std:.2g} ms {first}",
-            _is_significant(later, later_std),
-            float(np.pi / 4.0 * angle * abs(later)),
+            f"{1e3 * delay_drift:+.2g} +- {1e3 * delay_drift_std:.2g} ms {first}",
+            _is_significant(delay_drift, delay_drift_std),
+            float(np.pi / 4.0 * angle * abs(delay_drift)),
         ),
     ]
 

@@ -1,1 +1,1 @@
-"""Design of excitations for a rig with roughly known parameters."""
+"""Design of experiments that identify a rig with approximately known parameters."""

@@ -1,9 +1,10 @@
-"""Design of two runs that identify a rig best: a multisine in free motion and a pressed multisine.
+"""Optimal design of two identification runs: a multisine in free motion and a multisine in a press.
 
-The criterion is the error e - e* of a compensation that wrong parameters cause; its derivatives come from the
-simulated loop. The powers of both runs are optimized together (`powers`): free motion determines the motion
-simulator, and a press then determines stiffness, damping and force delay. A share of the power is spread
-evenly over all lines, which reveals a wrong model order or a nonlinearity.
+The design minimizes the error e - e* that wrong parameters cause in a compensated contact. The derivatives of
+this error come from the simulated loop. The power spectra of both runs are optimized together (`powers`),
+because the free run determines the motion simulator, and the press run then determines stiffness, damping and
+force delay. A share of the power is distributed evenly over all frequency lines, so that the runs also reveal
+a wrong model order or a nonlinearity.
 """
 
 from __future__ import annotations
@@ -24,20 +25,21 @@ from tuning.identification import hold, mechanism_models
 from tuning.identification.design import powers, waveform
 from tuning.identification.mechanism_file import set_value
 
-MULTISINE_PERIOD, MULTISINE_PERIODS = 5.0, 12  # s, and number of periods; the first one is dropped
-FADE_TIME, APPROACH_TIME, START_CLEARANCE = (
-    1.0,
-    2.0,
-    0.001,
-)  # s, s, and m: distance to the surface at the start of a press
-MIN_TOP_FREQUENCY = 45.0  # Hz, highest line; 3 bandwidths if that is more
-FLAT_POWER_SHARE = 0.2  # share of the power that lies evenly over the lines
-ASSUMED_CREST_FACTOR = 1.6  # crest factor that the limits assume
-PRELOAD_SHARE, SWING_SHARE = 0.45, 0.4  # mean force, and amplitude about it, over the greatest force
-RELATIVE_ERROR_WEIGHT = 0.01  # weight of the parameters' relative errors in addition to their effect on e
-CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # phases of the contacts at which e is evaluated
-ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise if the mechanism states none
-LIMIT_SHARE = 0.9  # share of the limits of speed, acceleration and force
+MULTISINE_PERIOD = 5.0  # s
+MULTISINE_PERIODS = 12  # number of periods; the first period of the free run is not evaluated
+FADE_TIME = 1.0  # s, duration of the fade-in and of the fade-out
+APPROACH_TIME = 2.0  # s, duration of the motion to the preload of a press, and back
+START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press
+MIN_TOP_FREQUENCY = 45.0  # Hz, highest frequency line; 3 times the bandwidth for a faster motion simulator
+FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly over the frequency lines
+ASSUMED_CREST_FACTOR = 1.6  # crest factor that is assumed when powers are compared with limits
+PRELOAD_SHARE = 0.45  # mean force of a press over the largest allowed force
+SWING_SHARE = 0.4  # amplitude of the force about its mean, over the largest allowed force
+# Weight of the parameters' relative errors, in addition to their effect on e - e*.
+RELATIVE_ERROR_WEIGHT = 0.01
+CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # control periods, phases of the contacts for which e is evaluated
+ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise of position and force if the mechanism specifies none
+LIMIT_SHARE = 0.9  # share of the limits of speed, acceleration and force that a run may use
 SIMULATOR_KEYS = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -48,30 +50,50 @@ SIMULATOR_KEYS = {
 
 @dataclass(frozen=True)
 class Excitation:
-    """Command of one run, and its multisine."""
+    """Position command of one run, and the multisine in it.
 
-    position: np.ndarray  # m, command relative to its start, or, for a press, to the nominal surface
-    frequency: np.ndarray  # Hz, lines of the multisine
-    amplitude: np.ndarray  # m, at each line
-    crest: float  # peak over rms of the signal that is closest to its limit
+    Attributes:
+        position: Position command in each control period [m], relative to the start of a free run, or
+            absolute for
+            a press.
+        frequency: Frequency lines of the multisine [Hz].
+        amplitude: Amplitude at each line [m].
+        crest: Crest factor (peak over rms) of the signal that is closest to its limit.
+    """
+
+    position: np.ndarray
+    frequency: np.ndarray
+    amplitude: np.ndarray
+    crest: float
 
 
 @dataclass(frozen=True)
 class ExcitationDesign:
-    """Both runs and the accuracy that they are expected to give."""
+    """Commands of both runs, and the predicted accuracy of the identification.
+
+    Attributes:
+        free: Run in free motion.
+        press: Run in contact.
+        keys: Keys of the identified parameters.
+        values: Values of the parameters in the mechanism, in SI units.
+        std: Predicted standard deviation of each parameter.
+        slopes: Derivatives of e - e* with respect to the parameters, shape (contacts and phases, keys).
+        covariance: Predicted covariance of the parameters.
+        flat: Error of e - e* for equal powers at all lines, over the error for this design.
+    """
 
     free: Excitation
     press: Excitation
-    keys: tuple[str, ...]  # identified parameters
-    values: np.ndarray  # of the parameters in the mechanism
-    std: np.ndarray  # predicted standard deviations
-    slopes: np.ndarray  # derivatives of e - e* by the parameters, (contacts and phases, keys)
+    keys: tuple[str, ...]
+    values: np.ndarray
+    std: np.ndarray
+    slopes: np.ndarray
     covariance: np.ndarray
-    flat: float  # ratio of the error of e with flat spectra to that of this design
+    flat: float
 
     @property
     def error(self) -> float:
-        """Return the rms of e - e* for parameter errors with this covariance."""
+        """Return the rms error e - e* that parameter errors with the predicted covariance cause."""
         return float(np.sqrt(np.mean(np.sum(self.slopes @ self.covariance * self.slopes, axis=1))))
 
 
@@ -81,16 +103,17 @@ SlopeFunction = Callable[[Sequence[str]], np.ndarray]
 def design_excitation(
     mechanism: Mechanism, stroke: float, slopes_by: SlopeFunction, seed: int = 0
 ) -> ExcitationDesign:
-    """Design both runs for a rig with approximately known parameters.
+    """Design a free run and a press run for a rig with approximately known parameters.
 
-    Speed and acceleration stay within the limits of `rig.simulator`. The force stays within the sensor's
-    range and the force that the approach causes.
+    Speed and acceleration stay within the limits of `rig.simulator`. The force stays within the range of the
+    sensor and below the peak force of a contact at the nominal approach speed.
 
     Args:
         mechanism: Mechanism with the approximate parameters.
-        stroke: Largest excursion to either side [m].
-        slopes_by: Function that returns the derivatives of e - e* by keys of the mechanism, (contacts, keys),
-            such as `differentiate_error`.
+        stroke: Largest excursion of the multisine in either direction [m].
+        slopes_by: Function that returns the derivatives of e - e* with respect to given keys, shape
+            (contacts, keys);
+            for example `differentiate_error`.
         seed: Seed of the random phases.
 
     Raises:
@@ -142,14 +165,27 @@ def design_excitation(
 def differentiate_error(
     mechanism: Mechanism, compensator: str, gains: dict[str, float], keys: Sequence[str]
 ) -> np.ndarray:
-    """Return the derivatives of e - e* by each key, (contacts and phases, keys), without noise."""
+    """Return the derivatives of e - e* with respect to parameters, simulated without noise.
+
+    Args:
+        mechanism: Mechanism with the approximate parameters.
+        compensator: Name of the compensator.
+        gains: Gains of the compensator.
+        keys: Keys of the parameters.
+
+    Returns:
+        Derivatives of shape (contacts and phases, keys).
+
+    Raises:
+        InputError: If no contact ends with finite derivatives.
+    """
     document, rows = to_plain_data(mechanism), []
     for key in ("noise_std", "quantum", "dead_zone", "bias"):
         document["rig"]["force_sensor"][key] = 0.0
     for key in ("noise_std", "quantum"):
         document["rig"]["position_sensor"][key] = 0.0
     for section in ("simulator", "force_sensor"):
-        # The derivative by a delay needs a delay above 0.
+        # The derivative with respect to a delay exists only for a delay above 0.
         document["rig"][section]["delay"] = max(document["rig"][section]["delay"], 1e-6)
     names = [_with_bracketed_indices(key) for key in keys]
     for phase in CONTACT_PHASES:
@@ -160,19 +196,17 @@ def differentiate_error(
     slopes = np.concatenate(rows)
     slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
     if not len(slopes):
-        raise InputError(
-            f"{mechanism.name}: found no contact that ends well under {compensator}, expected one"
-        )
+        raise InputError(f"{mechanism.name}: found no completed contact with {compensator}, expected one")
     return slopes
 
 
 def _with_bracketed_indices(key: str) -> str:
-    """Return a key in the notation of the mechanism's paths, with entries of lists in brackets."""
+    """Return a dotted key with the indices of list entries in brackets: `a.0` becomes `a[0]`."""
     return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
 
 class _MultisinePlan:
-    """Lines of both runs, with their information and their limits."""
+    """Frequency lines of both runs, with their Fisher information and the limits of the signals."""
 
     def __init__(self, mechanism: Mechanism, stroke: float):
         rig = mechanism.rig
@@ -197,9 +231,9 @@ class _MultisinePlan:
         stds = [
             np.hypot(sensor.noise_std, sensor.quantum / np.sqrt(12.0)) or usual for sensor, usual in sensors
         ]
-        parameters = self._told(mechanism)
+        parameters = self._list_parameters(mechanism)
         self.keys, self.values = tuple(parameters), np.array(list(parameters.values()))
-        # Parameters that are 0 need a scale for their relative errors.
+        # Relative errors of parameters that are 0 refer to these values.
         small = [self.period if key.endswith("delay") else 10.0 for key in parameters]
         self.scales = np.maximum(np.abs(self.values), small)
         motion, force = self._responses(mechanism)
@@ -221,8 +255,8 @@ class _MultisinePlan:
             [*self._limits(rig, stroke), (force, SWING_SHARE * greatest)],
         )
 
-    def _told(self, mechanism: Mechanism) -> dict[str, float]:
-        """Return the parameters that the runs identify, by key."""
+    def _list_parameters(self, mechanism: Mechanism) -> dict[str, float]:
+        """Return the values of the parameters that the runs identify, by key."""
         document, simulator = to_plain_data(mechanism), mechanism.rig.simulator.model
         keys = [*(f"rig.simulator.{name}" for name in SIMULATOR_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_find_stiffness_key(mechanism, self.depth)]
@@ -231,17 +265,26 @@ class _MultisinePlan:
         return {key: _get_value(document, key) for key in keys}
 
     def _responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-        """Return the responses of the position and of the pressed force to the command, at the lines."""
+        """Return the frequency responses from the command to the position and force readings in a press."""
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = mechanism_models.make_motion_model(mechanism).response(self.s) * self.hold
-        late = self.s * (sensor.delay - position.delay)
+        delay_exponent = self.s * (sensor.delay - position.delay)
         slope, rate = _differentiate_force(mechanism, self.depth)
-        return motion, (slope + rate * self.s) * motion * np.exp(-late) / (
+        return motion, (slope + rate * self.s) * motion * np.exp(-delay_exponent) / (
             1.0 + self.s * sensor.time_constant
         )
 
     def _group(self, mechanism, index, response, std, limits, periods) -> powers.RunLines:
-        """Return the information of unit power at each line, and the share of each limit that it uses."""
+        """Return the Fisher information of unit power at each line, and its use of each limit.
+
+        Args:
+            mechanism: Mechanism with the approximate parameters.
+            index: 0 for the position reading, 1 for the force reading.
+            response: Frequency response from the command to this reading.
+            std: Noise of the reading.
+            limits: Response and limit of each limited signal.
+            periods: Number of evaluated periods.
+        """
         slopes = []
         for key, scale in zip(self.keys, self.scales, strict=True):
             document, step = to_plain_data(mechanism), 1e-6 * scale
@@ -255,7 +298,7 @@ class _MultisinePlan:
         return powers.RunLines(fisher, use)
 
     def _limits(self, rig, stroke: float) -> list[tuple[np.ndarray, float]]:
-        """Return the response from the command to each limited signal, and its limit."""
+        """Return, for each limited signal, its frequency response to the command and its limit."""
         limits = [(np.ones_like(self.s), stroke)]
         for power, limit in ((1, rig.simulator.velocity_limit), (2, rig.simulator.acceleration_limit)):
             if np.isfinite(limit):
@@ -267,11 +310,11 @@ class _MultisinePlan:
         return waveform.synthesise_multisine(amplitude, self.lines, self.rows, angle)
 
     def repeated(self, wave: np.ndarray) -> np.ndarray:
-        """Return all periods, with a smooth start and end."""
+        """Return the command of all periods, with fade-in and fade-out."""
         return waveform.repeat_with_fades(wave, MULTISINE_PERIODS, round(FADE_TIME / self.period))
 
     def pressed(self, wave: np.ndarray) -> np.ndarray:
-        """Return the approach from clear of the surface to the preload, all periods, and the way back."""
+        """Return the command of a press: approach to the preload, multisine, and retraction."""
         low, high = self.plane - START_CLEARANCE, self.plane + self.depth
         rows = round(APPROACH_TIME / self.period)
         approach = waveform.ramp(low, high, rows)
@@ -286,7 +329,7 @@ def _get_value(document: dict, key: str) -> float:
 
 
 def _find_stiffness_key(mechanism: Mechanism, depth: float) -> list[str]:
-    """Return the key of the stiffness that is effective in a press at this depth."""
+    """Return, as a list, the key of the stiffness that acts at a depth [m]."""
     contact = mechanism.contact
     if not find_contact_law(contact.law).segmented:
         return ["contact.stiffness.0"]
@@ -302,7 +345,7 @@ def _compute_force(mechanism: Mechanism, depth: np.ndarray, rate: float = 0.0) -
 
 
 def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, float]:
-    """Return the slope of the force by depth [N/m] and by rate [N s/m] at a depth [m]."""
+    """Return the derivatives of the force at a depth [m]: by depth [N/m] and by rate [N s/m]."""
     step = 1e-3 * depth
     low, high = _compute_force(mechanism, np.array([depth - step, depth + step]))
     back, forth = (float(_compute_force(mechanism, np.array([depth]), rate)[0]) for rate in (-step, step))
@@ -310,17 +353,20 @@ def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, flo
 
 
 def _find_preload(mechanism: Mechanism) -> tuple[float, float]:
-    """Return the preload's depth [m] and the greatest force [N], limited by the sensor or the approach."""
+    """Return the depth of the preload [m] and the largest allowed force [N].
+
+    The force must not exceed the range of the sensor, or the peak force of a contact at the approach speed.
+    """
     energy = 0.5 * mechanism.bodies.mass * mechanism.approach.velocity**2
 
-    def left(depth: float) -> float:
+    def excess_energy(depth: float) -> float:
         grid = np.linspace(0.0, depth, 400)
         return float(np.trapezoid(_compute_force(mechanism, grid), grid)) - energy
 
-    far = 1e-6
-    while left(far) < 0.0:
-        far *= 2.0
-    deepest: Any = optimize.brentq(left, 0.0, far)
+    upper = 1e-6
+    while excess_energy(upper) < 0.0:
+        upper *= 2.0
+    deepest: Any = optimize.brentq(excess_energy, 0.0, upper)
     greatest = min(
         float(_compute_force(mechanism, np.array([deepest]))[0]),
         LIMIT_SHARE * mechanism.rig.force_sensor.range,

@@ -1,7 +1,8 @@
-"""Multisines of low crest factor: phases for given amplitudes, and commands that begin and end at rest.
+"""Multisines with a low crest factor, and commands that begin and end at rest.
 
-The phases start from Schroeder's (1970) and from random ones. Then means of increasing even powers of the
-wave are minimized, which converge to its peak (Guillaume, Schoukens, Pintelon and Kollar 1991).
+The phases are optimized from starting values: those of Schroeder (1970), and random phases. The optimization
+minimizes the L8 norm and then the L32 norm of the signal, which approximate the signal's peak (Guillaume,
+Schoukens, Pintelon and Kollar 1991).
 """
 
 from __future__ import annotations
@@ -12,14 +13,13 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-LimitedSignal = tuple[
-    np.ndarray | complex, float
-]  # response of a signal to the wave, at its lines, and its limit
+# Frequency response from the multisine to a limited signal, at each line, and the limit of the signal.
+LimitedSignal = tuple[np.ndarray | complex, float]
 UNLIMITED_SIGNAL: LimitedSignal = (1.0 + 0.0j, 1.0)
 
-RANDOM_STARTS = 1  # number of random starts
-NORM_POWER_LOG2 = 3, 5  # base-2 logarithms of the powers: the 8th, then the 32nd
-MAX_SOLVER_ITERATIONS = 40  # solver iterations for each power
+RANDOM_STARTS = 1  # number of optimizations that start from random phases
+NORM_POWER_LOG2 = 3, 5  # base-2 logarithms of the order of the norms: 8, then 32
+MAX_SOLVER_ITERATIONS = 40  # iterations of the solver for each norm
 
 
 def optimise_phases(
@@ -29,25 +29,23 @@ def optimise_phases(
     limited: Sequence[LimitedSignal] = (UNLIMITED_SIGNAL,),
     seed: int = 0,
 ) -> np.ndarray:
-    """Return phases [rad] of the lines that keep peaks low.
-
-    The largest ratio of a peak to its limit is minimized.
+    """Return the phases [rad] of a multisine that minimize the largest ratio of a signal's peak to its limit.
 
     Args:
         amplitude: Amplitude at each line.
-        lines: Number of periods in `rows` for each line.
-        rows: Rows of one period.
-        limited: Limited signals: the response from the wave at the lines, and the limit.
-        seed: Seed of the random starts.
+        lines: Harmonic number of each line: its number of cycles per period of the multisine.
+        rows: Number of samples in one period of the multisine.
+        limited: Frequency response and limit of each limited signal.
+        seed: Seed of the random phases.
     """
     power = amplitude**2 / np.sum(amplitude**2)
-    # Schroeder: the group delay at a line is proportional to the power below it.
+    # Schroeder: the group delay at a line is proportional to the power at lower frequencies.
     schroeder = -2.0 * np.pi * np.cumsum(np.cumsum(power) - power) * np.gradient(lines.astype(float))
     rng = np.random.default_rng(seed)
     starts = [schroeder, *rng.uniform(0.0, 2.0 * np.pi, (RANDOM_STARTS, len(lines)))]
-    tried = [_reduce_peak(amplitude, lines, rows, limited, angles) for angles in starts]
+    candidates = [_reduce_peak(amplitude, lines, rows, limited, angles) for angles in starts]
     return min(
-        tried,
+        candidates,
         key=lambda candidate: max(
             np.abs(s).max() for s in make_limited_signals(amplitude, lines, rows, candidate, limited)
         ),
@@ -60,18 +58,20 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
     )
 
     def mean(angle, doublings):
-        """Return the logarithm of the mean of a power of all signals, and its derivative by the phases."""
+        """Return the logarithm of the norm of order 2**`doublings`, and its derivative by the phases."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
             limited, make_limited_signals(amplitude, lines, rows, angle, limited), strict=True
         ):
-            raised, one_less = signal / size, np.ones_like(signal)
+            raised, derivative = signal / size, np.ones_like(signal)
             for _ in range(doublings):
-                one_less = one_less * raised
+                derivative = derivative * raised
                 raised = raised * raised
             total += np.sum(raised)
-            pull = np.conj(np.fft.rfft(one_less)[lines])
-            slope += np.real(1j * amplitude * response / (limit * size) * np.exp(1j * angle) * pull)
+            gradient_spectrum = np.conj(np.fft.rfft(derivative)[lines])
+            slope += np.real(
+                1j * amplitude * response / (limit * size) * np.exp(1j * angle) * gradient_spectrum
+            )
         return np.log(total) / power, slope / total
 
     for doublings in NORM_POWER_LOG2:
@@ -83,7 +83,7 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
 
 
 def make_limited_signals(amplitude, lines, rows, angle, limited: Sequence[LimitedSignal]) -> list[np.ndarray]:
-    """Return one period of each limited signal over its limit."""
+    """Return one period of each limited signal, divided by the signal's limit."""
     return [
         synthesise_multisine(amplitude * np.abs(r) / limit, lines, rows, angle + np.angle(r))
         for r, limit in limited
@@ -93,26 +93,26 @@ def make_limited_signals(amplitude, lines, rows, angle, limited: Sequence[Limite
 def synthesise_multisine(
     amplitude: np.ndarray, lines: np.ndarray, rows: int, angle: np.ndarray
 ) -> np.ndarray:
-    """Return one period, the sum of amplitude_l cos(2 pi l n / rows + angle_l)."""
+    """Return one period of a multisine: sum over l of amplitude_l cos(2 pi l n / rows + angle_l)."""
     spectrum = np.zeros(rows // 2 + 1, complex)
     spectrum[lines] = 0.5 * rows * amplitude * np.exp(1j * angle)
     return np.fft.irfft(spectrum, rows)
 
 
 def crest_factor(values: np.ndarray) -> float:
-    """Return the peak over the rms."""
+    """Return the crest factor: the largest magnitude divided by the rms."""
     return float(np.abs(values).max() / np.sqrt(np.mean(values**2)))
 
 
 def repeat_with_fades(period: np.ndarray, times: int, fade: int) -> np.ndarray:
-    """Return the period repeated `times`, with `fade` further rows at each end for a smooth start and end."""
-    whole = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
+    """Return `times` periods of a signal, with `fade` additional samples of fade-in and of fade-out."""
+    signal = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
     rise = np.sin(0.5 * np.pi * np.arange(fade) / fade) ** 2
-    whole[:fade] *= rise
-    whole[-fade:] *= rise[::-1]
-    return whole
+    signal[:fade] *= rise
+    signal[-fade:] *= rise[::-1]
+    return signal
 
 
 def ramp(begin: float, end: float, rows: int) -> np.ndarray:
-    """Return a motion from one position to another, at rest at both ends."""
+    """Return a smooth motion of `rows` periods from one position to another, with speed 0 at both ends."""
     return begin + (end - begin) * np.sin(0.5 * np.pi * np.arange(rows + 1) / rows) ** 2

@@ -1,7 +1,9 @@
-"""Campaign from log files and their mapping: reading, checks and conversion to the grid of ticks.
+"""Reading of a campaign from log files and their mapping, with checks and one row per tick.
 
-A run has at most one contact: a log with several is divided midway between them. Without a channel of contact
-numbers, contacts are numbered by their order in the file, like the lists of a mechanism file.
+A run has at most one contact: a log with several contacts is divided in the middle between successive
+    contacts. If
+the log has no channel `contact_index`, the contacts of a file are numbered in their order. The number of a
+contact is its index into the contact lists of a mechanism file.
 """
 
 from __future__ import annotations
@@ -35,28 +37,30 @@ from tuning.identification.logs.scales import SPEED_SPAN_TICKS, check_velocity
 from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, RunKind
 
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
-MIN_SEGMENT_ROWS = 50  # rows, least length of a segment between gaps
-MIN_VELOCITY_JUMP = 0.5  # jump of the velocity between runs of a log, over the 95 % quantile of the speed
+MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
+MIN_VELOCITY_JUMP = 0.5  # velocity jump that shows a new simulated run, over the 95 % quantile of the speed
 
 
 def read_campaign(
     logs: Sequence[Path], mapping: LogMapping | None = None, prior: Mechanism | None = None
 ) -> Campaign:
-    """Read all runs of the log files, in the order of the mapping's runs and, within each, of the files.
+    """Read all runs of a campaign from log files and check them.
 
-    Without a mapping the columns must have the names of `jaxhil simulate --log`, and every file is a run of
-    contacts. The prior provides the timing and masses that the mapping omits.
+    The runs are in the order of the `[[runs]]` entries of the mapping; the runs of one entry are in the order
+    of the files. Without a mapping, the columns must have the names of `jaxhil simulate --log`, and every
+    file must contain contacts. The prior provides the timing and the mass if the mapping omits them.
 
     Args:
         logs: Paths of the log files.
         mapping: Mapping of columns to channels, or None.
-        prior: Mechanism, or None.
+        prior: Prior mechanism, or None.
 
     Returns:
         The runs with their timing.
 
     Raises:
-        InputError: If a log cannot be read or fails a check; the message names file, row or column.
+        InputError: If a log cannot be read or fails a check. The message names the file and the row or
+            column.
     """
     mapping = mapping or make_simulation_mapping()
     if not logs:
@@ -64,14 +68,16 @@ def read_campaign(
     timing, mass = _make_timing(mapping, prior), find_equivalent_mass(mapping, prior)
     if mass is None:
         raise InputError(
-            "bodies.equivalent_mass: found nothing, expected a number > 0 kg, here or in a prior"
+            "bodies.equivalent_mass: found nothing, expected a number > 0 kg in the mapping or in a prior"
         )
     for path in logs:
         if not any(entry.names(path) for entry in mapping.runs):
             patterns = ", ".join(format_value(pattern) for entry in mapping.runs for pattern in entry.files)
-            raise InputError(f"{to_one_line(str(path))}: found a log that no run names, expected {patterns}")
+            raise InputError(
+                f"{to_one_line(str(path))}: found a name that no run matches, expected {patterns}"
+            )
     runs: list[LoggedRun] = []
-    notes: dict[str, list[str]] = {}  # labels of the logs of each note
+    notes: dict[str, list[str]] = {}  # for each note, the names of the logs that it concerns
     clocks = []
     for entry in mapping.runs:
         for path in logs:
@@ -99,7 +105,7 @@ def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 class _RunsOfFile:
-    """Runs of one file under one entry of the mapping."""
+    """Runs that one log file contains according to one `[[runs]]` entry of the mapping."""
 
     def __init__(
         self,
@@ -113,10 +119,10 @@ class _RunsOfFile:
         self.label, self.notes = to_one_line(str(path)) or "''", list[str]()
         self.kind: RunKind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
-        # Contacts so far; last tick and resting force of a contact that a gap interrupts.
-        self._met, self._open = 0, None
+        # Number of contacts so far; last tick and resting force of a contact that a gap interrupts.
+        self._contact_count, self._open_contact = 0, None
         self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
-        # The last entry of the contact lists repeats.
+        # Later contacts use the last entry of the contact lists.
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
@@ -142,108 +148,115 @@ class _RunsOfFile:
                 checks.check_values(self.label, name, values)
         if (index := channels["contact_index"]) is not None:
             channels["contact_index"] = index.astype(np.int64)
-        self.runs = self._cut(channels, modes)
+        self.runs = self._split_runs(channels, modes)
 
-    def _cut(self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None) -> list[LoggedRun]:
-        """Return the runs, divided at gaps, changes of mode, jumps between runs, and contacts."""
+    def _split_runs(
+        self, channels: dict[str, np.ndarray | None], modes: np.ndarray | None
+    ) -> list[LoggedRun]:
+        """Divide the log into runs: at gaps, at changes of the mode, at restarts, and between contacts."""
         tick, x = self.ticks.tick, channels["position_desired"]
         assert x is not None
         cuts = _find_restarts(x, channels["contact_index"])
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
         runs: list[LoggedRun] = []
-        for stretch in split_at_gaps(tick, channels, cuts, self._timing.control_period, self._mass):
-            if len(stretch.tick) < MIN_SEGMENT_ROWS:
-                self.notes.append(f"{self.label}: {len(stretch.tick)} rows between gaps are left out")
+        for segment in split_at_gaps(tick, channels, cuts, self._timing.control_period, self._mass):
+            if len(segment.tick) < MIN_SEGMENT_ROWS:
+                self.notes.append(f"{self.label}: {len(segment.tick)} rows between gaps are omitted")
                 continue
             kind: RunKind = self.kind
             if modes is not None:
-                kind = KINDS[int(modes[np.searchsorted(tick, stretch.tick[:1])][0])]
-            runs += self._runs_of_segment(stretch, kind)
+                kind = KINDS[int(modes[np.searchsorted(tick, segment.tick[:1])][0])]
+            runs += self._make_runs(segment, kind)
         if not runs:
-            allowed = (
-                f"at least {MIN_SEGMENT_ROWS} without a gap of more than 3, and a contact if the kind has one"
+            expected = (
+                f"{MIN_SEGMENT_ROWS} successive rows or more; for kinds contact and tap, with a contact"
             )
-            raise InputError(f"{self.label}: found {len(tick)} rows, expected {allowed}")
+            raise InputError(f"{self.label}: found no run in {len(tick)} rows, expected {expected}")
         return runs
 
-    def _runs_of_segment(self, stretch: LogSegment, kind: RunKind) -> list[LoggedRun]:
-        """Check a segment and return its runs: one for each contact, or a single one."""
-        period, force = self._timing.control_period, stretch.channels["force_measured"]
-        self.notes += checks.check_motion(self.label, kind, stretch, period, self._timing.command_hold)
-        self._ignore(stretch, "velocity_desired", check_velocity(self.label, stretch, period))
+    def _make_runs(self, segment: LogSegment, kind: RunKind) -> list[LoggedRun]:
+        """Check a segment of the log and return its runs: one per contact, or a single run."""
+        period, force = self._timing.control_period, segment.channels["force_measured"]
+        self.notes += checks.check_motion(self.label, kind, segment, period, self._timing.command_hold)
+        self._ignore_channel(segment, "velocity_desired", check_velocity(self.label, segment, period))
         if kind not in ("press", *KINDS_SPLIT_AT_CONTACTS):
-            return [self._run(stretch, kind, slice(None), None, None)]
+            return [self._make_run(segment, kind, slice(None), None, None)]
         if force is None:
-            allowed = "one where there is contact"
-            raise InputError(f"{self.label}: force_measured: found no such channel, expected {allowed}")
-        touched = self._touched(stretch.tick, force)
-        holds = kind == "contact" and self._command_holds(stretch, touched)
-        self.notes += checks.check_force(self.label, kind, stretch, touched, period, self._mass, holds)
+            raise InputError(f"{self.label}: force_measured: found no such channel, expected one for {kind}")
+        contacts = self._detect_contacts(segment.tick, force)
+        holds = kind == "contact" and self._is_command_valid(segment, contacts)
+        self.notes += checks.check_force(self.label, kind, segment, contacts, period, self._mass, holds)
         if kind == "press":
-            return [self._run(stretch, kind, slice(None), None, None)]
-        if not touched:
-            self.notes.append(f"{self.label}: {len(stretch.tick)} rows without contact are left out")
-        middles = [(contact[1] + two[0]) // 2 for contact, two in pairwise(touched)]
-        parts = [slice(*edges) for edges in pairwise([0, *middles, len(stretch.tick)])]
-        first = self._met - len(touched)
+            return [self._make_run(segment, kind, slice(None), None, None)]
+        if not contacts:
+            self.notes.append(f"{self.label}: {len(segment.tick)} rows without contact are omitted")
+        middles = [(contact[1] + two[0]) // 2 for contact, two in pairwise(contacts)]
+        parts = [slice(*edges) for edges in pairwise([0, *middles, len(segment.tick)])]
+        first = self._contact_count - len(contacts)
         return [
-            self._run(stretch, kind, part, contact, min(first + number, self._last))
-            for number, (part, contact) in enumerate(zip(parts, touched, strict=False))
+            self._make_run(segment, kind, part, contact, min(first + number, self._last))
+            for number, (part, contact) in enumerate(zip(parts, contacts, strict=False))
         ]
 
-    def _command_holds(self, stretch: LogSegment, touched: list[tuple[int, int]]) -> bool:
-        """Return whether the force command moves the model; ignore the channel with a note if it cannot."""
-        if stretch.channels["force_command"] is None:
+    def _is_command_valid(self, segment: LogSegment, contacts: list[tuple[int, int]]) -> bool:
+        """Return whether the force command explains the motion; if not, remove the channel with a note."""
+        if segment.channels["force_command"] is None:
             return False
         timing = self._timing
         holds, note = check_command(
-            self.label, stretch, touched, timing.control_period, self._mass, timing.row, self._integrator
+            self.label, segment, contacts, timing.control_period, self._mass, timing.row, self._integrator
         )
         if holds:
             self.notes += [note] if note else []
         else:
-            self._ignore(stretch, "force_command", note)
+            self._ignore_channel(segment, "force_command", note)
         return holds
 
-    def _ignore(self, stretch: LogSegment, channel: str, note: str | None) -> None:
-        """Remove a channel of a segment if there is a note with the reason."""
+    def _ignore_channel(self, segment: LogSegment, channel: str, note: str | None) -> None:
+        """Remove a channel from a segment and keep the note with the reason; do nothing without a note."""
         if note is not None:
             self.notes.append(note)
-            stretch.channels[channel] = None
+            segment.channels[channel] = None
 
-    def _touched(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
-        """Return the contacts of a segment, and count them; a contact may continue after a gap."""
+    def _detect_contacts(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
+        """Return the row ranges of the contacts in a segment, and count the contacts of the file.
+
+        A contact that a gap interrupts is counted once.
+        """
         period, rest = self._timing.control_period, None
-        if self._open is not None and (tick[0] - self._open[0]) * period < contact_detection.MIN_CONTACT_GAP:
-            rest = self._open[1]
-        touched = contact_detection.detect_contacts(force, period, rest)
-        goes_on = rest is not None and bool(touched) and touched[0][0] == 0
-        self._met += len(touched) - goes_on
-        ended = not touched or touched[-1][1] < len(force) - contact_detection.MIN_CONTACT_TICKS
-        self._open = (
+        if (
+            self._open_contact is not None
+            and (tick[0] - self._open_contact[0]) * period < contact_detection.MIN_CONTACT_GAP
+        ):
+            rest = self._open_contact[1]
+        contacts = contact_detection.detect_contacts(force, period, rest)
+        continues = rest is not None and bool(contacts) and contacts[0][0] == 0
+        self._contact_count += len(contacts) - continues
+        ended = not contacts or contacts[-1][1] < len(force) - contact_detection.MIN_CONTACT_TICKS
+        self._open_contact = (
             None
             if ended
             else (tick[-1], contact_detection.estimate_resting_force(force) if rest is None else rest)
         )
-        return touched
+        return contacts
 
-    def _run(
+    def _make_run(
         self,
-        stretch: LogSegment,
+        segment: LogSegment,
         kind: RunKind,
         part: slice,
-        touched: tuple[int, int] | None,
+        contact: tuple[int, int] | None,
         number: int | None,
     ) -> LoggedRun:
-        """Return a part of a segment as a run, with the contact's number if no channel contains it."""
+        """Return a part of a segment as a run; `number` is the contact index if no channel contains it."""
         channels = {
-            name: None if values is None else values[part] for name, values in stretch.channels.items()
+            name: None if values is None else values[part] for name, values in segment.channels.items()
         }
-        tick, index = stretch.tick[part], channels["contact_index"]
+        tick, index = segment.tick[part], channels["contact_index"]
         if index is None and number is not None:
             index = np.full(len(tick), number, np.int64)
-        x, measured = stretch.channels["position_desired"], channels["position_measured"]
+        x, measured = segment.channels["position_desired"], channels["position_measured"]
         assert x is not None and measured is not None
         return LoggedRun(
             kind=kind,
@@ -255,11 +268,11 @@ class _RunsOfFile:
             force_measured=channels["force_measured"],
             velocity_desired=channels["velocity_desired"],
             force_command=channels["force_command"],
-            valid=stretch.valid[part],
+            valid=segment.valid[part],
             contact_index=index,
             speed=None
-            if touched is None
-            else _estimate_approach_speed(x, touched[0], self._timing.control_period),
+            if contact is None
+            else _estimate_approach_speed(x, contact[0], self._timing.control_period),
             begin=self._begin,
             force_late=channels[FORCE_LATE_CHANNEL],
         )
@@ -271,7 +284,9 @@ def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming
     if period is None and mapping.channels.time.rate is not None:
         period = 1.0 / mapping.channels.time.rate
     if period is None:
-        raise InputError("timing.control_period: found nothing, expected a number > 0 s, here or in a prior")
+        raise InputError(
+            "timing.control_period: found nothing, expected a number > 0 s in the mapping or in a prior"
+        )
     rate = mapping.channels.time.rate
     if rate is not None and abs(rate * period - 1.0) > 1e-6:
         raise InputError(
@@ -279,12 +294,12 @@ def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming
         )
     hold = spec.command_hold or (rig.command_hold if rig else "linear")
     latency = spec.command_latency if spec.command_latency is not None else rig.command_latency if rig else 0
-    late, separate = spec.computing_delay, spec.clock == "separate"
-    return CampaignTiming(period, hold, latency, spec.row, None, late, separate)
+    computing_delay, has_two_clocks = spec.computing_delay, spec.clock == "separate"
+    return CampaignTiming(period, hold, latency, spec.row, None, computing_delay, has_two_clocks)
 
 
 def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
-    """Return the rows from the begin to the end of an entry."""
+    """Return the range of rows between `begin` and `end` of a `[[runs]]` entry."""
     if stamps is None:
         return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
     first = int(np.searchsorted(stamps, entry.begin)) if entry.begin else 0
@@ -294,25 +309,25 @@ def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> s
 def _classify_rows(
     values: np.ndarray | None, mapping: LogMapping, kind: RunKind, label: str
 ) -> np.ndarray | None:
-    """Return the kind of experiment at each row as an index into `KINDS`, or None without a mode channel."""
+    """Return the kind of experiment in each row as an index into `KINDS`, or None without a mode channel."""
     channel = mapping.channels.mode
     if values is None or channel is None:
         return None
-    named, inverse = np.unique(np.asarray(values, dtype=str), return_inverse=True)
+    modes, inverse = np.unique(np.asarray(values, dtype=str), return_inverse=True)
     kinds = []
-    for name in named.tolist():
-        word = name[:-2] if name.endswith(".0") else name
-        kind_name = channel.values.get(word, word)
+    for name in modes.tolist():
+        mode = name[:-2] if name.endswith(".0") else name
+        kind_name = channel.values.get(mode, mode)
         if kind_name not in KINDS:
             row = int(np.flatnonzero(inverse == len(kinds))[0]) + 1
             allowed = f"one of {', '.join([*channel.values, *KINDS])}"
-            raise InputError(f"{label}: row {row}: mode: found {format_value(word)}, expected {allowed}")
+            raise InputError(f"{label}: row {row}: mode: found {format_value(mode)}, expected {allowed}")
         kinds.append(KINDS.index(kind_name))
     return np.array(kinds)[inverse]
 
 
 def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    """Return the rows at which another contact begins at another position, as in simulations."""
+    """Return the rows at which the motion restarts with the next contact, as in simulated logs."""
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
@@ -322,8 +337,8 @@ def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
 
 
 def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float | None:
-    """Return the approach speed of a contact [m/s], or None."""
-    # The contact begins some ticks before its force exceeds the noise.
+    """Return the approach speed of a contact [m/s], or None if the log begins too late."""
+    # The contact begins some ticks before the force exceeds the noise.
     before = begin - SPEED_SPAN_TICKS
     if before < SPEED_SPAN_TICKS:
         return None
@@ -331,7 +346,7 @@ def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float 
 
 
 def _hash_log(path: Path) -> str:
-    """Return the hash of a file, or of the names and contents of a folder's files."""
+    """Return the SHA-256 of a log file, or of the names and contents of all files in a log folder."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

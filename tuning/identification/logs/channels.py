@@ -1,4 +1,4 @@
-"""Channels of a log in SI units, at the rows of the desired position, according to its mapping."""
+"""Channels of a log according to its mapping: in SI units, and at the times of the desired position."""
 
 from __future__ import annotations
 
@@ -21,13 +21,23 @@ NUMERIC_CHANNELS = (
     "contact_index",
 )
 
-STAMP_COLUMN_PATTERN = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # column names of stamps in a group
+STAMP_COLUMN_PATTERN = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # names of columns with time stamps
 
 
 def read_channels(
     log: OpenLog, mapping: LogMapping, period: float
 ) -> tuple[ColumnsByName, np.ndarray | None, float, list[str]]:
-    """Return the available channels in SI units, the stamps from the first one [s], that one, and notes."""
+    """Read the channels of a log that the mapping names.
+
+    Args:
+        log: Open log.
+        mapping: Mapping of columns to channels.
+        period: Control period [s].
+
+    Returns:
+        The available channels in SI units; the time stamps of the rows relative to the first one [s], or
+        None; the first time stamp [s]; and notes.
+    """
     channels = mapping.channels
     wanted: dict[str, str] = {}
     for name in (*NUMERIC_CHANNELS, "mode"):
@@ -64,7 +74,7 @@ def read_channels(
 def _read_channel_stamps(
     log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str], read: ColumnsByName
 ) -> dict[str, np.ndarray | None] | None:
-    """Return the stamps of each channel if they differ; None if all channels share the rows of the log."""
+    """Return the time stamps of each channel [s], or None if all channels have common time stamps."""
     named = {name: getattr(getattr(mapping.channels, name), "time", None) for name in wanted}
     if any(named.values()):
         return _read_mapped_stamps(log.label, mapping, named, read)
@@ -75,20 +85,20 @@ def _read_channel_stamps(
     different = [wanted[name] for name, t in clocks.items() if not resampling.has_same_stamps(t, master)]
     if not different:
         return None
-    time, since = mapping.channels.time, f"{format_value(different[0])} has a clock of its own"
+    time, reason = mapping.channels.time, f"because {format_value(different[0])} has separate time stamps"
     if mapping.timing.clock == "index":
-        raise InputError(f'{log.label}: timing.clock: found "index", expected "stamps", since {since}')
+        raise InputError(f'{log.label}: timing.clock: found "index", expected "stamps", {reason}')
     if time.column is not None and time.column not in log.stamps:
-        allowed = ", ".join(sorted(to_one_line(column, 40) for column in log.stamps)[:4])
-        found_text = f"column {format_value(time.column)}"
-        raise InputError(f"{log.label}: time: found {found_text}, expected one of {allowed}, since {since}")
+        expected = ", ".join(sorted(to_one_line(column, 40) for column in log.stamps)[:4])
+        finding = f"column {format_value(time.column)}"
+        raise InputError(f"{log.label}: time: found {finding}, expected one of {expected}, {reason}")
     return clocks
 
 
 def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
-    """Raise `InputError` if a group of columns has stamps that differ from those of the rows.
+    """Raise `InputError` if the mapping ignores time stamps of a group that differ from those of the rows.
 
-    The names of columns define the groups of HDF5, MAT and TDMS files.
+    In HDF5, MAT and TDMS files, the names of the columns define the groups.
     """
     time = mapping.channels.time
     if time.column is None or log.stamps:
@@ -102,26 +112,25 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
             step, group_step = float(np.median(np.diff(rows))), float(np.median(np.diff(times)))
             if not (step > 0.0 and group_step > 0.0):
                 continue
-            # The stamps may have another unit of time.
+            # The time stamps of the group may have another unit.
             power = round(float(np.log10(group_step / step)) / 3.0)
             times = times * 1000.0**-power
             if abs(group_step * 1000.0**-power / step - 1.0) > clock.MAX_RATE_ERROR:
-                continue  # not a time, for example a count
+                continue  # The column does not contain times, but for example a counter.
             if (
                 len(rows) == len(times)
                 and np.max(np.abs(times - rows)) <= resampling.SIMULTANEITY_TOLERANCE * step
             ):
                 continue
             raise InputError(
-                f"{log.label}: column {format_value(column)}: found stamps of its own in "
-                f"{format_value(stamps)} that are "
-                f"not those in {format_value(time.column)}, expected channels.{name}.time = "
-                f"{format_value(stamps)}"
+                f"{log.label}: column {format_value(column)}: found separate time stamps in "
+                f"{format_value(stamps)} that differ from {format_value(time.column)}, "
+                f"expected channels.{name}.time = {format_value(stamps)}"
             )
 
 
 def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str]:
-    """Return stamp columns in the groups of a column that do not contain the stamps of the rows."""
+    """Return the time stamp columns in the groups that contain `column` but not the column `time`."""
     result = []
     for candidate in names:
         name = re.split(r"[/.]", candidate)[-1]
@@ -139,12 +148,15 @@ def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str
 def _read_mapped_stamps(
     label: str, mapping: LogMapping, named: Mapping[str, str | None], read: ColumnsByName
 ) -> dict[str, np.ndarray | None]:
-    """Return the stamps [s] of each channel from the columns in the mapping, relative to the first of all."""
+    """Read the time stamps [s] of each channel from the columns that the mapping names.
+
+    The origin of all time stamps is the earliest first stamp of all columns.
+    """
     time = mapping.channels.time
     if mapping.timing.clock == "index":
         name = next(name for name, column in named.items() if column)
         raise InputError(
-            f'{label}: timing.clock: found "index", expected "stamps", since channels.{name}.time is named'
+            f'{label}: timing.clock: found "index", expected "stamps", because channels.{name}.time is given'
         )
     columns = {name: column or time.column for name, column in named.items()}
     for column in dict.fromkeys(columns.values()):
@@ -160,7 +172,10 @@ def _read_mapped_stamps(
 
 
 def _read_row_stamps(label: str, read: ColumnsByName, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
-    """Return the stamps [s] from the first one, and that one; None without a column of stamps."""
+    """Return the time stamps of the rows relative to the first one, and the first one [s].
+
+    The time stamps are None if the mapping names no column of time stamps.
+    """
     time = mapping.channels.time
     if time.column is None:
         return None, 0.0
@@ -168,10 +183,10 @@ def _read_row_stamps(label: str, read: ColumnsByName, mapping: LogMapping) -> tu
     if time.time_format is not None:
         return clock.parse_stamps(stamps, time.time_format, label)
     if stamps.dtype == object:
-        allowed = "numbers, or a time_format beside the column"
+        expected = "numbers, or channels.time.time_format for texts"
         where = f"{label}: column {format_value(time.column)}"
-        raise InputError(f"{where}: found {format_value(stamps[0])}, expected {allowed}")
+        raise InputError(f"{where}: found {format_value(stamps[0])}, expected {expected}")
     checks.check_values(label, "time", stamps)
-    # The first stamp may count from an epoch; subtracting it before the conversion saves digits.
+    # Time stamps may be relative to an epoch: subtract the first one before the conversion to keep precision.
     factor = get_si_conversion(Channel(column=time.column, unit=time.unit), "time")[0]
     return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0

@@ -1,8 +1,10 @@
-"""Checks that channels agree with their mapping: unit, sign and row convention.
+"""Checks of the mapping of each channel: unit, sign and row convention.
 
-A wrong sign, a wrong unit or a row with another tick's command would give a good fit of a rig that does not
-exist. The numerical model is known exactly, so its motion reveals such errors: the commands follow from the
-logged force command by Newton's law, and the change of speed in a contact from the measured force.
+With a wrong sign, unit or row convention, the model may fit the logs well but describe another rig. The
+numerical model is known exactly and reveals such errors: by Newton's law, the force command determines the
+position
+    commands,
+and the measured force determines the change of speed in a contact.
 """
 
 from __future__ import annotations
@@ -19,24 +21,24 @@ from tuning.identification.logs.scales import (
     estimate_force_beside_contacts,
 )
 
-MIN_LOG_ROWS = 200  # rows, shortest log
-MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, least time between two contacts on the far side
-MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # share of the change of momentum that shows a contact on the far side
-MIN_CLIPPED_READINGS = 10  # repetitions of the largest reading that show clipping
-MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; nanoseconds since an epoch are 1e18
-MAX_STROKE = 1.0  # m
-MIN_STROKE = 1e-5  # m
-MAX_SPEED = 5.0  # m/s
-MAX_POSITION_LAG = 400  # ticks, largest delay of a reading behind its command
-MAX_REPEATED_SHARE = 0.4  # share of repeated readings, above which a note warns of held readings
-MAX_HOLD_ROWS = 20  # rows, longest regular repetition
-MIN_REGULAR_SHARE = 0.9  # share of changes at the most common distance that shows regular repetition
-MIN_SPEED_CORRELATION = 0.3  # correlation of speeds, below which a note says that the reading does not follow
-MAX_EVALUATED_ROWS = 200_000  # rows that are sufficient
+MIN_LOG_ROWS = 200  # minimum number of rows in a log
+MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, minimum time between two contacts at the second surface of a clearance
+MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # impulse over change of momentum that shows a contact at the second surface
+MIN_CLIPPED_READINGS = 10  # number of successive largest readings that shows clipping
+MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; nanoseconds since an epoch are about 1e18
+MAX_STROKE = 1.0  # m, largest plausible range of positions
+MIN_STROKE = 1e-5  # m, smallest plausible range of positions
+MAX_SPEED = 5.0  # m/s, largest plausible speed
+MAX_POSITION_LAG = 400  # ticks, longest delay of a position reading relative to its command
+MAX_REPEATED_SHARE = 0.4  # share of repeated readings; above it, a note warns of held readings
+MAX_HOLD_ROWS = 20  # rows, longest time that a reading is held
+MIN_REGULAR_SHARE = 0.9  # share of changes with the most common distance that shows held readings
+MIN_SPEED_CORRELATION = 0.3  # correlation of desired and measured speed; below it, a note warns the user
+MAX_EVALUATED_ROWS = 200_000  # number of rows that is sufficient
 
 
 def check_values(label: str, name: str, values: np.ndarray) -> None:
-    """Raise `InputError` if a value cannot be a reading of a sensor or a clock."""
+    """Raise `InputError` if a value is not finite or is larger than any sensor reading or time stamp."""
     bad = np.flatnonzero(~(np.abs(values) <= MAX_ABSOLUTE_VALUE))
     if len(bad):
         row, value = int(bad[0]) + 1, float(values[bad[0]])
@@ -44,29 +46,40 @@ def check_values(label: str, name: str, values: np.ndarray) -> None:
         raise InputError(f"{label}: row {row}: {name}: found {value:g}, expected {allowed}")
 
 
-def check_motion(label: str, kind: str, stretch: LogSegment, period: float, hold: str) -> list[str]:
-    """Check the position channels of a segment: size, excitation, and agreement; return notes.
+def check_motion(label: str, kind: str, segment: LogSegment, period: float, hold: str) -> list[str]:
+    """Check the desired and measured positions of a segment, and return notes.
 
-    With the `hold` "linear" the command must change in every row.
+    The positions must have plausible strokes and speeds, and the measured position must follow the desired
+    position. With the command hold "linear", the desired position must change in every row.
+
+    Args:
+        label: Name of the log in messages.
+        kind: Kind of experiment.
+        segment: Segment of the log.
+        period: Control period [s].
+        hold: Command hold, "linear" or "zoh".
+
+    Raises:
+        InputError: If the positions are not plausible, for example because of a wrong unit or sign.
     """
     x, measured = (
-        _get_channel(stretch, name)[stretch.valid] for name in ("position_desired", "position_measured")
+        _get_channel(segment, name)[segment.valid] for name in ("position_desired", "position_measured")
     )
     if kind == "rest":
         return []
     if np.ptp(x) == 0.0:
         raise InputError(
-            f"{label}: position_desired: found {x[0]:g} m in every row: nothing excites the motion simulator"
+            f"{label}: position_desired: found {x[0]:g} m in every row, expected a motion, or kind rest"
         )
     if np.ptp(measured) == 0.0:
         raise InputError(
-            f"{label}: position_measured: found {measured[0]:g} m in every row, expected a reading"
+            f"{label}: position_measured: found {measured[0]:g} m in every row, expected readings that change"
         )
     _check_size(label, x, measured, period)
     if hold == "linear" and (rows := find_change_interval(x)) > 1:
-        allowed = 'one of every row; or command_hold = "zoh" where the drives hold it so long'
+        expected = 'one in every row, or command_hold = "zoh" if the drives hold each command so long'
         raise InputError(
-            f"{label}: position_desired: found one that changes every {rows} rows, expected {allowed}"
+            f"{label}: position_desired: found a new command every {rows} rows, expected {expected}"
         )
     return [*_note_held_readings(label, x, measured), *_check_following(label, kind, x, measured)]
 
@@ -74,44 +87,72 @@ def check_motion(label: str, kind: str, stretch: LogSegment, period: float, hold
 def check_force(
     label: str,
     kind: str,
-    stretch: LogSegment,
-    touched: list[tuple[int, int]],
+    segment: LogSegment,
+    contacts: list[tuple[int, int]],
     period: float,
     mass: float,
-    command_holds: bool = False,
+    mass_is_verified: bool = False,
 ) -> list[str]:
-    """Check the sign and unit of the measured force by the change of speed, or of a press by the motion.
+    """Check the sign and unit of the measured force in a segment, and return notes.
 
-    `command_holds` says whether force_command moves the model.
+    In contacts, the force must explain the model's change of speed. In a press, it must increase with the
+    position.
+
+    Args:
+        label: Name of the log in messages.
+        kind: Kind of experiment.
+        segment: Segment of the log.
+        contacts: For each contact, its first row and the row after its last row.
+        period: Control period [s].
+        mass: Equivalent mass of the numerical model [kg].
+        mass_is_verified: Whether the force command moves the model with this mass.
 
     Returns:
-        Notes, for example that the force does not have a new reading in every row.
+        Notes, for example that the log does not have a new force reading in every row.
+
+    Raises:
+        InputError: If the force has a wrong sign or unit.
     """
-    force = _get_channel(stretch, "force_measured")
-    readings = force[stretch.valid]
+    force = _get_channel(segment, "force_measured")
+    readings = force[segment.valid]
     if np.ptp(readings) == 0.0:
-        raise InputError(f"{label}: force_measured: found {readings[0]:g} N in every row, expected a reading")
+        raise InputError(
+            f"{label}: force_measured: found {readings[0]:g} N in every row, expected readings that change"
+        )
     if kind == "press":
-        measured = _get_channel(stretch, "position_measured")[stretch.valid]
+        measured = _get_channel(segment, "position_measured")[segment.valid]
         if np.corrcoef(readings, measured)[0, 1] < -0.5:
-            raise _make_sign_error(label, "falls where the hardware is pushed deeper")
+            raise InputError(
+                f"{label}: force_measured: found a force that decreases when the hardware is pressed deeper, "
+                "expected the other sign: F > 0 pushes back"
+            )
         return _note_slow_readings(label, readings)
     top = np.abs(readings) >= np.max(np.abs(readings))
     clipped = bool(np.count_nonzero(top[1:] & top[:-1]) >= MIN_CLIPPED_READINGS)
     if kind == "contact":
-        pull = np.minimum(force - estimate_force_beside_contacts(force, touched), 0.0)
-        _check_one_side(label, pull, _get_channel(stretch, "position_desired"), period, mass)
-    check_impulse(label, kind, stretch, touched, period, mass, command_holds, clipped)
+        pull = np.minimum(force - estimate_force_beside_contacts(force, contacts), 0.0)
+        _check_one_side(label, pull, _get_channel(segment, "position_desired"), period, mass)
+    check_impulse(label, kind, segment, contacts, period, mass, mass_is_verified, clipped)
     notes = _note_slow_readings(label, readings)
     if clipped:
         notes.append(
-            f"{label}: force_measured: {np.count_nonzero(top)} rows at the largest reading, as if clipped"
+            f"{label}: force_measured: {np.count_nonzero(top)} rows have the largest reading, as if clipped"
         )
     return notes
 
 
 def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, mass: float) -> None:
-    """Raise `InputError` if a contact reverses a retracting motion, like the far surface of a clearance."""
+    """Raise `InputError` if the log contains contacts at the second surface of a clearance.
+
+    Such a contact pulls (F < 0) and reverses a retracting motion.
+
+    Args:
+        label: Name of the log in messages.
+        pull: Negative part of the force [N].
+        x: Desired position [m].
+        period: Control period [s].
+        mass: Equivalent mass of the numerical model [kg].
+    """
     for begin, end in contact_detection.detect_contacts(pull, period, 0.0, apart=MIN_FAR_SIDE_CONTACT_GAP):
         begin, end = begin - SPEED_SPAN_TICKS, end + SPEED_SPAN_TICKS
         if begin < SPEED_SPAN_TICKS or end + SPEED_SPAN_TICKS >= len(x):
@@ -123,42 +164,42 @@ def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, 
         impulse = -period * float(np.nansum(pull[begin:end]))
         if before < 0.0 < after and impulse > MIN_FAR_SIDE_IMPULSE_SHARE * mass * (after - before):
             raise InputError(
-                f"{label}: row {begin + SPEED_SPAN_TICKS + 1}: found a contact on the far side (F < 0 "
-                "that turns "
-                "falling positions round), expected contacts on the side that rising positions press (F > 0)"
+                f"{label}: row {begin + SPEED_SPAN_TICKS + 1}: found a contact at the second surface of a "
+                "clearance (F < 0 reverses a retraction), expected only contacts that reverse an approach "
+                "(F > 0)"
             )
 
 
 def _note_slow_readings(label: str, force: np.ndarray) -> list[str]:
-    """Return a note if there are fewer readings than rows."""
+    """Return a note if the log does not have a new force reading in every row."""
     rows = find_change_interval(force)
     if rows == 1:
         return []
-    return [f"{label}: force_measured: a new reading every {rows} rows alone: those between do not fit a law"]
+    return [f"{label}: force_measured: a new reading only every {rows} rows: other rows do not fit a law"]
 
 
 def find_change_interval(values: np.ndarray) -> int:
-    """Return the regular number of rows between changes of the values, or 1."""
+    """Return the number of rows for which each value is held, or 1 if the values do not change regularly."""
     steps = np.diff(values[:MAX_EVALUATED_ROWS])
     apart = np.diff(np.flatnonzero(steps))
     if len(apart) < MIN_LOG_ROWS // 10:
         return 1
     usual = int(np.median(apart))
-    # Rounded values of a steady motion also change regularly, by one unit of their last digit.
+    # In a steady motion, rounded values also change regularly, by one unit of their last digit.
     coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _detect_resolution(values)
     is_held = 1 < usual <= MAX_HOLD_ROWS and np.mean(apart == usual) > MIN_REGULAR_SHARE and not coarse
     return usual if is_held else 1
 
 
 def _detect_resolution(values: np.ndarray) -> float:
-    """Return the step of which all differences are multiples, or 0."""
+    """Return the resolution of rounded values: all differences are multiples of it; 0 without rounding."""
     steps = np.diff(np.unique(values[np.isfinite(values)][:MAX_EVALUATED_ROWS]))
     least = float(np.min(steps, initial=np.inf))
     return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
 
 
 def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) -> None:
-    """Raise `InputError` for strokes or speeds that indicate a wrong unit."""
+    """Raise `InputError` if the stroke or speed of a position channel indicates a wrong unit."""
     for name, values in (("position_desired", x), ("position_measured", measured)):
         stroke = float(np.ptp(values))
         if not MIN_STROKE <= stroke <= MAX_STROKE:
@@ -172,14 +213,14 @@ def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) 
             raise InputError(f"{label}: {name}: found speeds of {speed:.3g} m/s, expected {allowed}")
     ratio = float(np.ptp(measured) / np.ptp(x))
     if not 0.02 <= ratio <= 50:
-        stroke_text = f"a stroke {ratio:.3g} times that of position_desired"
+        stroke_text = f"{ratio:.3g} times the stroke of position_desired"
         raise InputError(
-            f"{label}: position_measured: found {stroke_text}, expected a like one (is its unit right?)"
+            f"{label}: position_measured: found {stroke_text}, expected 0.02 to 50 times (is its unit right?)"
         )
 
 
 def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """Check that the reading follows its command with the same sign; return notes."""
+    """Check that the measured position follows the desired position with the same sign, and return notes."""
     command, reading = (
         (values[SPEED_SPAN_TICKS:] - values[:-SPEED_SPAN_TICKS])[:MAX_EVALUATED_ROWS]
         for values in (x, measured)
@@ -199,19 +240,19 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
         return [f"{label}: position_measured: hardly follows position_desired (correlation {strength:.2g})"]
     if strength < 0:
         raise InputError(
-            f"{label}: position_measured: found one that moves against the command, expected the other sign"
+            f"{label}: position_measured: found a motion against position_desired, expected the other sign"
         )
     if lag <= -2:
-        finding = f"one that leads position_desired by {-lag} ticks"
+        finding = f"a motion {-lag} ticks earlier than position_desired"
         raise InputError(
-            f"{label}: position_measured: found {finding}, expected one that follows (are the two swapped?)"
+            f"{label}: position_measured: found {finding}, expected a later one (are the two swapped?)"
         )
     check_gain(label, kind, x, measured)
     return []
 
 
 def _note_held_readings(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """Return a note if readings are constant while the command moves by more than their resolution."""
+    """Return a note if position readings are often repeated although the command moves."""
     moving = np.abs(np.diff(x)) > _detect_resolution(measured)
     if np.count_nonzero(moving) < MIN_LOG_ROWS // 2:
         return []
@@ -219,19 +260,11 @@ def _note_held_readings(label: str, x: np.ndarray, measured: np.ndarray) -> list
     if share < MAX_REPEATED_SHARE:
         return []
     rows_held = 1 / (1 - share) if share < 1 else np.inf
-    message = (
-        f"the same in {100 * share:.0f} % of rows, as if each reading was held for {rows_held:.2g} of them"
-    )
-    return [f"{label}: position_measured: {message}: its delay is then longer by half of that"]
+    message = f"repeated in {100 * share:.0f} % of rows, as if each reading was held for {rows_held:.2g} rows"
+    return [f"{label}: position_measured: {message}: this adds half of this time to the delay"]
 
 
-def _make_sign_error(label: str, problem: str) -> InputError:
-    return InputError(
-        f"{label}: force_measured: found one that {problem}, expected the other sign: F > 0 pushes back"
-    )
-
-
-def _get_channel(stretch: LogSegment, name: str) -> np.ndarray:
-    values = stretch.channels[name]
+def _get_channel(segment: LogSegment, name: str) -> np.ndarray:
+    values = segment.channels[name]
     assert values is not None
     return values

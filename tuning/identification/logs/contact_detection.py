@@ -1,52 +1,56 @@
-"""Detection of contacts in a run, from the force, if no channel marks them."""
+"""Detection of contacts from the measured force, for logs in which no channel marks the contacts."""
 
 from __future__ import annotations
 
 import numpy as np
 
-CONTACT_THRESHOLD_SIGMAS = 5.0  # standard deviations of the force noise that indicate contact
-MIN_CONTACT_TICKS = 3  # successive ticks above the threshold that begin a contact
-MIN_CONTACT_GAP = 0.1  # s, least time between two contacts
-MAX_REST_ROWS = 200  # largest number of rows for the force at rest
+CONTACT_THRESHOLD_SIGMAS = 5.0  # standard deviations of the force noise; a larger force indicates contact
+MIN_CONTACT_TICKS = 3  # number of successive ticks above the threshold with which a contact begins
+MIN_CONTACT_GAP = 0.1  # s, minimum time between two contacts
+MAX_REST_ROWS = 200  # maximum number of first rows that determine the force without contact
 
 
 def detect_contacts(
     force: np.ndarray, period: float, rest: float | None = None, apart: float = MIN_CONTACT_GAP
 ) -> list[tuple[int, int]]:
-    """Return the first row of each contact and the row after its last one.
+    """Detect contacts as intervals in which the force exceeds its noise.
 
     Args:
-        force: Force [N], without contact at first unless `rest` is specified; NaN in lost rows.
+        force: Measured force [N]; NaN in lost rows. The first rows must be without contact unless `rest` is
+            given.
         period: Control period [s].
-        rest: Force at rest [N].
-        apart: Time [s] below which successive contacts are merged.
+        rest: Force reading without contact [N], or None to estimate it.
+        apart: Minimum time between two contacts [s]; closer contacts are merged.
+
+    Returns:
+        For each contact, its first row and the row after its last row.
     """
-    touched = np.abs(
+    is_above = np.abs(
         force - (estimate_resting_force(force) if rest is None else rest)
     ) > estimate_contact_threshold(force)
-    long = touched.copy()
+    is_sustained = is_above.copy()
     for ticks in range(1, MIN_CONTACT_TICKS):
-        long[: len(force) - ticks] &= touched[ticks:]
-        long[len(force) - ticks :] = False
-    starts = np.flatnonzero(long)
+        is_sustained[: len(force) - ticks] &= is_above[ticks:]
+        is_sustained[len(force) - ticks :] = False
+    starts = np.flatnonzero(is_sustained)
     if not len(starts):
         return []
-    # Short excursions above the threshold belong to a contact only if they are close to one.
-    inside = np.flatnonzero(touched)
+    # A short excursion above the threshold belongs to a contact only if it is close to that contact.
+    inside = np.flatnonzero(is_above)
     inside = inside[inside >= starts[0]]
     breaks = np.flatnonzero(np.diff(inside) > round(apart / period))
     begins, ends = inside[[0, *(breaks + 1)]], inside[[*breaks, len(inside) - 1]] + 1
-    has = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
-    return [(int(a), int(b)) for a, b, good in zip(begins, ends, has, strict=True) if good]
+    has_start = np.searchsorted(starts, begins) < np.searchsorted(starts, ends)
+    return [(int(a), int(b)) for a, b, is_contact in zip(begins, ends, has_start, strict=True) if is_contact]
 
 
 def estimate_resting_force(force: np.ndarray) -> float:
-    """Return the reading of the sensor without contact [N], from the first rows."""
+    """Return the force reading without contact [N], the median of the first rows."""
     return float(np.nanmedian(_select_first_readings(force)))
 
 
 def estimate_contact_threshold(force: np.ndarray) -> float:
-    """Return the contact threshold [N], from the scatter between rows and that of the first rows."""
+    """Return the force [N] above which there is contact, from the noise of the readings."""
     steps = np.diff(force[np.isfinite(force)])
     sigma = max(
         1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_select_first_readings(force)))

@@ -1,13 +1,14 @@
 """Reconstruction of lost rows, and division of a log at longer gaps.
 
-A lost row also lost its command. Up to `MAX_RECONSTRUCTED_ROWS` successive commands are reconstructed. The
-numerical model
+The command of a lost row is lost, too. Up to `MAX_RECONSTRUCTED_ROWS` successive commands are reconstructed.
+The numerical model
 
     x(n+1) = x(n) + T v(n+1),   v(n+1) = v(n) - T F_c(n) / M        (semi-implicit Euler)
 
-gives the first and the last of them from the neighbouring rows, exactly to the digits of the log. A cubic
-gives those between, or all of them if velocity or force command are not logged. Sensor readings are never
-reconstructed: they are NaN, and the row is not valid. A longer gap divides the log.
+gives the first and the last lost command from the adjacent rows, with the precision of the log. A cubic
+polynomial gives the commands between them, or all commands if velocity or force command are not logged.
+Sensor readings are not reconstructed: they are NaN, and the row is marked as not valid. At longer gaps, the
+log is divided.
 """
 
 from __future__ import annotations
@@ -20,27 +21,37 @@ import numpy as np
 
 from tuning.identification.logs.scale_fit import fit_scale
 
-MAX_RECONSTRUCTED_ROWS = 3  # rows, longest gap that is reconstructed
-INTEGRATOR_SPAN_ROWS = 32  # rows over which the integrator is recognizable despite rounding and jitter
-MAX_INTEGRATOR_DISTANCE = 0.2  # half periods, largest distance of the estimate from an integrator
-MIN_INTEGRATOR_SIGMAS = 4.0  # standard errors of a reliable estimate
-MIN_VELOCITY_CHANGE_SHARE = 0.1  # share of the largest change of velocity, above which a row is used
+MAX_RECONSTRUCTED_ROWS = 3  # rows, longest gap in which commands are reconstructed
+INTEGRATOR_SPAN_ROWS = 32  # rows, span of differences that show the integrator despite rounding and jitter
+# half periods, largest difference between the estimate and an integrator's value
+MAX_INTEGRATOR_DISTANCE = 0.2
+MIN_INTEGRATOR_SIGMAS = 4.0  # standard errors that must separate the estimate from the other integrators
+# share of the largest change of velocity; rows with a smaller change are not used
+MIN_VELOCITY_CHANGE_SHARE = 0.1
 
 ChannelValues = Mapping[str, np.ndarray | None]
 
 
 class LogSegment(NamedTuple):
-    """Segment of a log without a longer gap, with a row for every tick."""
+    """Segment of a log without a long gap, with one row per tick."""
 
     tick: np.ndarray  # int64
-    channels: dict[str, np.ndarray | None]
-    valid: np.ndarray  # bool
+    channels: dict[str, np.ndarray | None]  # values of each channel in SI units; NaN or -1 in lost rows
+    valid: np.ndarray  # bool, False in lost rows
 
 
 def split_at_gaps(
     tick: np.ndarray, channels: ChannelValues, cuts: np.ndarray, period: float, mass: float
 ) -> list[LogSegment]:
-    """Return the segments between longer gaps and before the rows in `cuts`."""
+    """Divide a log at long gaps and before given rows; fill shorter gaps.
+
+    Args:
+        tick: Tick of each row.
+        channels: Values of each channel.
+        cuts: Rows at which a new segment begins.
+        period: Control period [s].
+        mass: Equivalent mass of the numerical model [kg].
+    """
     before = np.flatnonzero(np.diff(tick) > MAX_RECONSTRUCTED_ROWS + 1) + 1
     edges = [0, *np.union1d(before, cuts).astype(int).tolist(), len(tick)]
     return [
@@ -53,13 +64,22 @@ def split_at_gaps(
 
 
 def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str | None:
-    """Return the integrator of the numerical model in a log; None if the log does not determine it."""
+    """Detect the integrator of the numerical model from logged positions and velocities.
+
+    Args:
+        x: Desired position [m].
+        v: Desired velocity [m/s], or None.
+        period: Control period [s].
+
+    Returns:
+        The name of the integrator, or None if the log does not determine it.
+    """
     if v is None:
         return None
     step = np.diff(x)
     by = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
     errors = {name: np.abs(step - period * velocity) for name, velocity in by.items()}
-    # Without force all integrators agree, and jumps come from a reset of the rig.
+    # Omit rows without force, where all integrators agree, and jumps due to a reset of the rig.
     pulled = np.abs(np.diff(v))
     usable = np.isfinite(step) & (pulled > 0)
     usable &= pulled <= 10 * np.nanmedian(pulled[usable]) if np.any(usable) else False
@@ -69,9 +89,10 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
 
 
 def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
-    """Return the integrator from the motion over `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
+    """Detect the integrator from the motion over `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
 
-    The integrators differ in the weights of the velocities at both ends of a step.
+    Integrators differ in the velocity that they use for a step: at its start, at its end, or the mean of
+        both.
     """
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))
@@ -83,38 +104,40 @@ def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) ->
     fit = fit_scale(left, period / 2 * changed[pulled], INTEGRATOR_SPAN_ROWS) if np.any(pulled) else None
     if fit is None:
         return None
-    places = {"semi_implicit_euler": 1.0, "explicit_euler": -1.0, "zoh": 0.0}
-    best = min(places, key=lambda name: abs(fit.slope - places[name]))
+    expected_slopes = {"semi_implicit_euler": 1.0, "explicit_euler": -1.0, "zoh": 0.0}
+    best = min(expected_slopes, key=lambda name: abs(fit.slope - expected_slopes[name]))
     return (
         best
-        if abs(fit.slope - places[best]) < MAX_INTEGRATOR_DISTANCE
+        if abs(fit.slope - expected_slopes[best]) < MAX_INTEGRATOR_DISTANCE
         and MIN_INTEGRATOR_SIGMAS * fit.error < 0.5 - MAX_INTEGRATOR_DISTANCE
         else None
     )
 
 
 def _fill_lost_ticks(tick: np.ndarray, channels: ChannelValues, period: float, mass: float) -> LogSegment:
-    """Return a segment with a row for every tick."""
+    """Return a segment with one row per tick: insert lost rows and reconstruct their commands."""
     index = tick - tick[0]
     rows = int(index[-1]) + 1
     valid = np.zeros(rows, bool)
     valid[index] = True
-    spread: dict[str, np.ndarray | None] = {}
+    filled_channels: dict[str, np.ndarray | None] = {}
     for name, values in channels.items():
         if values is None or rows == len(tick):
-            spread[name] = values
+            filled_channels[name] = values
             continue
-        spread[name] = filled = np.full(rows, -1 if values.dtype.kind == "i" else np.nan, values.dtype)
+        filled_channels[name] = filled = np.full(
+            rows, -1 if values.dtype.kind == "i" else np.nan, values.dtype
+        )
         filled[index] = values
     if rows > len(tick):
-        _reconstruct_commands(spread, valid, period, mass)
-    return LogSegment(np.arange(rows, dtype=np.int64) + tick[0], spread, valid)
+        _reconstruct_commands(filled_channels, valid, period, mass)
+    return LogSegment(np.arange(rows, dtype=np.int64) + tick[0], filled_channels, valid)
 
 
 def _reconstruct_commands(
     channels: dict[str, np.ndarray | None], valid: np.ndarray, period: float, mass: float
 ) -> None:
-    """Reconstruct the commands of the lost rows, in place."""
+    """Reconstruct the position commands and contact indices of lost rows, in place."""
     x, v, force = (channels[name] for name in ("position_desired", "velocity_desired", "force_command"))
     assert x is not None
     index, valid_rows = channels["contact_index"], np.flatnonzero(valid)
@@ -130,7 +153,7 @@ def _reconstruct_commands(
         is_known[after + 1] = is_known[until - 1] = True
     for a, b in zip(after, until, strict=True):
         gap = np.flatnonzero(~is_known[a:b]) + a
-        near = np.flatnonzero(is_known[max(0, a - 3) : b + 4]) + max(0, a - 3)
+        neighbours = np.flatnonzero(is_known[max(0, a - 3) : b + 4]) + max(0, a - 3)
         if len(gap):
-            near = near[np.argsort(np.abs(near - (a + b) / 2), kind="stable")[:4]]
-            x[gap] = np.polynomial.Polynomial.fit(near, x[near], len(near) - 1)(gap)
+            neighbours = neighbours[np.argsort(np.abs(neighbours - (a + b) / 2), kind="stable")[:4]]
+            x[gap] = np.polynomial.Polynomial.fit(neighbours, x[neighbours], len(neighbours) - 1)(gap)

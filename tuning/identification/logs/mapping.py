@@ -1,4 +1,4 @@
-"""Mapping file of logs, `jaxhil/log/1`: channels, units and kinds of experiments.
+"""Mapping file `jaxhil/log/1`, which describes logs: channels, units and kinds of experiments.
 
     schema = "jaxhil/log/1"
     [channels]                  # a column's name, or a table: column, unit, scale, sign, offset
@@ -7,8 +7,8 @@
     [text]                      # skip_rows, delimiter, decimal, of text files
     [[runs]]                    # files (patterns), kind
 
-The prior mechanism file provides values that timing and bodies omit. A number of a column means sign (scale
-number + offset), in the named unit.
+A prior mechanism file provides the values that `[timing]` and `[bodies]` omit. The value of a channel is sign
+* (scale * number + offset) in the given unit, where number is the entry of the column.
 """
 
 from __future__ import annotations
@@ -35,20 +35,19 @@ FilePattern = Annotated[str, Meta(min_length=1, max_length=1000)]
 
 
 class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Numeric column and its conversion to SI units."""
+    """Numeric column of a log and its conversion to SI units."""
 
     column: ColumnName  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI unit if not specified
-    scale: Annotated[float, key_metadata("of the column's number", "")] = (
-        1.0  # in the unit; for counts in SI units
-    )
+    # Factor, in the given unit; with the unit "counts", the value of one count in SI units.
+    scale: Annotated[float, key_metadata("of the column's number", "")] = 1.0
     sign: Annotated[int, key_metadata("of the whole", "", ge=-1, le=1)] = 1
-    offset: Annotated[float, key_metadata("added to the scaled number", "")] = 0.0  # in the unit
-    time: ColumnName | None = None  # column of separate stamps, in the unit of the rows' stamps
+    offset: Annotated[float, key_metadata("added to the scaled number", "")] = 0.0  # in the given unit
+    time: ColumnName | None = None  # column of separate time stamps, in the unit of `channels.time`
 
 
 class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Time stamps of the rows, or their rate if there are no stamps."""
+    """Column of the rows' time stamps, or the rate of the rows if there are no time stamps."""
 
     column: ColumnName | None = None  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s if not specified
@@ -57,14 +56,14 @@ class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Column with the kind of experiment in each row."""
+    """Column that states the kind of experiment in each row."""
 
     column: ColumnName  # name of the column
-    values: dict[str, RunKind] = field(default_factory=dict)  # kind of each entry with another word
+    values: dict[str, RunKind] = field(default_factory=dict)  # kind for each entry that is not a kind itself
 
 
 class ChannelTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Columns of all channels."""
+    """Table `[channels]`: the column of each channel."""
 
     time: TimeChannel
     position_desired: Channel
@@ -77,7 +76,7 @@ class ChannelTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Timing of commands and readings in the logs."""
+    """Table `[timing]`: timing of commands and readings in the logs."""
 
     control_period: Annotated[float, key_metadata("time from tick to tick", "s", gt=0.0, le=0.1)] | None = (
         None
@@ -90,34 +89,33 @@ class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     computing_delay: Annotated[
         int, key_metadata("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
-    clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": those of the drives alone
+    clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": another clock for the forces
 
 
 class TextFormat(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Format of text files."""
+    """Table `[text]`: format of text files."""
 
     skip_rows: Annotated[int, key_metadata("lines above that of the columns' names", ge=0, le=10_000)] = 0
-    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = (
-        None  # found in the line of names if not specified
-    )
+    # If not specified, the delimiter is detected in the line of column names.
+    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None
     decimal: Literal[".", ","] = "."
 
 
 class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Files of one kind of experiment."""
+    """Entry of `[[runs]]`: log files of one kind of experiment."""
 
-    files: Annotated[list[FilePattern], Meta(min_length=1, max_length=1000)]  # patterns of the files' names
+    files: Annotated[list[FilePattern], Meta(min_length=1, max_length=1000)]  # patterns of file names
     kind: RunKind
     begin: Annotated[float, key_metadata("of the run, from the first row", "s", ge=0.0)] = 0.0
     end: Annotated[float, key_metadata("of the run, from the first row", "s", gt=0.0)] | None = None
 
     def names(self, path: Path) -> bool:
-        """Return whether a pattern matches the file."""
+        """Return whether one of the patterns matches the path of a file."""
         return any(PurePath(path).match(pattern) for pattern in self.files)
 
 
 class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Mapping of logs: channels, timing, masses, text format and runs."""
+    """Content of a mapping file: channels, timing, masses, text format and runs."""
 
     schema: Literal["jaxhil/log/1"]
     channels: ChannelTable
@@ -128,7 +126,7 @@ class LogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
-    """Return the mapping of a TOML file.
+    """Load a mapping from a TOML file.
 
     Raises:
         InputError: If the file is missing or invalid.
@@ -142,7 +140,7 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
 
 
 def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
-    """Return the mapping of a parsed table; `label` names it in messages.
+    """Convert parsed TOML tables to a mapping; `label` is its name in messages.
 
     Raises:
         InputError: If the table is invalid.
@@ -156,7 +154,7 @@ def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
 
 
 def make_simulation_mapping(kind: RunKind = "contact") -> LogMapping:
-    """Return the mapping of logs with the column names of `jaxhil simulate --log`."""
+    """Return the mapping of logs that `jaxhil simulate --log` writes."""
     names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
     return parse_mapping(
@@ -165,7 +163,7 @@ def make_simulation_mapping(kind: RunKind = "contact") -> LogMapping:
 
 
 def get_si_conversion(channel: Channel, name: str) -> tuple[float, float]:
-    """Return the factor and the offset that convert the column's values to SI units."""
+    """Return the factor and the offset that convert a column to SI units: factor * number + offset."""
     if channel.unit == COUNTS_UNIT or name not in UNITS_OF_CHANNEL:
         unit = 1.0
     else:
@@ -175,7 +173,7 @@ def get_si_conversion(channel: Channel, name: str) -> tuple[float, float]:
 
 
 def _expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table with bare names replaced by tables and single patterns by lists."""
+    """Return the tables without shorthand: column names become tables, single patterns become lists."""
     tables = dict(raw)
     if isinstance(channels := tables.get("channels"), Mapping):
         named = {
@@ -204,13 +202,13 @@ def _check_mapping(mapping: LogMapping) -> None:
             expected = f"one of {', '.join(allowed)}{suggest_names(channel.unit, allowed)}"
             raise KeyProblem(("channels", name, "unit"), format_value(channel.unit), expected)
         if channel.unit == COUNTS_UNIT and channel.scale == 1.0:
-            raise KeyProblem(("channels", name, "scale"), "none", "how much a count is, in SI units")
+            raise KeyProblem(("channels", name, "scale"), "none", "the value of one count in SI units")
     for name in channels.__struct_fields__:
         channel = getattr(channels, name)
         if isinstance(channel, Channel) and channel.sign == 0:
             raise KeyProblem(("channels", name, "sign"), "0", "1 or -1")
         if isinstance(channel, Channel) and channel.scale == 0.0:
-            raise KeyProblem(("channels", name, "scale"), "0.0", "another number")
+            raise KeyProblem(("channels", name, "scale"), "0.0", "a number other than 0")
     time = channels.time
     if (time.column is None) == (time.rate is None):
         finding = "neither" if time.rate is None else "both"
@@ -219,7 +217,7 @@ def _check_mapping(mapping: LogMapping) -> None:
         for name in channels.__struct_fields__:
             stamps_column = getattr(getattr(channels, name), "time", None)
             if stamps_column is not None:
-                expected = "none, since channels.time is no column of numbers"
+                expected = "none, because channels.time is not a column of numbers"
                 raise KeyProblem(("channels", name, "time"), format_value(stamps_column), expected)
     _check_rest(mapping)
 
@@ -239,7 +237,7 @@ def _check_rest(mapping: LogMapping) -> None:
 
 
 def find_equivalent_mass(mapping: LogMapping, prior: Mechanism | None) -> float | None:
-    """Return the equivalent mass [kg] of the numerical model, from the mapping or else from the prior."""
+    """Return the equivalent mass of the numerical model [kg] from the mapping, or else from the prior."""
     if mapping.bodies is not None:
         return mapping.bodies.mass
     return None if prior is None else prior.bodies.mass

@@ -1,8 +1,10 @@
-"""Draft of a mapping file, from the names and the contents of columns; the user has to check it.
+"""Draft of a mapping file from the names and values of a log's columns, for the user to check.
 
-The name of a column indicates its channel and, in brackets or after an underscore, its unit. The values
-indicate a missing unit and the signs: contact is deepest where the force is largest, and a repelling force is
-positive.
+The name of a column indicates the channel and, in brackets or after an underscore, the unit. If a unit is
+missing, it is guessed from the values. The signs also follow from the values: positions increase where the
+force is
+    large, and
+a force that pushes the bodies apart is positive.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from tuning.identification.logs.mapping import KINDS, SCHEMA
 from tuning.identification.logs.readers import ColumnsByName, OpenLog, open_log
 from tuning.identification.logs.units import UNITS_OF_CHANNEL
 
-# Patterns of names, the most specific first: the first match decides the channel of a column.
+# Patterns of column names for each channel, in order of priority: a column belongs to the first match.
 CHANNEL_PATTERNS = {
     "time": r"^t$|time|stamp|clock",
     "velocity_desired": r"^v_?d$|vel\w*_?(des|cmd|com|ref)|(des|cmd|com|ref)\w*_?vel",
@@ -35,10 +37,10 @@ CHANNEL_PATTERNS = {
     "position_measured": r"^x_?m$|^x_?a$|pos|meas|actual|feedback|disp|lvdt|encoder|^x$",
 }
 REQUIRED_CHANNELS = ("position_desired", "position_measured")
-# Typical largest values in SI units.
+# Largest plausible range of a channel in SI units; a larger range indicates mm or um.
 TYPICAL_MAXIMUM = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}
-MAX_SAMPLED_ROWS = 200_000  # rows that are read
-# Hz, common rates of control loops.
+MAX_SAMPLED_ROWS = 200_000  # maximum number of rows that are read
+# Hz, common control rates.
 COMMON_CONTROL_RATES = (
     100,
     125,
@@ -58,25 +60,25 @@ COMMON_CONTROL_RATES = (
     5000,
     8000,
 )
-MAX_CONTROL_PERIOD = 0.02  # s, largest time between rows
+MAX_CONTROL_PERIOD = 0.02  # s, longest plausible time between rows
 
 _UNIT_SUFFIXES = {unit for units in UNITS_OF_CHANNEL.values() for unit in units if unit != "m"}
 
 
 class ChannelGuess(NamedTuple):
-    """Column, unit and sign of a channel, with the reason of the guess."""
+    """Guess of a channel's column, unit and sign, with the reason."""
 
     column: str
-    unit: str | None
+    unit: str | None  # None for the SI unit
     sign: int
     why: str
 
 
 def draft_mapping(paths: Sequence[Path]) -> str:
-    """Return the text of a mapping file for these logs.
+    """Draft a mapping file for logs and return its text.
 
     Raises:
-        InputError: If there is no log, or no column for a required channel.
+        InputError: If no log is given, or if no column name matches a required channel.
     """
     if not paths:
         raise InputError("logs: found none, expected one or more files")
@@ -86,9 +88,11 @@ def draft_mapping(paths: Sequence[Path]) -> str:
     for name in REQUIRED_CHANNELS:
         if name not in columns:
             names = ", ".join(to_one_line(column, 40) for column in first.names[:12])
-            raise InputError(f"{first.label}: found no column named like {name} among {names}, expected one")
+            raise InputError(
+                f"{first.label}: found no column with a name like {name}, expected one; columns: {names}"
+            )
     kinds = {path: _guess_kind(path, log, columns) for path, log in logs.items()}
-    # Only a log with contact reveals the signs.
+    # Only a log with contact shows the signs.
     best = next((path for path, kind in kinds.items() if kind == "contact"), paths[0])
     guesses = _guess_channels(logs[best], columns)
     return "\n".join(
@@ -97,26 +101,29 @@ def draft_mapping(paths: Sequence[Path]) -> str:
 
 
 def _match_columns(names: Sequence[str]) -> dict[str, str]:
-    """Return the column of each channel whose name matches."""
+    """Return the column of each channel according to `CHANNEL_PATTERNS`."""
     result: dict[str, str] = {}
     for name in names:
         bare = _strip_unit(name)
-        for channel, words in CHANNEL_PATTERNS.items():
-            if re.search(words, bare):
+        for channel, pattern in CHANNEL_PATTERNS.items():
+            if re.search(pattern, bare):
                 result.setdefault(channel, name)
                 break
     return result
 
 
 def _strip_unit(name: str) -> str:
-    """Return the name in lower case and without its unit."""
+    """Return a column name in lower case and without its unit."""
     bare = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name).strip().lower().replace(" ", "_").replace("-", "_")
     head, _, tail = bare.rpartition("_")
     return head if head and any(tail == unit.lower() for unit in _UNIT_SUFFIXES) else bare
 
 
 def _find_unit(name: str, channel: str) -> str | None:
-    """Return the unit at the end of a name, in brackets or after an underscore; `x_m` has no unit."""
+    """Return the unit at the end of a column name, in brackets or after an underscore, or None.
+
+    The ending `_m` is not a unit, because it often means "measured".
+    """
     match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|_([A-Za-z]+)$", name)
     if match is None or match.group(2) == "m":
         return None
@@ -125,7 +132,7 @@ def _find_unit(name: str, channel: str) -> str | None:
 
 
 def _guess_kind(path: Path, log: OpenLog, columns: Mapping[str, str]) -> str:
-    """Return the kind of the run, by the file's name, else by its values."""
+    """Guess the kind of experiment from the file name, or else from the values."""
     named = [kind for kind in KINDS if kind in path.stem.lower()]
     if named:
         return named[0]
@@ -145,7 +152,7 @@ def _guess_kind(path: Path, log: OpenLog, columns: Mapping[str, str]) -> str:
 
 
 def _sample_rows(log: OpenLog, names: Sequence[str]) -> ColumnsByName:
-    """Return the first rows without missing values."""
+    """Read the given columns and return the first rows, without rows in which a value is missing."""
     read = log.read(names)
     rows = min(
         MAX_SAMPLED_ROWS, *(len(values) for values in read.values())
@@ -165,7 +172,7 @@ def _sample_rows(log: OpenLog, names: Sequence[str]) -> ColumnsByName:
 
 
 def _guess_channels(log: OpenLog, columns: Mapping[str, str]) -> dict[str, ChannelGuess]:
-    """Return column, unit and sign of each channel."""
+    """Guess the unit and sign of each channel."""
     read = _sample_rows(log, list(dict.fromkeys(columns.values())))
     signs = _guess_signs(read, columns)
     result = {}
@@ -187,13 +194,13 @@ def _guess_channels(log: OpenLog, columns: Mapping[str, str]) -> dict[str, Chann
             size = float(np.ptp(values))
             unit = "um" if size > 1000 * TYPICAL_MAXIMUM[channel] else "mm"
             unit += "/s" * (channel == "velocity_desired")
-            why += f"; {size:.3g} from least to greatest"
+            why += f"; values span {size:.3g}"
         result[channel] = ChannelGuess(column, unit, signs.get(channel, 1), why)
     return result
 
 
 def _guess_signs(read: ColumnsByName, columns: Mapping[str, str]) -> dict[str, int]:
-    """Return signs with which positions increase towards the contact and contact forces are positive."""
+    """Return the signs with which positions increase in contact and contact forces are positive."""
 
     def of(channel: str) -> np.ndarray | None:
         values = read.get(columns.get(channel, ""))
@@ -201,18 +208,18 @@ def _guess_signs(read: ColumnsByName, columns: Mapping[str, str]) -> dict[str, i
 
     force, x, measured = of("force_measured"), of("position_desired"), of("position_measured")
     if x is None or measured is None:
-        return {}  # Texts are rejected when the log is read.
+        return {}  # Columns of texts are rejected when the mapping is used.
     signs = {}
     towards = 1
     if force is not None:
-        away = force - estimate_resting_force(force)
-        touched = np.abs(away) > estimate_contact_threshold(force)
-        if np.any(touched) and not np.all(touched):
-            signs["force_measured"] = int(np.sign(np.median(away[touched])) or 1)
-            towards = int(np.sign(np.mean(x[touched]) - np.mean(x[~touched])) or 1)
+        contact_force = force - estimate_resting_force(force)
+        in_contact = np.abs(contact_force) > estimate_contact_threshold(force)
+        if np.any(in_contact) and not np.all(in_contact):
+            signs["force_measured"] = int(np.sign(np.median(contact_force[in_contact])) or 1)
+            towards = int(np.sign(np.mean(x[in_contact]) - np.mean(x[~in_contact])) or 1)
             command = of("force_command")
-            if command is not None and np.any(command[touched]):
-                signs["force_command"] = int(np.sign(np.median(command[touched])) or 1)
+            if command is not None and np.any(command[in_contact]):
+                signs["force_command"] = int(np.sign(np.median(command[in_contact])) or 1)
     together = int(np.sign(np.dot(x - np.mean(x), measured - np.mean(measured))) or 1)
     return signs | {
         "position_desired": towards,
@@ -222,10 +229,10 @@ def _guess_signs(read: ColumnsByName, columns: Mapping[str, str]) -> dict[str, i
 
 
 def _format_channels(guesses: Mapping[str, ChannelGuess]) -> list[str]:
-    lines = ["# A draft: check every line. A number means sign (scale number + offset), in the unit.", ""]
+    lines = ["# A draft: check every line. Values are sign * (scale * number + offset), in the unit.", ""]
     lines += [f'schema = "{SCHEMA}"', "", "[channels]"]
     if "time" not in guesses:
-        lines.append("time = { rate = 1000.0 }  # Hz: no column is named like one of stamps")
+        lines.append("time = { rate = 1000.0 }  # Hz; no column name indicates time stamps")
     for channel in [name for name in (*UNITS_OF_CHANNEL, "mode", "contact_index") if name in guesses]:
         guess = guesses[channel]
         items = [f"column = {json.dumps(guess.column, ensure_ascii=False)}"]
@@ -245,11 +252,11 @@ def _format_timing(log: OpenLog, guesses: Mapping[str, ChannelGuess]) -> list[st
     return [
         *lines,
         f"control_period = {period!r}",
-        'command_hold = "linear"  # or "zoh": what the drives do between ticks',
+        'command_hold = "linear"  # or "zoh": input of the drives between two ticks',
         "command_latency = 0  # periods until a command reaches the drives: 0 or 1",
         'row = "tick"  # or "sent": with the next tick\'s command; "after": with the next tick\'s readings',
         "",
-        "# [bodies]  # of the numerical model; needed unless a prior says it",
+        "# [bodies]  # of the numerical model; required without a prior",
         "# equivalent_mass = 350.0",
     ]
 
@@ -260,8 +267,8 @@ def _format_runs(paths: Sequence[Path], kinds: Mapping[Path, str]) -> list[str]:
         names = [path.name for path in paths if kinds[path] == kind]
         suffix = Path(names[0]).suffix
         pattern = f"{kind}*{suffix}"
-        mine = {path.name for path in paths if fnmatch(path.name, pattern)}
-        files = json.dumps(pattern if mine == set(names) else names, ensure_ascii=False)
+        matching = {path.name for path in paths if fnmatch(path.name, pattern)}
+        files = json.dumps(pattern if matching == set(names) else names, ensure_ascii=False)
         other_kinds = ", ".join(name for name in KINDS if name != kind)
         lines += ["", "[[runs]]", f"files = {files}", f'kind = "{kind}"  # or {other_kinds}']
     return lines

@@ -1,7 +1,7 @@
-"""Columns of a log file by its format; only the requested columns are read.
+"""Readers of log files in different formats; only the requested columns are read.
 
-Text and Parquet files need no further library. `foreign` reads MAT, HDF5, ROS 2 bags, MDF4 and TDMS with the
-libraries of `jaxhil[logs]`.
+Text and Parquet files need no further library. The module `third_party` reads MAT, HDF5, ROS 2 bags, MDF4 and
+TDMS with the optional libraries of `jaxhil[logs]`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.conversion import suggest_names
 from tuning.identification.logs.mapping import TextFormat
 
-ColumnsByName = dict[str, np.ndarray]  # float64 numbers, text objects, or stamps in s from the first one
+# Values of each column: float64, text objects, or time stamps in s relative to the first one.
+ColumnsByName = dict[str, np.ndarray]
 
+# Function that returns the time stamps [s] of given columns, or None for columns without separate stamps.
 StampsOfColumns = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
 
 DEFAULT_TEXT_FORMAT = TextFormat()
-DELIMITERS = "\t;,"  # candidates in the line of names, in this order
-PARSE_BLOCK_BYTES = 1 << 22  # bytes that are parsed together
-GROWTH_ROWS = 1 << 19  # rows by which columns grow
-MAX_LINE_BYTES = 1 << 20  # bytes
-MAX_NAMES_IN_MESSAGE = 12  # column names in a message
+DELIMITERS = "\t;,"  # the first of these that occurs in the line of column names is the delimiter
+PARSE_BLOCK_BYTES = 1 << 22  # bytes that are parsed at once
+GROWTH_ROWS = 1 << 19  # rows by which an array is enlarged when it is full
+MAX_LINE_BYTES = 1 << 20  # bytes, longest line of column names
+MAX_NAMES_IN_MESSAGE = 12  # maximum number of column names in a message
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
 _PARQUET_SUFFIXES = (".parquet", ".pq")
@@ -50,18 +52,23 @@ _THIRD_PARTY_FORMATS = {
 
 
 class OpenLog(NamedTuple):
-    """Log file: the names of its columns, and functions that read them."""
+    """Open log file: the names of its columns, and functions that read columns and their time stamps."""
 
-    label: str  # its name in messages
+    label: str  # name of the log in messages
     names: list[str]
     read: Callable[[Sequence[str]], ColumnsByName]
-    # Stamps [s] of columns that were read, with a common zero; None for a column without separate stamps.
+    # Time stamps [s] of columns that were read, with a common origin; None for a column without separate
+    # stamps.
     clocks: StampsOfColumns = dict.fromkeys
-    stamps: Collection[str] = ()  # columns that contain such stamps
+    stamps: Collection[str] = ()  # names of the columns that contain such time stamps
 
 
 def open_log(path: Path, text: TextFormat = DEFAULT_TEXT_FORMAT) -> OpenLog:
-    """Return the log of a file, or of a folder with a ROS 2 bag.
+    """Open a log file, or a folder that contains a ROS 2 bag.
+
+    Args:
+        path: Path of the log.
+        text: Format of text files.
 
     Raises:
         InputError: If the log does not exist, has an unknown format or cannot be read.
@@ -90,7 +97,7 @@ def open_log(path: Path, text: TextFormat = DEFAULT_TEXT_FORMAT) -> OpenLog:
                 importlib.import_module(package)
             except ImportError:
                 needs = f"{package}, which is not installed: python3 -m pip install 'jaxhil[logs]'"
-                raise InputError(f"{label}: a {suffix} file is read with {needs}") from None
+                raise InputError(f"{label}: reading {suffix} files needs {needs}") from None
         opened = getattr(importlib.import_module("tuning.identification.logs.third_party"), format)(path)
         read = _wrap_reader(label, opened.names, opened.read)
         return OpenLog(label, opened.names, read, _wrap_stamp_reader(label, opened.clocks), opened.stamps)
@@ -98,7 +105,7 @@ def open_log(path: Path, text: TextFormat = DEFAULT_TEXT_FORMAT) -> OpenLog:
 
 @contextmanager
 def convert_reader_errors(label: str) -> Iterator[None]:
-    """Convert every exception of a reader to an `InputError` with one line."""
+    """Convert every exception inside the `with` block to an `InputError` with a message of one line."""
     try:
         yield
     except InputError:
@@ -130,12 +137,12 @@ def _wrap_reader(label: str, names: Sequence[str], read: Callable[[Sequence[str]
                 ) + ", ..." * (len(names) > MAX_NAMES_IN_MESSAGE)
                 hint = to_one_line(suggest_names(name, names))
                 raise InputError(
-                    f"{label}: column {format_value(name)}: found none of this name, expected "
+                    f"{label}: column {format_value(name)}: found no column with this name, expected "
                     f"{examples}{hint}"
                 )
             if names.count(name) > 1:
                 raise InputError(
-                    f"{label}: column {format_value(name)}: found {names.count(name)}, expected one"
+                    f"{label}: column {format_value(name)}: found {names.count(name)} columns, expected one"
                 )
         with convert_reader_errors(label):
             columns = read(wanted)
@@ -151,9 +158,7 @@ def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
         raw = file.readline(MAX_LINE_BYTES)
         second = file.readline(MAX_LINE_BYTES)
     if not raw.strip():
-        raise InputError(
-            f"{label}: found no line of columns' names, expected one after {text.skip_rows} lines"
-        )
+        raise InputError(f"{label}: found no line of column names, expected one after {text.skip_rows} lines")
     line, following = (
         _decode_line(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second)
     )
@@ -176,7 +181,7 @@ def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
 
 
 def _is_numeric_column(line: str, names: Sequence[str], name: str, delimiter: str, text: TextFormat) -> bool:
-    """Return whether the column contains a number in this line."""
+    """Return whether the column contains a number, or nothing, in this line."""
     cells = next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
     index = list(names).index(name)
     return index >= len(cells) or not cells[index].strip() or _is_number(cells[index], text.decimal)
@@ -203,8 +208,8 @@ def _read_text(
             strings_can_be_null=False,
         ),
     )
-    # Growing columns save memory: a whole table takes three times the memory of its numbers. A single
-    # thread counts the rows, so that messages name the bad one.
+    # Arrays that grow with each batch save memory: a whole table takes three times the memory of its numbers.
+    # A single thread parses the file, so that error messages name the invalid row.
     columns: ColumnsByName = {name: np.empty(0, object if name in texts else float) for name in chosen}
     rows = 0
     for batch in batches:
@@ -222,7 +227,7 @@ def _open_parquet_log(path: Path, label: str) -> OpenLog:
     names = list(parquet.read_schema(path).names)
 
     def read(wanted: Sequence[str]) -> ColumnsByName:
-        # Read column by column: a whole table next to its numbers takes twice the memory.
+        # Read one column at a time: a whole table together with its arrays takes twice the memory.
         columns = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
         return {name: _column_to_array(column, name) for name, column in zip(wanted, columns, strict=True)}
 

@@ -1,10 +1,11 @@
-"""Resampling of channels with separate clocks to the rows of the desired position.
+"""Resampling of channels with separate time stamps to the rows of the desired position.
 
-In some formats every channel, or every group of channels, has its own time stamps. Such a channel may begin
-later, have a higher rate, or lose other rows. The rows are those of the desired position. A reading at the
-time of a row is used unchanged; otherwise readings are interpolated linearly. The force jumps at the onset of
-contact, and interpolation would smear the jump: if forces have the rate of the rows, the nearest reading is
-used, together with its delay behind the row. A row without a reading of some channel counts as lost.
+In some log formats, each channel or group of channels has its own time stamps. Such a channel may begin
+later, have a higher rate, or lose other rows than the desired position. All channels are resampled to the
+times of the desired position. A reading at exactly this time is used unchanged; otherwise, readings are
+interpolated linearly. Interpolation would smooth the jump of the force at the onset of contact. If forces are
+logged at the rate of the desired position, the nearest reading is therefore used, and its time offset is
+returned. Rows in which any channel has no reading are removed.
 """
 
 from __future__ import annotations
@@ -16,32 +17,30 @@ import numpy as np
 from jaxhil.errors import InputError, format_value
 from tuning.identification.logs import clock
 
-MASTER_CHANNEL = "position_desired"
-MAX_READING_PERIOD = 1.5  # control periods between readings, above which rows would lack data
-MIN_GAP_RATIO = 1.5  # times the median distance of readings, above which readings are missing
-SIMULTANEITY_TOLERANCE = 0.02  # periods, distance to a row within which a reading counts as simultaneous
-HELD_CHANNELS = "contact_index", "mode"  # channels that hold their value between readings
-NEAREST_READING_CHANNEL, FORCE_LATE_CHANNEL = (
-    "force_measured",
-    "force_late",
-)  # channel that jumps; its delay behind the rows [s]
-EQUAL_RATE_TOLERANCE = 0.01  # relative difference of two rates that count as equal
+MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
+MAX_READING_PERIOD = 1.5  # control periods, longest time between readings; a slower channel is rejected
+MIN_GAP_RATIO = 1.5  # time between readings over its median; above it, a reading was lost
+SIMULTANEITY_TOLERANCE = 0.02  # periods; a reading this close to a row is at the time of the row
+HELD_CHANNELS = "contact_index", "mode"  # channels whose value holds until the next reading
+NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
+FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it
+EQUAL_RATE_TOLERANCE = 0.01  # relative difference; two rates with a smaller difference are equal
 
 
 def has_same_stamps(one: np.ndarray | None, other: np.ndarray | None) -> bool:
-    """Return whether two clocks have the same stamps."""
+    """Return whether two channels have the same time stamps; None means that there are no stamps."""
     if one is None or other is None:
         return one is other
     return one is other or np.array_equal(one, other)
 
 
 def check_lengths(label: str, columns: Mapping[str, np.ndarray], named: Mapping[str, str]) -> None:
-    """Raise `InputError` if columns that share a clock have different lengths."""
+    """Raise `InputError` if columns without separate time stamps have different lengths."""
     if len({len(values) for values in columns.values()}) > 1:
         lengths = ", ".join(
             f"{len(x)} in {format_value(named.get(name, name))}" for name, x in columns.items()
         )
-        raise InputError(f"{label}: found columns of unlike length ({lengths}), expected one row a tick")
+        raise InputError(f"{label}: found columns of different lengths ({lengths}), expected equal lengths")
 
 
 def resample_to_rows(
@@ -51,52 +50,56 @@ def resample_to_rows(
     named: Mapping[str, str],
     period: float,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
-    """Bring all channels to the rows of the desired position.
+    """Resample all channels to the rows of the desired position.
 
     Args:
         label: Name of the log in messages.
         columns: Values of each channel.
-        clocks: Stamps of each channel [s], with a common zero.
-        named: Column of each channel, for messages.
+        clocks: Time stamps of each channel [s], with a common origin.
+        named: Name of each channel's column, for messages.
         period: Control period [s].
 
     Returns:
-        Values of each channel at the rows, with `FORCE_LATE_CHANNEL` if the nearest forces are used; the
-        stamps of the rows [s]; and notes.
+        The values of each channel, including `FORCE_LATE_CHANNEL` if the nearest force readings are used; the
+        time stamps of the rows [s]; and notes.
 
     Raises:
-        InputError: If a channel has no clock, or its clock does not cover any row.
+        InputError: If a channel has no valid time stamps, or no row has readings of all channels.
     """
     for name, stamps in clocks.items():
         _check_clock(label, named[name], stamps, len(columns[name]))
     master = clocks[MASTER_CHANNEL]
     assert master is not None
     times = clock.remove_stamp_jitter(master, period, label, _label_stamps(named[MASTER_CHANNEL]))
-    joined, notes, full = {}, [], np.ones(len(times), bool)
-    places: list[tuple[np.ndarray, _RowsAmongReadings]] = []
+    resampled, notes, is_complete = {}, [], np.ones(len(times), bool)
+    assignments: list[tuple[np.ndarray, _RowsAmongReadings]] = []
     for name, values in columns.items():
         stamps = clocks[name]
         assert stamps is not None
         if has_same_stamps(stamps, master):
-            joined[name] = values
+            resampled[name] = values
             continue
-        places_of = next((item for times_of, item in places if has_same_stamps(times_of, stamps)), None)
-        if places_of is None:
-            places_of = _RowsAmongReadings(label, named[name], stamps, times, period)
-            places.append((stamps, places_of))
-            notes.append(f"{label}: {places_of.note(named[MASTER_CHANNEL])}")
-        if name == NEAREST_READING_CHANNEL and places_of.has_row_rate:
-            joined[name], joined[FORCE_LATE_CHANNEL] = places_of.nearest(values)
+        assignment = next(
+            (item for assigned_stamps, item in assignments if has_same_stamps(assigned_stamps, stamps)), None
+        )
+        if assignment is None:
+            assignment = _RowsAmongReadings(label, named[name], stamps, times, period)
+            assignments.append((stamps, assignment))
+            notes.append(f"{label}: {assignment.note(named[MASTER_CHANNEL])}")
+        if name == NEAREST_READING_CHANNEL and assignment.has_row_rate:
+            resampled[name], resampled[FORCE_LATE_CHANNEL] = assignment.nearest(values)
         else:
-            joined[name] = places_of.of(values, name in HELD_CHANNELS or values.dtype == object)
-        full &= places_of.there
-    if not full.any():
+            resampled[name] = assignment.of(values, name in HELD_CHANNELS or values.dtype == object)
+        is_complete &= assignment.has_reading
+    if not is_complete.any():
         spans = [f"{format_value(named[name])} {t[0]:.6g} to {t[-1]:.6g} s" for name, t in clocks.items()
                  if t is not None]  # fmt: skip
-        raise InputError(f"{label}: found no time at which all channels were read ({', '.join(spans)})")
-    if not full.all():
-        notes.append(f"{label}: {np.count_nonzero(~full)} rows at which a channel was not read are left out")
-    return {name: values[full] for name, values in joined.items()}, master[full], notes
+        raise InputError(f"{label}: found no time with readings of all channels ({', '.join(spans)})")
+    if not is_complete.all():
+        notes.append(
+            f"{label}: {np.count_nonzero(~is_complete)} rows without readings of all channels are omitted"
+        )
+    return {name: values[is_complete] for name, values in resampled.items()}, master[is_complete], notes
 
 
 def _label_stamps(column: str) -> str:
@@ -104,12 +107,14 @@ def _label_stamps(column: str) -> str:
 
 
 def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -> None:
-    """Raise `InputError` if there is not one stamp per row, or the stamps do not increase."""
+    """Raise `InputError` if a column does not have one increasing time stamp per row."""
     if stamps is None:
-        allowed = "some, since other columns have their own"
-        raise InputError(f"{label}: column {format_value(column)}: found no stamps, expected {allowed}")
+        expected = "stamps, because other columns have separate stamps"
+        raise InputError(f"{label}: column {format_value(column)}: found no stamps, expected {expected}")
     if len(stamps) != rows:
-        raise InputError(f"{label}: {_label_stamps(column)}: found {len(stamps)}, expected {rows}, one a row")
+        raise InputError(
+            f"{label}: {_label_stamps(column)}: found {len(stamps)}, expected {rows}: one per row"
+        )
     if rows < 2:
         raise InputError(f"{label}: column {format_value(column)}: found {rows} rows, expected at least 2")
     bad = np.flatnonzero(~(np.diff(stamps) > 0.0) | ~np.isfinite(stamps[1:]))
@@ -122,7 +127,7 @@ def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) 
 
 
 class _RowsAmongReadings:
-    """Positions of the rows among the readings of another clock."""
+    """Assignment of a channel's readings to the rows, by their time stamps."""
 
     def __init__(self, label: str, column: str, stamps: np.ndarray, times: np.ndarray, period: float):
         self._column = column
@@ -133,38 +138,40 @@ class _RowsAmongReadings:
                 f"expected the control period, {period:g} s, or less"
             )
         self._rate, self._period = usual, period
-        # The stamps scatter, but the samples are regular.
+        # The samples are equidistant; only their time stamps scatter.
         stamps = clock.remove_stamp_jitter(stamps, period, label, _label_stamps(column))
         self._begins = float(stamps[0] - times[0])
         index = np.interp(times, stamps, np.arange(len(stamps), dtype=float))
         slack = SIMULTANEITY_TOLERANCE * usual
-        self.there = (times >= stamps[0] - slack) & (times <= stamps[-1] + slack)
+        self.has_reading = (times >= stamps[0] - slack) & (times <= stamps[-1] + slack)
         nearest = np.rint(index)
         distance = np.abs(times - stamps[nearest.astype(np.int64)])
         self._exact = bool(
-            np.all((distance <= SIMULTANEITY_TOLERANCE * period) | (distance > 0.5 * usual) | ~self.there)
+            np.all(
+                (distance <= SIMULTANEITY_TOLERANCE * period) | (distance > 0.5 * usual) | ~self.has_reading
+            )
         )
         if self._exact:
-            self.there &= distance <= SIMULTANEITY_TOLERANCE * period
+            self.has_reading &= distance <= SIMULTANEITY_TOLERANCE * period
             self._before = nearest.astype(np.int64)
             self._share = np.zeros(0)
             return
         self._nearest, self._late = nearest.astype(np.int64), stamps[nearest.astype(np.int64)] - times
         before = np.minimum(index.astype(np.int64), len(stamps) - 2)
-        self.there &= stamps[before + 1] - stamps[before] <= MIN_GAP_RATIO * usual
+        self.has_reading &= stamps[before + 1] - stamps[before] <= MIN_GAP_RATIO * usual
         self._before, self._share = before, index - before
 
     @property
     def has_row_rate(self) -> bool:
-        """Return whether the readings have the rate of the rows, but other times."""
+        """Return whether the readings have the rate of the rows but are taken at other times."""
         return not self._exact and abs(self._rate / self._period - 1.0) < EQUAL_RATE_TOLERANCE
 
     def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the readings nearest to the rows, and their delay behind the rows [s]."""
+        """Return the reading nearest to each row, and the time from the row to this reading [s]."""
         return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:
-        """Return the values at the rows; with `steps`, a value holds until the next reading."""
+        """Return the values at the rows, interpolated linearly, or held until the next reading if `steps`."""
         if self._exact:
             return values[self._before]
         if steps:
@@ -172,12 +179,12 @@ class _RowsAmongReadings:
         return values[self._before] * (1.0 - self._share) + values[self._before + 1] * self._share
 
     def note(self, master: str) -> str:
-        """Return a note on the resampling."""
-        how = "taken at their own times" if self._exact else "interpolated between their own times"
-        how += ", forces taken at the nearest" if self.has_row_rate else ""
-        begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} that"
+        """Return a note, in words, on how the channel was resampled."""
+        how = "used unchanged" if self._exact else "interpolated"
+        how += ", but the nearest forces are used" if self.has_row_rate else ""
+        begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} those"
         return (
-            f"column {format_value(self._column)} has a clock of its own, which begins {begins} of "
+            f"column {format_value(self._column)} has separate stamps, which begin {begins} of "
             f"{format_value(master)}: "
             f"readings {1e3 * self._rate:.4g} ms apart are {how}"
         )

@@ -1,10 +1,13 @@
-"""Check of the row convention: the tick whose readings a row holds, from the noise of the force sensor.
+"""Check of the row convention (the ticks of command and readings in a row) by the force sensor's noise.
 
-A compensator responds to the force reading including its noise, and the numerical model to the compensator: M
-(x(n+1) - 2 x(n) + x(n-1)) / T^2 = -F_c(n) contains the noise of F(n) and of no later reading. If rows hold
-the next tick's command, the commands seem to depend on the noise of the following row; if rows hold the next
-tick's readings, the response seems one row late. A regression finds the latest reading on which the second
-differences of the commands depend. Differencing all signals leaves little except noise.
+The force command depends on the force reading, including its noise, and moves the numerical model:
+
+    M (x(n+1) - 2 x(n) + x(n-1)) / T^2 = -F_c(n).
+
+The right-hand side contains the noise of the reading F(n), but not of later readings. If rows contain the
+next tick's command, the commands seem to depend on the noise of the following row. If rows contain the next
+tick's readings, the response seems to be one row late. A regression finds the latest reading on which the
+second differences of the commands depend. All signals are differenced twice, so that mainly noise remains.
 """
 
 from __future__ import annotations
@@ -18,66 +21,75 @@ from tuning.identification.logs.contact_detection import estimate_contact_thresh
 from tuning.identification.logs.lost_rows import detect_integrator
 from tuning.identification.records import CampaignTiming, LoggedRun
 
-ROWS_AFTER_COMMAND, ROWS_BEFORE_COMMAND = (
-    2,
-    6,
-)  # rows after and before a command whose readings enter the regression
-MIN_COEFFICIENT_SIGMAS = 6.0  # standard deviations of a significant coefficient
-MIN_COEFFICIENT_SHARE = 0.3  # share of the largest coefficient, above which a coefficient counts
-MAX_PRECEDING_SHARE = 0.12  # the same for the row before; above it a slow filter hides the first coefficient
-# Correlation of neighbours in twice differenced noise (-2/3 if white), above which it is no noise.
+# Readings from this many rows after a command to this many rows before it enter the regression.
+ROWS_AFTER_COMMAND, ROWS_BEFORE_COMMAND = 2, 6
+MIN_COEFFICIENT_SIGMAS = 6.0  # standard deviations; a larger coefficient may be significant
+MIN_COEFFICIENT_SHARE = 0.3  # minimum size of a significant coefficient, relative to the largest coefficient
+# Maximum size of the coefficient before the first significant one, relative to the largest coefficient. If it
+# is larger, a slow filter hides the latest reading.
+MAX_PRECEDING_SHARE = 0.12
+# Correlation of successive readings after two differences: -2/3 for white noise. If it is larger, the
+# readings are not dominated by noise.
 MAX_NEIGHBOUR_CORRELATION = -0.4
-MIN_REGRESSION_ROWS = 100  # rows that a regression needs
-OUTLIER_RATIO = 8.0  # times the median residual, above which a row is excluded
-MIN_AGREEING_SHARE = 0.7  # share of the conclusive runs that must agree
-ROWS_BESIDE_CONTACT = 50  # rows before and after a contact that are included
-OUTLIER_ITERATIONS = 6  # iterations of excluding rows
-MAX_RUNS = 50  # runs that are evaluated
-MAX_COMPUTING_DELAY = 4  # ticks, largest computing delay
+MIN_REGRESSION_ROWS = 100  # minimum number of rows for a regression
+OUTLIER_RATIO = 8.0  # residual over the median residual; rows with a larger ratio are excluded
+MIN_AGREEING_SHARE = 0.7  # minimum share of the conclusive runs that must agree
+ROWS_BESIDE_CONTACT = 50  # number of rows before and after a contact that are included
+OUTLIER_ITERATIONS = 6  # iterations that exclude rows
+MAX_RUNS = 50  # maximum number of evaluated runs
+MAX_COMPUTING_DELAY = 4  # ticks, longest computing delay
+# Number of ticks by which the readings of a row are older than its command.
 ROW_SHIFT = {"sent": 1, "tick": 0, "after": -1}
-EXPLICIT_INTEGRATOR = "explicit_euler"  # applies a reading one tick later than the other integrators
+EXPLICIT_INTEGRATOR = "explicit_euler"  # integrator that responds to a reading one tick later than the others
 
 
 def check_row_convention(
     runs: Sequence[LoggedRun], timing: CampaignTiming, integrator: str | None = None
 ) -> None:
-    """Check that the noise in the commands agrees with the row convention `timing.row`.
+    """Check that the row convention `timing.row` agrees with the noise in the commands.
 
-    A command depends on the reading of its tick, or of `timing.computing_delay` ticks earlier; with the
-    explicit integrator, of one more tick.
+    A command depends on the force reading of its tick, or of a tick that is `timing.computing_delay` ticks
+    earlier. With the explicit Euler integrator, the reading is one tick older.
+
+    Args:
+        runs: Runs of the campaign.
+        timing: Timing of commands and readings.
+        integrator: Integrator of the numerical model, or None if it is unknown.
 
     Raises:
-        InputError: If the noise shows another convention.
+        InputError: If the noise shows another row convention.
     """
-    last = detect_reading_offset(runs)
-    usual = timing.computing_delay + (integrator == EXPLICIT_INTEGRATOR)
-    if last is None or last == ROW_SHIFT[timing.row] - usual:
+    offset = detect_reading_offset(runs)
+    delay = timing.computing_delay + (integrator == EXPLICIT_INTEGRATOR)
+    if offset is None or offset == ROW_SHIFT[timing.row] - delay:
         return
-    meant = [row for row, ahead in ROW_SHIFT.items() if ahead - usual == last]
-    late = ROW_SHIFT[timing.row] - last - (integrator == EXPLICIT_INTEGRATOR)
-    allowed = [f'row = "{row}"' for row in meant] + [f"computing_delay = {late}"] * (
-        0 < late <= MAX_COMPUTING_DELAY
+    rows = [row for row, shift in ROW_SHIFT.items() if shift - delay == offset]
+    computing_delay = ROW_SHIFT[timing.row] - offset - (integrator == EXPLICIT_INTEGRATOR)
+    expected = [f'row = "{row}"' for row in rows] + [f"computing_delay = {computing_delay}"] * (
+        0 < computing_delay <= MAX_COMPUTING_DELAY
     )
-    if late == 1 and integrator is None:
-        allowed.append(f'velocity_desired, or a prior whose rig.integrator is "{EXPLICIT_INTEGRATOR}"')
-    row_text = "their own row" if last == 0 else f"{abs(last)} rows {'after' if last > 0 else 'before'} them"
+    if computing_delay == 1 and integrator is None:
+        expected.append(f'velocity_desired, or a prior whose rig.integrator is "{EXPLICIT_INTEGRATOR}"')
+    count = f"{abs(offset)} row{'s' * (abs(offset) != 1)}"
+    row_text = "of the same row" if offset == 0 else f"{count} {'later' if offset > 0 else 'earlier'}"
     raise InputError(
-        f'timing.row: found "{timing.row}", but commands answer the force reading of {row_text}, '
-        f"expected {' or '.join(allowed) or 'another row'}"
+        f'timing.row: found "{timing.row}", but commands depend on the force reading {row_text}, '
+        f"expected {' or '.join(expected) or 'another row convention'}"
     )
 
 
 def detect_common_integrator(runs: Sequence[LoggedRun], period: float) -> str | None:
-    """Return the numerical model's integrator according to most of the contacts with a logged velocity."""
+    """Return the integrator of the numerical model that most contacts show, or None if most show none."""
     contacts = [run for run in runs if run.kind == "contact"][:MAX_RUNS]
     integrators = [detect_integrator(run.position_desired, run.velocity_desired, period) for run in contacts]
     return max(set(integrators), key=integrators.count, default=None)
 
 
 def detect_reading_offset(runs: Sequence[LoggedRun]) -> int | None:
-    """Return the number of rows by which the last reading that affects a command follows it.
+    """Return the row offset from a command to the latest force reading that affects it, from all contacts.
 
-    Returns None if the noise is not conclusive, if only one run is conclusive, or if the runs disagree.
+    The offset is positive if the reading is in a later row. It is None if the noise is not conclusive in at
+    least two runs, or if the runs disagree.
     """
     contacts = [run for run in runs if run.kind == "contact"]
     contacts = contacts[:: -(-len(contacts) // MAX_RUNS) or 1]
@@ -85,55 +97,65 @@ def detect_reading_offset(runs: Sequence[LoggedRun]) -> int | None:
     if not parts:
         return None
     first = _find_latest_reading(*(np.concatenate([part[index] for part in parts]) for index in (0, 1)))
-    votes = [vote for part in parts for vote in [_find_latest_reading(*part)] if vote is not None]
-    if first is None or len(votes) < 2 or votes.count(first) < MIN_AGREEING_SHARE * len(votes):
+    offsets = [offset for part in parts for offset in [_find_latest_reading(*part)] if offset is not None]
+    if first is None or len(offsets) < 2 or offsets.count(first) < MIN_AGREEING_SHARE * len(offsets):
         return None
     return first
 
 
-def _find_latest_reading(moved: np.ndarray, columns: np.ndarray) -> int | None:
-    """Return the row offset of the latest reading that affects the commands, or None.
+def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | None:
+    """Return the row offset from a command to the latest reading that affects it, or None if it is not clear.
 
-    The columns begin with the reading `ROWS_AFTER_COMMAND` rows after the command.
+    Args:
+        commands: Twice differenced second differences of the commands.
+        columns: Regressors; the first one is the reading `ROWS_AFTER_COMMAND` rows after the command, and
+            each further
+            reading is one row earlier.
     """
-    if len(moved) < MIN_REGRESSION_ROWS or _correlate_neighbours(columns) > MAX_NEIGHBOUR_CORRELATION:
+    if len(commands) < MIN_REGRESSION_ROWS or _correlate_neighbours(columns) > MAX_NEIGHBOUR_CORRELATION:
         return None
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
-    solution, error = np.zeros(columns.shape[1]), moved
+    solution, error = np.zeros(columns.shape[1]), commands
     for _ in range(OUTLIER_ITERATIONS):
-        # Exclude rows with large residuals: onsets and limits are not linear.
+        # Exclude rows with large residuals, because onsets and limits are nonlinear.
         used = np.abs(error) <= OUTLIER_RATIO * np.median(np.abs(error))
-        solution, _, rank, _ = np.linalg.lstsq(columns[used], moved[used], rcond=1e-10)
+        solution, _, rank, _ = np.linalg.lstsq(columns[used], commands[used], rcond=1e-10)
         if rank < columns.shape[1]:
             return None
-        error = moved - columns @ solution
-    free = np.count_nonzero(used) - columns.shape[1]
+        error = commands - columns @ solution
+    freedom = np.count_nonzero(used) - columns.shape[1]
     inverse = np.linalg.inv(columns[used].T @ columns[used])
-    variance = float(error[used] @ error[used]) / free * np.diag(inverse)
+    variance = float(error[used] @ error[used]) / freedom * np.diag(inverse)
     lags = slice(0, ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + 1)
     size = np.abs(solution[lags])
-    clear = (size > MIN_COEFFICIENT_SIGMAS * np.sqrt(variance[lags])) & (
+    is_significant = (size > MIN_COEFFICIENT_SIGMAS * np.sqrt(variance[lags])) & (
         size > MIN_COEFFICIENT_SHARE * np.max(size)
     )
-    first = int(np.argmax(clear))
-    if not np.any(clear) or (first > 0 and size[first - 1] > MAX_PRECEDING_SHARE * np.max(size)):
+    first = int(np.argmax(is_significant))
+    if not np.any(is_significant) or (first > 0 and size[first - 1] > MAX_PRECEDING_SHARE * np.max(size)):
         return None
     return ROWS_AFTER_COMMAND - first
 
 
 def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the second differences of the commands and the regressors, all differenced twice.
+    """Return the columns of the regression for one run, or None if the run has no contact.
 
-    Regressors are the neighbouring readings and the model's position and velocity. Only rows in and near
-    contact are included, because elsewhere another source may drive the rig.
+    The first array contains the second differences of the commands. The second array contains the regressors:
+        force
+    readings of adjacent rows, and the position and velocity of the numerical model. All columns are
+    differenced twice more. Only rows in and near contact are included, because other rows may not depend on
+    the force.
+
+    Returns:
+        Arrays of shape (rows,) and (rows, regressors).
     """
     x, force = run.position_desired, run.force_measured
     assert force is not None
     if len(x) < ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + MIN_REGRESSION_ROWS // 2:
         return None
-    loud = np.abs(force - estimate_resting_force(force)) > estimate_contact_threshold(force)
-    touched = np.flatnonzero(loud[:-2] & loud[1:-1] & loud[2:])
+    exceeds_threshold = np.abs(force - estimate_resting_force(force)) > estimate_contact_threshold(force)
+    touched = np.flatnonzero(exceeds_threshold[:-2] & exceeds_threshold[1:-1] & exceeds_threshold[2:])
     if not len(touched):
         return None
     second = x[2:] - 2 * x[1:-1] + x[:-2]
@@ -142,20 +164,20 @@ def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | 
     readings = [force[rows + ahead] for ahead in range(ROWS_AFTER_COMMAND, -ROWS_BEFORE_COMMAND - 1, -1)]
     table = np.stack([second[rows - 1], *readings, x[rows], x[rows] - x[rows - 1]], axis=1)
     table = np.diff(table, n=2, axis=0)
-    # Rows without acceleration carry no information, and jumps come from a reset of the rig.
-    pulled = np.abs(second[rows - 1])
-    usual = np.median(pulled[pulled > 0]) if np.any(pulled > 0) else 0.0
-    good = (pulled > 0) & (pulled < 20 * usual) & run.valid[rows]
-    good = good[2:] & good[1:-1] & good[:-2] & np.all(np.isfinite(table), axis=1)
+    # Exclude rows without acceleration and jumps due to a reset of the rig.
+    acceleration = np.abs(second[rows - 1])
+    median_acceleration = np.median(acceleration[acceleration > 0]) if np.any(acceleration > 0) else 0.0
+    usable = (acceleration > 0) & (acceleration < 20 * median_acceleration) & run.valid[rows]
+    usable = usable[2:] & usable[1:-1] & usable[:-2] & np.all(np.isfinite(table), axis=1)
     return (
-        (table[good, 0], table[good, 1:])
-        if np.count_nonzero(good) > ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + 5
+        (table[usable, 0], table[usable, 1:])
+        if np.count_nonzero(usable) > ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + 5
         else None
     )
 
 
 def _correlate_neighbours(columns: np.ndarray) -> float:
-    """Return the correlation of each reading's difference with the next one's; 1 if it is undefined."""
+    """Return the correlation of successive readings after two differences; 1 if it is undefined."""
     reading, next_reading = columns[:, ROWS_AFTER_COMMAND], columns[:, ROWS_AFTER_COMMAND + 1]
     size = float(np.sqrt(np.dot(reading, reading) * np.dot(next_reading, next_reading)))
     return float(np.dot(reading, next_reading)) / size if size else 1.0

@@ -1,29 +1,35 @@
-"""Robust fit of one signal as a multiple of another one, with the standard error of the factor."""
+"""Robust fit of one signal as a multiple of another signal, with the standard error of the factor."""
 
 from __future__ import annotations
 
 import numpy as np
 
-OUTLIER_RATIO = 6.0  # times the median error, above which a row is excluded
-MIN_USED_SHARE = 0.7  # share of rows that a fit must include
-OUTLIER_ITERATIONS = 4  # iterations of excluding rows
+OUTLIER_RATIO = 6.0  # error over the median error; rows with a larger ratio are excluded
+MIN_USED_SHARE = 0.7  # minimum share of the rows in a fit
+OUTLIER_ITERATIONS = 4  # iterations that exclude rows
 
 
 class ScaleFit:
-    """Fit of one signal as a multiple of another one."""
+    """Fit of one signal as a multiple of another signal, with the residual and its standard error."""
 
     def __init__(self, slope: float, left: float, rms: float, error: float, rows: float):
         self.slope = slope
-        self.left = left  # rms of the residual over the rms of the signal
-        self.rms = rms  # rms of the residual
+        self.left = left  # rms of the residual over rms of the signal
+        self.rms = rms  # rms of the residual, in the unit of the signal
         self.error = error  # standard error of the slope
-        self.rows = rows  # effective number of rows: fewer if the errors are correlated
+        self.rows = rows  # effective number of rows; correlated errors reduce it
 
 
 def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit | None:
-    """Fit signal = slope * unit without outliers; return None if one of both is 0 throughout.
+    """Fit signal = slope * unit by least squares without outliers.
 
-    Errors of rows up to twice `width` apart may be correlated.
+    Args:
+        signal: Signal to fit.
+        unit: Signal that is multiplied by the slope.
+        width: Half the number of rows over which errors may be correlated.
+
+    Returns:
+        The fit, or None if one of the signals is 0 in all rows.
     """
     used = np.ones(len(signal), bool)
     slope = 0.0
@@ -45,7 +51,7 @@ def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit 
 
 
 def _count_correlated(values: np.ndarray, longest: int) -> float:
-    """Return the number of correlated values that are equivalent to one independent value."""
+    """Return the number of correlated values that contain as much information as one independent value."""
     power = float(values @ values)
     if power == 0.0:
         return 1.0

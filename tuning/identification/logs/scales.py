@@ -1,8 +1,8 @@
-"""Checks of the scales of forces, positions and velocities, from the momentum of the numerical model.
+"""Checks of the units of forces, positions and velocities, from the momentum of the numerical model.
 
-The numerical model is a free body during a contact, so its change of momentum is exactly the impulse of the
-force command. The impulse of the measured force differs by the action of the compensator, which is much less
-than the factor between two units. A velocity is the difference of positions.
+During a contact, the numerical model is a free body. Its change of momentum is therefore exactly the impulse
+of the force command. The impulse of the measured force differs from it because of the compensator, but much
+less than by the factor between two units. Velocities are checked against the differences of positions.
 """
 
 from __future__ import annotations
@@ -13,26 +13,23 @@ from jaxhil.errors import InputError
 from tuning.identification.logs.lost_rows import LogSegment
 from tuning.identification.logs.scale_fit import fit_scale
 
-SPEED_SPAN_TICKS = 10  # ticks, span of a difference that gives a speed
-IMPULSE_RATIO_RANGE = (
-    0.5,
-    2.0,
-)  # measured impulse over change of momentum; jaxhil's compensators reach 0.97 to 1.45
-UNIT_FACTOR_TOLERANCE = 0.25  # relative tolerance of a unit's factor, since compensators change the impulse
-WIDE_IMPULSE_RATIO_RANGE = (
-    0.2,
-    5.0,
-)  # as `IMPULSE_RATIO_RANGE`, for clipped readings or a model that may not be a free body
-TOLERANCE_SIGMAS = 5.0  # standard errors added to the tolerances
-VELOCITY_TOLERANCE = 0.02  # relative tolerance of the velocity against the difference of positions
-MAX_RELATIVE_RESIDUAL = 0.3  # largest relative residual of a usable velocity channel or position fit
+SPEED_SPAN_TICKS = 10  # ticks, time between two positions that give a speed
+# Allowed impulse of the measured force over the change of momentum; the compensators of jaxhil reach 0.97 to
+# 1.45.
+IMPULSE_RATIO_RANGE = 0.5, 2.0
+UNIT_FACTOR_TOLERANCE = 0.25  # relative tolerance of a unit's factor, because compensators change the impulse
+# Allowed impulse ratio if readings are clipped or the numerical model may not be a free body.
+WIDE_IMPULSE_RATIO_RANGE = 0.2, 5.0
+TOLERANCE_SIGMAS = 5.0  # number of standard errors that are added to a tolerance
+VELOCITY_TOLERANCE = 0.02  # relative tolerance between the velocity and the differences of positions
+MAX_RELATIVE_RESIDUAL = 0.3  # largest relative residual of a fit that can be evaluated
 POSITION_GAIN_RANGE = 0.5, 2.0  # allowed ratio of measured to desired position in slow motion
-MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # rows that are sufficient
-MAX_EVALUATED_CONTACTS = 500  # contacts that are sufficient
-MAX_SLOW_MOTION_LAG = 100  # rows, largest delay of a slow motion behind its command
-ROWS_BESIDE_CONTACT = 60  # rows before and after a contact that give the force at rest
+MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # numbers of rows that are sufficient
+MAX_EVALUATED_CONTACTS = 500  # number of contacts that is sufficient
+MAX_SLOW_MOTION_LAG = 100  # rows, longest delay of a slow motion relative to its command
+ROWS_BESIDE_CONTACT = 60  # number of rows before and after a contact that determine the force without contact
 
-# Factors by which a wrong unit of the force multiplies it.
+# Factors by which a wrong unit multiplies the force.
 _FORCE_FACTORS = {
     1.0 / 4.4482216152605: "force in lbf, read as N",
     4.4482216152605: "force in N, read as lbf",
@@ -42,7 +39,7 @@ _FORCE_FACTORS = {
     1e3: "force in N, read as kN (or mN as N)",
     1e6: "force in mN, read as kN",
 }
-# Factors by which a wrong unit of positions or mass multiplies the impulse over the momentum.
+# Factors by which a wrong unit of positions or mass multiplies the ratio of impulse to momentum.
 _MOMENTUM_FACTORS = {
     2.54: "positions in in, read as cm",
     1.0 / 2.54: "positions in cm, read as in",
@@ -59,73 +56,81 @@ _MOMENTUM_FACTORS = {
     0.45359237: "equivalent_mass in lb, read as kg",
     1.0 / 0.45359237: "equivalent_mass in kg, read as lb",
 }
+# Factors by which a wrong unit multiplies a length.
 _LENGTH_FACTORS = {
     1.0 / f: what.replace("positions ", "") for f, what in _MOMENTUM_FACTORS.items() if "pos" in what
 }
 
 
 def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = True) -> str:
-    """Return a question that names the wrong units that may explain a factor of the force.
+    """Return a question for a message that names wrong units with which a force would have a wrong value.
 
     Args:
-        factors: Estimates of the ratio of the force to its expected value, the best one first.
-        tolerance: Relative tolerance of a unit's factor.
-        momentum: Whether positions or the mass may be in a wrong unit instead.
+        factors: Estimates of the ratio of the force to its expected value, the best estimate first.
+        tolerance: Relative tolerance of the factor between two units.
+        momentum: Whether positions or the mass may have a wrong unit instead.
 
     Returns:
-        Text such as " (force in lbf, read as N?)", the nearest factors first; "" if none is near.
+        Text such as " (force in lbf, read as N?)", with the closest units first; "" if no unit fits.
     """
     factors_of_units = [*_FORCE_FACTORS.items(), *(_MOMENTUM_FACTORS.items() if momentum else ())]
     return _ask_for_units(factors_of_units, factors, tolerance)
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question that names the wrong units that may explain a factor of a length."""
+    """Return a question for a message that names wrong units with which lengths are wrong by a factor."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return the texts of the nearest factors as a question, or ""."""
-    near: list[str] = []
+    """Return a question with the texts of the closest factors, or an empty string."""
+    texts: list[str] = []
     for factor in factors:
-        off = sorted((abs(np.log(factor / unit_factor)), text) for unit_factor, text in units if factor > 0.0)
-        near += [text for distance, text in off if distance <= np.log1p(tolerance)]
-    return f" ({', or '.join(list(dict.fromkeys(near))[:3])}?)" if near else ""
+        distances = sorted(
+            (abs(np.log(factor / unit_factor)), text) for unit_factor, text in units if factor > 0.0
+        )
+        texts += [text for distance, text in distances if distance <= np.log1p(tolerance)]
+    return f" ({', or '.join(list(dict.fromkeys(texts))[:3])}?)" if texts else ""
 
 
 def check_impulse(
     label: str,
     kind: str,
-    stretch: LogSegment,
+    segment: LogSegment,
     contacts: list[tuple[int, int]],
     period: float,
     mass: float,
-    command_holds: bool,
+    mass_is_verified: bool,
     clipped: bool,
 ) -> None:
-    """Raise `InputError` if the impulse of the measured force is not about the model's change of momentum.
+    """Check that the impulse of the measured force roughly equals the model's change of momentum.
 
     Args:
         label: Name of the log in messages.
-        kind: "contact", or "tap", whose commands need not be those of a free body.
-        stretch: Rows without a gap.
-        contacts: First row, and row after the last one, of each contact.
+        kind: Kind of experiment: "contact", or "tap" if the model need not move as a free body.
+        segment: Segment of the log.
+        contacts: For each contact, its first row and the row after its last row.
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
-        command_holds: Whether force_command was found to move the model with this mass.
-        clipped: Whether readings end at a limit, beyond which some of the force is missing.
+        mass_is_verified: Whether the force command moves the model with this mass, so that positions and mass
+            have
+            the right units.
+        clipped: Whether force readings are clipped, so that part of the impulse is missing.
+
+    Raises:
+        InputError: If the impulse has another sign or magnitude.
     """
-    force, x = stretch.channels["force_measured"], stretch.channels["position_desired"]
+    force, x = segment.channels["force_measured"], segment.channels["position_desired"]
     assert force is not None and x is not None
     contacts = contacts[:: len(contacts) // MAX_EVALUATED_CONTACTS + 1]
-    needed, made = _compute_impulses(force, x, contacts, period, mass)
-    if not np.any(needed):
+    momentum_changes, impulses = _compute_impulses(force, x, contacts, period, mass)
+    if not np.any(momentum_changes):
         return
-    ratio = float(np.dot(made, needed) / np.dot(needed, needed))
-    error = _estimate_impulse_error(force, period, contacts) / float(np.linalg.norm(needed))
+    ratio = float(np.dot(impulses, momentum_changes) / np.dot(momentum_changes, momentum_changes))
+    error = _estimate_impulse_error(force, period, contacts) / float(np.linalg.norm(momentum_changes))
     if ratio < -WIDE_IMPULSE_RATIO_RANGE[0] - TOLERANCE_SIGMAS * error:
         raise InputError(
-            f"{label}: force_measured: found one that pulls where the numerical model is pushed back, "
+            f"{label}: force_measured: found F < 0 in contacts that push the numerical model back, "
             "expected the other sign: F > 0 pushes back"
         )
     low, high = IMPULSE_RATIO_RANGE if kind == "contact" else WIDE_IMPULSE_RATIO_RANGE
@@ -133,42 +138,40 @@ def check_impulse(
     low, high = low - TOLERANCE_SIGMAS * error, high + TOLERANCE_SIGMAS * error
     if low <= ratio <= high:
         return
-    # Damping by the compensator and a dead zone change the impulse, but not the slope of the force.
+    # Damping by the compensator and a dead zone change the impulse, but not the slope of force over position.
     slope = _estimate_force_ratio(force, x, contacts, period, mass) or ratio
     if kind == "contact" and low <= slope <= high:
         return
-    units = ask_for_unit((ratio, slope), UNIT_FACTOR_TOLERANCE, momentum=not command_holds)
+    units = ask_for_unit((ratio, slope), UNIT_FACTOR_TOLERANCE, momentum=not mass_is_verified)
     units = units or " (is its unit right?)"
     raise InputError(
-        f"{label}: force_measured: found {ratio:.4g} times the impulse that there was, "
-        f"expected {low:.2g} to {high:.2g} times what turns {mass:g} kg round{units}"
+        f"{label}: force_measured: found {ratio:.4g} times the impulse that reverses {mass:g} kg, "
+        f"expected {low:.2g} to {high:.2g} times{units}"
     )
 
 
 def _compute_impulses(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> tuple[list[float], list[float]]:
-    """Return the change of momentum and the impulse of the measured force in each contact [N s]."""
+    """Return the model's change of momentum and the measured impulse of each contact [N s]."""
     rest = estimate_force_beside_contacts(force, contacts)
-    needed, made = [], []
+    momentum_changes, impulses = [], []
     for begin, end in contacts:
-        begin, end = (
-            begin - SPEED_SPAN_TICKS,
-            end + SPEED_SPAN_TICKS,
-        )  # There is some force below the threshold, too.
+        # Include rows in which the force is below the detection threshold.
+        begin, end = begin - SPEED_SPAN_TICKS, end + SPEED_SPAN_TICKS
         if begin < SPEED_SPAN_TICKS or end + SPEED_SPAN_TICKS > len(x):
             begin, end = begin + SPEED_SPAN_TICKS, end - SPEED_SPAN_TICKS
         if begin < SPEED_SPAN_TICKS or end + SPEED_SPAN_TICKS > len(x):
             continue
         before = (x[begin] - x[begin - SPEED_SPAN_TICKS]) / (SPEED_SPAN_TICKS * period)
         after = (x[end + SPEED_SPAN_TICKS - 1] - x[end - 1]) / (SPEED_SPAN_TICKS * period)
-        needed.append(mass * (before - after))
-        made.append(period * float(np.nanmean(force[begin:end]) - rest) * (end - begin))
-    return needed, made
+        momentum_changes.append(mass * (before - after))
+        impulses.append(period * float(np.nanmean(force[begin:end]) - rest) * (end - begin))
+    return momentum_changes, impulses
 
 
 def estimate_force_beside_contacts(force: np.ndarray, contacts: list[tuple[int, int]]) -> float:
-    """Return the median reading near, but outside, the contacts [N]; a log may begin in contact."""
+    """Return the median force reading just before and after the contacts [N]."""
     beside = [
         force[max(0, begin - ROWS_BESIDE_CONTACT) : max(0, begin - SPEED_SPAN_TICKS)] for begin, _ in contacts
     ]
@@ -178,7 +181,7 @@ def estimate_force_beside_contacts(force: np.ndarray, contacts: list[tuple[int, 
 
 
 def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tuple[int, int]]) -> float:
-    """Return the standard deviation [N s] of the impulse of all contacts due to noise."""
+    """Return the standard deviation of the total impulse of all contacts due to noise [N s]."""
     steps = np.abs(np.diff(force[:MAX_EVALUATED_ROWS]))
     std = 1.4826 * float(np.nanmedian(steps)) / np.sqrt(2.0)
     rows = sum(end - begin + 2 * SPEED_SPAN_TICKS for begin, end in contacts)
@@ -188,9 +191,9 @@ def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tup
 def _estimate_force_ratio(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> float | None:
-    """Return the measured force over -M x_d'' in contact, without constant and rate-dependent parts.
+    """Return the ratio of the measured force to -M x_d'' in contact, or None if it cannot be determined.
 
-    Returns None if the contacts do not determine it.
+    Constant and rate-dependent parts of the force are excluded by regression.
     """
     rows = [
         np.arange(max(begin, SPEED_SPAN_TICKS), min(end, len(x) - SPEED_SPAN_TICKS))
@@ -200,44 +203,45 @@ def _estimate_force_ratio(
     if len(inside) < 2 * SPEED_SPAN_TICKS:
         return None
     second = x[inside + SPEED_SPAN_TICKS] - 2.0 * x[inside] + x[inside - SPEED_SPAN_TICKS]
-    needed = -mass * second / (SPEED_SPAN_TICKS * period) ** 2
+    needed_force = -mass * second / (SPEED_SPAN_TICKS * period) ** 2
     force = np.nan_to_num(force[: inside[-1] + SPEED_SPAN_TICKS])
-    made = np.convolve(force, make_triangular_weights(SPEED_SPAN_TICKS) / SPEED_SPAN_TICKS**2)[
+    mean_force = np.convolve(force, make_triangular_weights(SPEED_SPAN_TICKS) / SPEED_SPAN_TICKS**2)[
         inside + SPEED_SPAN_TICKS - 1
     ]
     columns = np.stack(
-        [made, np.ones(len(inside)), x[inside + SPEED_SPAN_TICKS] - x[inside - SPEED_SPAN_TICKS]], axis=1
+        [mean_force, np.ones(len(inside)), x[inside + SPEED_SPAN_TICKS] - x[inside - SPEED_SPAN_TICKS]],
+        axis=1,
     )
     size = np.linalg.norm(columns, axis=0)
-    solution = np.linalg.lstsq(columns / np.where(size > 0.0, size, 1.0), needed, rcond=None)[0]
+    solution = np.linalg.lstsq(columns / np.where(size > 0.0, size, 1.0), needed_force, rcond=None)[0]
     return float(size[0] / solution[0]) if solution[0] else None
 
 
 def make_triangular_weights(width: int) -> np.ndarray:
-    """Return the weights with which second differences over one row add up to one over `width` rows."""
+    """Return the weights with which second differences of adjacent rows add up to one over `width` rows."""
     return width - np.abs(np.arange(1.0 - width, width))
 
 
-def check_velocity(label: str, stretch: LogSegment, period: float) -> str | None:
-    """Check that velocity_desired is the rate of position_desired.
+def check_velocity(label: str, segment: LogSegment, period: float) -> str | None:
+    """Check that the desired velocity is the rate of the desired position.
 
     Returns:
-        None, or a note if the channel does not follow the positions and is ignored.
+        None, or a note if the velocity is not proportional to the rate of the position and must be ignored.
 
     Raises:
-        InputError: If it follows them with another scale or sign.
+        InputError: If the velocity is proportional to the rate of the position with a factor other than 1.
     """
-    x, v = stretch.channels["position_desired"], stretch.channels["velocity_desired"]
+    x, v = segment.channels["position_desired"], segment.channels["velocity_desired"]
     if x is None or v is None or len(x) <= 2 * SPEED_SPAN_TICKS:
         return None
     x, v = x[:MAX_EVALUATED_ROWS], v[:MAX_EVALUATED_ROWS]
-    moved, integrated = x[SPEED_SPAN_TICKS:] - x[:-SPEED_SPAN_TICKS], _sum_windows(period * v)
-    good = np.isfinite(integrated) & np.isfinite(moved)
-    fit = fit_scale(moved[good], integrated[good], SPEED_SPAN_TICKS)
-    if not np.any(good) or not np.any(moved[good]):
+    steps, integrated = x[SPEED_SPAN_TICKS:] - x[:-SPEED_SPAN_TICKS], _sum_windows(period * v)
+    usable = np.isfinite(integrated) & np.isfinite(steps)
+    fit = fit_scale(steps[usable], integrated[usable], SPEED_SPAN_TICKS)
+    if not np.any(usable) or not np.any(steps[usable]):
         return None
     if fit is None or fit.left > MAX_RELATIVE_RESIDUAL or fit.slope == 0.0:
-        return f"{label}: velocity_desired: ignored, since position_desired does not move by it"
+        return f"{label}: velocity_desired: ignored, because it is not the rate of position_desired"
     if abs(fit.slope - 1.0) <= VELOCITY_TOLERANCE + TOLERANCE_SIGMAS * fit.error:
         return None
     ratio = 1.0 / fit.slope
@@ -248,7 +252,7 @@ def check_velocity(label: str, stretch: LogSegment, period: float) -> str | None
 
 
 def _sum_windows(values: np.ndarray) -> np.ndarray:
-    """Return sums over `SPEED_SPAN_TICKS` rows up to each row, NaN if one of the values is NaN."""
+    """Return, for each row, the sum of the last `SPEED_SPAN_TICKS` values; NaN if one of them is NaN."""
     finite = np.isfinite(values)
     summed = np.concatenate([[0.0], np.cumsum(np.where(finite, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(finite)])
@@ -259,7 +263,7 @@ def _sum_windows(values: np.ndarray) -> np.ndarray:
 
 
 def check_gain(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> None:
-    """Raise `InputError` if the measured amplitude of a slow motion differs much from the commanded one."""
+    """Raise `InputError` if the gain from desired to measured position in slow motion is far from 1."""
     if kind not in ("contact", "tap"):
         return
     x, measured = (

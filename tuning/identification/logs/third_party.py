@@ -1,8 +1,8 @@
-"""Logs in third-party formats, each read by the library of that format, which is imported on demand.
+"""Readers of third-party log formats; the library of a format is imported when a log is opened.
 
-Every function takes a path and returns a `LogReader`. Fields of structures are joined by a dot (`log.force`);
-the columns of a matrix are counted from 1 (`log.signals_2`). Stamps that count from an epoch are in s from
-the first one of the log.
+Every public function takes a path and returns a `LogReader`. The column name of a field in a structure
+contains a dot (`log.force`). The columns of a matrix are numbered from 1 (`log.signals_2`). Time stamps
+relative to an epoch are converted to seconds from the first time stamp of the log.
 """
 
 # The libraries are optional.
@@ -22,13 +22,13 @@ ColumnsByName = dict[str, np.ndarray]
 
 
 class LogReader(NamedTuple):
-    """Open log: names of its columns, and functions that read them."""
+    """Open log: the names of its columns, and functions that read columns and their time stamps."""
 
-    names: list[str]  # of its columns
+    names: list[str]  # names of the columns
     read: Callable[[Sequence[str]], ColumnsByName]
-    # Stamps [s] of columns that were read, with a common zero; None if the format has none.
+    # Time stamps [s] of columns that were read, with a common origin; None if the format has no such stamps.
     clocks: Callable[[Sequence[str]], dict[str, np.ndarray | None]] | None = None
-    stamps: Collection[str] = ()  # columns that contain such stamps
+    stamps: Collection[str] = ()  # names of the columns that contain such time stamps
 
 
 def mat(path: Path) -> LogReader:
@@ -37,35 +37,35 @@ def mat(path: Path) -> LogReader:
 
     def flat(name: str, value: Any) -> ColumnsByName:
         if isinstance(value, Mapping):
-            return _join_chunks(name, value, flat)
+            return _join_fields(name, value, flat)
         return _split_columns(name, value)
 
     content = read_mat(str(path))
-    columns = _join_chunks(
+    columns = _join_fields(
         "", {name: value for name, value in content.items() if not name.startswith("__")}, flat
     )
     if not columns:
         export = "export signals as arrays, or as a structure with time"
-        raise ValueError(f"found no numbers, expected arrays or structures of them: {export}")
+        raise ValueError(f"found no numbers, expected arrays or structures of numbers: {export}")
     return _make_reader(columns)
 
 
 def hdf5(path: Path) -> LogReader:
-    """Open an HDF5 file; a column is a numeric dataset, named by its path without the first slash."""
+    """Open an HDF5 file; the columns are its datasets, named by their paths without the first slash."""
     import h5py
 
-    places: dict[str, tuple[str, str | None, int | None]] = {}
+    locations: dict[str, tuple[str, str | None, int | None]] = {}
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2):
                 return
             if item.dtype.names:
-                places.update({f"{name}.{part}": (name, part, None) for part in item.dtype.names})
+                locations.update({f"{name}.{part}": (name, part, None) for part in item.dtype.names})
             elif item.ndim == 1:
-                places[name] = name, None, None
+                locations[name] = name, None, None
             else:
-                places.update(
+                locations.update(
                     {f"{name}_{column + 1}": (name, None, column) for column in range(item.shape[1])}
                 )
 
@@ -75,17 +75,20 @@ def hdf5(path: Path) -> LogReader:
         with h5py.File(path, "r") as file:
             columns = {}
             for column in wanted:
-                name, part, index = places[column]
+                name, part, index = locations[column]
                 data: Any = file[name]
                 values = data[:, index] if index is not None else data[part] if part else data[()]
                 columns[column] = _convert_to_numbers(column, values)
             return columns
 
-    return LogReader(list(places), read)
+    return LogReader(list(locations), read)
 
 
 def bag(path: Path) -> LogReader:
-    """Open a ROS 2 bag, sqlite3 or MCAP; columns are `/topic.field` and `/topic.time`, the recording time."""
+    """Open a ROS 2 bag (sqlite3 or MCAP).
+
+    The columns are `/topic.field`, and `/topic.time` with the recording time of the messages.
+    """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -100,7 +103,7 @@ def bag(path: Path) -> LogReader:
     columns, topics, stamps = {}, {}, {}
     zero = min((fields["time"][0] for fields in rows.values()), default=0)
     for topic, fields in rows.items():
-        # Subtract in integers: nanoseconds since an epoch have more digits than a float.
+        # Subtract integers: nanoseconds since an epoch have more digits than a float.
         stamps[topic] = 1e-9 * (np.array(fields["time"]) - zero)
         for name, values in fields.items():
             if len(values) == len(fields["time"]):
@@ -116,11 +119,11 @@ def bag(path: Path) -> LogReader:
 
 
 def mdf(path: Path) -> LogReader:
-    """Open an ASAM MDF file; `time` is the master of the first channel that is read."""
+    """Open an ASAM MDF file; the column `time` contains the time stamps of the first channel that is read."""
     from asammdf import MDF
 
     with MDF(path) as file:
-        groups = {name: places[0][0] for name, places in file.channels_db.items() if name != "time"}
+        groups = {name: locations[0][0] for name, locations in file.channels_db.items() if name != "time"}
     names = list(groups)
     masters: dict[int, np.ndarray] = {}  # stamps of each group that was read
 
@@ -144,7 +147,10 @@ def mdf(path: Path) -> LogReader:
 
 
 def tdms(path: Path) -> LogReader:
-    """Open an NI TDMS file; `group/channel.time` exists if the channel has its own rate."""
+    """Open an NI TDMS file.
+
+    The columns are `group/channel`, and `group/channel.time` for channels with a sampling rate.
+    """
     from nptdms import TdmsFile
 
     channels, group_of = {}, {}
@@ -159,10 +165,10 @@ def tdms(path: Path) -> LogReader:
     zero = min(begins.values(), default=0)
 
     def wave(name: str) -> tuple[float, float, int]:
-        """Return a channel's first time [s], the distance of its readings [s], and their number."""
+        """Return a channel's first time stamp [s], sampling period [s] and number of readings."""
         if begins and name not in begins:
             raise ValueError(
-                f"column {format_value(name)}: found no wf_start_time, expected one, as others have"
+                f"column {format_value(name)}: found no wf_start_time, expected one as in other channels"
             )
         properties = waves[name].properties
         begin = 1e-9 * (begins.get(name, 0) - zero) + float(properties.get("wf_start_offset", 0.0))
@@ -170,7 +176,8 @@ def tdms(path: Path) -> LogReader:
 
     def stamps(name: str) -> np.ndarray | None:
         if name not in waves:
-            # A channel without a rate has that of the other channels of its group, if these agree.
+            # A channel without a rate gets the time stamps of its group if all other channels of the group
+            # agree.
             group = [member for member in waves if group_of[member] == group_of[name]]
             if len({wave(member) for member in group}) != 1 or len(waves[group[0]]) != len(channels[name]):
                 return None
@@ -181,30 +188,30 @@ def tdms(path: Path) -> LogReader:
     def read(wanted: Sequence[str]) -> ColumnsByName:
         columns = {}
         for name in wanted:
-            own_stamps = stamps(name.removesuffix(".time")) if name in timed else None
+            own_stamps = stamps(name.removesuffix(".time")) if name in time_columns else None
             columns[name] = (
                 own_stamps if own_stamps is not None else _convert_to_numbers(name, channels[name][:])
             )
         return columns
 
-    timed = [f"{name}.time" for name in waves]
+    time_columns = [f"{name}.time" for name in waves]
     return LogReader(
-        [*channels, *timed],
+        [*channels, *time_columns],
         read,
         lambda wanted: {
-            name: stamps(name.removesuffix(".time") if name in timed else name) for name in wanted
+            name: stamps(name.removesuffix(".time") if name in time_columns else name) for name in wanted
         },
-        timed,
+        time_columns,
     )
 
 
 def _to_nanoseconds(stamp: Any) -> int:
-    """Return a date as nanoseconds since 1970."""
+    """Return a date in nanoseconds since 1970."""
     stamp = stamp.as_datetime64("ns") if hasattr(stamp, "as_datetime64") else stamp
     return int(np.datetime64(stamp).astype("datetime64[ns]").astype(np.int64))
 
 
-def _join_chunks(
+def _join_fields(
     name: str, parts: Mapping[str, Any], flat: Callable[[str, Any], ColumnsByName]
 ) -> ColumnsByName:
     columns: ColumnsByName = {}
@@ -214,7 +221,7 @@ def _join_chunks(
 
 
 def _split_columns(name: str, value: Any) -> ColumnsByName:
-    """Return the columns of a numeric vector or matrix, else nothing."""
+    """Return the columns of a numeric vector or matrix by name; none for other values."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -227,7 +234,7 @@ def _split_columns(name: str, value: Any) -> ColumnsByName:
 
 
 def _flatten_fields(message: Any, name: str = "") -> list[tuple[str, float]]:
-    """Return the numbers of a message with their paths."""
+    """Return all numbers in a message, each with the dotted path of its field."""
     fields: list[tuple[str, float]] = []
     for part, value in vars(message).items():
         path = f"{name}.{part}".lstrip(".")
@@ -249,8 +256,8 @@ def _convert_to_numbers(name: str, values: Any) -> np.ndarray:
         return 1e-9 * (nanoseconds - nanoseconds[:1])
     if array.dtype.kind not in "biuf" or array.ndim != 1:
         raise ValueError(
-            f"column {format_value(name)}: found {array.dtype} of {array.ndim} axes, expected numbers, "
-            "one a row"
+            f"column {format_value(name)}: found {array.dtype} with {array.ndim} axes, expected one number "
+            "per row"
         )
     return array.astype(float)
 

@@ -1,1 +1,1 @@
-"""Monitoring of a rig, contact by contact: comparison with its mechanism file."""
+"""Monitoring of a rig: comparison of each contact with the rig's mechanism file."""

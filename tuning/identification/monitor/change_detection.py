@@ -1,34 +1,39 @@
-"""Change detection in the mean: generalised likelihood ratio of a change, and its time.
+"""Detection of a change in the mean by the generalised likelihood ratio (Siegmund and Venkatraman 1995).
 
-For deviations z over their predicted standard deviation, twice the log likelihood ratio of a change at
-contact c, with the new mean fitted, is
+Let z_1 ... z_n be the normalized deviations of a metric in all contacts: independent and standard normal
+    without a
+change. For a change of the mean at contact c to an unknown value, twice the log likelihood ratio is
 
-    sum(z_c ... z_n)^2 / (n - c + 1)
+    sum(z_c ... z_n)^2 / (n - c + 1).
 
-and the maximizing c estimates the time of the change (Siegmund and Venkatraman 1995). A ratio above
-`ALARM_THRESHOLD` raises an alarm. For comparison, `tests/test_monitor_charts.py` counts false alarms and
-delays of a CUSUM with an allowance of half a standard deviation, together with a moving average with weight
-0.2.
+The value of c with the largest ratio estimates the first contact after the change. A ratio above
+`ALARM_THRESHOLD` raises an alarm. `tests/test_monitor_charts.py` compares false alarms and detection delays
+with those of a CUSUM chart and a moving average.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-CONTACTS_PER_FALSE_ALARM = 2000  # contacts per false alarm, over all seven metrics
-ALARM_THRESHOLD = 19.55  # of twice the log likelihood ratio; gives this rate of false alarms
-CHANGE_WINDOW = 200  # number of latest contacts that are searched for a change
+CONTACTS_PER_FALSE_ALARM = 2000  # mean number of contacts between false alarms of any of the seven metrics
+# Threshold of twice the log likelihood ratio; it gives the rate of `CONTACTS_PER_FALSE_ALARM`.
+ALARM_THRESHOLD = 19.55
+CHANGE_WINDOW = 200  # number of latest contacts among which a change is searched
 
 
 def detect_changes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return twice the log likelihood ratio of a change, and its first contact, for each metric.
+    """Return the largest likelihood ratio of a change for each metric, and the contact of the change.
 
-    `z` holds the deviations, (contacts, metrics); NaN marks a missing value.
+    Args:
+        z: Normalized deviations, shape (contacts, metrics); NaN marks a missing value.
+
+    Returns:
+        Twice the log likelihood ratio, and the index of the first contact after the change, shape (metrics,).
     """
     first = max(0, len(z) - CHANGE_WINDOW)
     finite = np.isfinite(z[first:])
     number = np.cumsum(finite[::-1], axis=0)[::-1]
     total = np.cumsum(np.where(finite, z[first:], 0.0)[::-1], axis=0)[::-1]
-    likelier = np.where(finite, total**2 / np.maximum(number, 1), 0.0)
-    best = np.argmax(likelier, axis=0)
-    return np.take_along_axis(likelier, best[None], axis=0)[0], first + best
+    ratio = np.where(finite, total**2 / np.maximum(number, 1), 0.0)
+    best = np.argmax(ratio, axis=0)
+    return np.take_along_axis(ratio, best[None], axis=0)[0], first + best

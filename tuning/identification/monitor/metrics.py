@@ -1,9 +1,9 @@
-"""Metrics of one contact: seven values that are 0 if the mechanism file is correct.
+"""Metrics that compare one contact with the mechanism file: seven values, 0 if the file is correct.
 
-All metrics except the noise are weighted sums of the differences between the readings and those that the file
-predicts. Their noise and their sensitivity to any parameter of the file are therefore known. Readings near
-the onset are not used: the force of damped contact jumps there, and a row on its other side carries no
-information.
+All metrics except the noise are weighted sums of the differences between measured and predicted readings. The
+variance of the metrics and their sensitivity to each parameter are therefore known. Readings near the onset
+of contact are not used, because the force of damped contact jumps there, and the time of the jump is
+uncertain.
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from tuning.identification.monitor.predicted_readings import PredictedReadings
 from tuning.identification.noise import compute_whitened_share, estimate_noise, fit_whitening_filter
 from tuning.identification.records import LoggedRun
 
-# Name, displayed unit, and factor from the SI unit to it.
+# Name, displayed unit, and factor that converts SI units to the displayed unit.
 METRICS = (
-    ("stiffness", "%", 100.0),  # change of the force in phase with the depth, relative to the file
-    ("apparent damping", "N s/m", 1.0),  # change in phase with the rate: damping and force delay combined
-    ("mean force", "N", 1.0),  # change of the mean in contact
-    ("restitution", "1", 1.0),  # of the log minus that of the file under the same command
-    ("bias", "N", 1.0),  # change of the mean out of contact
-    ("noise", "%", 100.0),  # change of the force noise, relative to the file
-    ("lag of motion", "ms", 1e3),  # delay of the measured position behind that of the file
+    ("stiffness", "%", 100.0),  # relative change of the force in phase with the depth
+    ("apparent damping", "N s/m", 1.0),  # force change in phase with the rate: by damping or by force delay
+    ("mean force", "N", 1.0),  # change of the mean force in contact
+    ("restitution", "1", 1.0),  # measured minus predicted restitution, for the same commands
+    ("bias", "N", 1.0),  # change of the mean force reading out of contact
+    ("noise", "%", 100.0),  # relative change of the force noise
+    ("lag of motion", "ms", 1e3),  # delay of the measured position relative to the prediction
 )
 METRIC_NAMES = tuple(name for name, _, _ in METRICS)
 BIAS_INDEX, NOISE_INDEX, LAG_INDEX = (METRIC_NAMES.index(name) for name in ("bias", "noise", "lag of motion"))
-FORCE_METRICS = slice(0, NOISE_INDEX)  # metrics that are sums of forces
-MIN_METRIC_ROWS = 20  # rows that a metric needs
-MAX_NOISE_ROWS = 2000  # rows at rest that determine the noise's colour
-MIN_MODEL_ERROR = 1e-3  # least model error over the largest force or depth
-ONSET_MARGIN_SIGMAS = 3.0  # standard deviations of delays and plane, within which an onset is uncertain
-DEEP_CONTACT_SHARE = 0.1  # share of the greatest depth, beyond which rows are always used
+FORCE_METRICS = slice(0, NOISE_INDEX)  # metrics that are weighted sums of force readings
+MIN_METRIC_ROWS = 20  # minimum number of rows for a metric
+MAX_NOISE_ROWS = 2000  # number of latest rows at rest that determine the autocorrelation of the noise
+MIN_MODEL_ERROR = 1e-3  # minimum error of the predicted readings, relative to the largest force or depth
+ONSET_MARGIN_SIGMAS = 3.0  # standard deviations of delays and surface position within which an onset may lie
+DEEP_CONTACT_SHARE = 0.1  # share of the largest depth; deeper rows are used in any case
 
 
 @dataclass(frozen=True)
 class MetricWeights:
-    """Weights of one contact's readings in its metrics."""
+    """Weights with which the readings of one contact add up to its metrics."""
 
-    force: np.ndarray  # (metrics except noise and lag, rows); NaN in the row of a missing metric
-    position: np.ndarray  # (rows,)
+    # (metrics, rows), weights of the force readings in the first five metrics; NaN: no metric
+    force: np.ndarray
+    position: np.ndarray  # (rows,), weights of the position readings in the lag of motion
     rest: np.ndarray  # bool, (rows,), rows out of contact
 
     def shift(self, force: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the change of the metrics for changes of the force [N] and position readings [m]."""
+        """Return the change of each metric due to changes of the force [N] and position [m] readings."""
         result = np.zeros(len(METRIC_NAMES))
         result[FORCE_METRICS] = self.force @ force
         result[LAG_INDEX] = self.position @ position
@@ -54,13 +55,13 @@ class MetricWeights:
 
 @dataclass(frozen=True)
 class ForceSensorSpec:
-    """Noise of the force sensor in the file, and its limits."""
+    """Properties of the force sensor according to the mechanism file."""
 
-    std: float  # N
+    std: float  # N, standard deviation of the noise
     quantum: float  # N
     dead_zone: float  # N
     range: float  # N
-    time_constant: float  # s
+    time_constant: float  # s, first-order lag
 
 
 def compute_weights(
@@ -72,9 +73,16 @@ def compute_weights(
     mass: float,
     period: float,
 ) -> MetricWeights:
-    """Return the weights of a run's readings.
+    """Return the weights of the readings of a run in its metrics.
 
-    `slack` holds the standard deviations of the delays [s] and of the surface [m].
+    Args:
+        run: The run.
+        expected: Predicted readings of several runs.
+        lane: Index of the run in the predicted readings.
+        sensors: Properties of the force sensor.
+        slack: Standard deviations of the delays [s] and of the surface position [m].
+        mass: Equivalent mass of the numerical model [kg].
+        period: Control period [s].
     """
     rows = len(run.tick)
     parts = (expected.depth, expected.touching, expected.rate, expected.elastic, expected.force)
@@ -82,7 +90,7 @@ def compute_weights(
     measured = np.asarray(run.force_measured, float)
     read = run.valid & np.isfinite(measured)
     speed = np.max(np.abs(np.gradient(depth, period)))
-    # A lag extends the onset by some of its time constants.
+    # The lag of the sensor extends the onset by some time constants.
     margin = (
         ONSET_MARGIN_SIGMAS * (slack[0] + sensors.time_constant) + period
     ) * speed + ONSET_MARGIN_SIGMAS * slack[1]
@@ -102,15 +110,16 @@ def compute_weights(
         table[:2, used] = np.linalg.pinv((columns / size[:, None]).T) / size[:, None]
         table[2, used] = 1.0 / used.sum()
         table[3] = _compute_restitution_weights(run, used, mass, period)
-        # Subtract the mean out of contact.
+        # All metrics in contact refer to the mean reading out of contact.
         table[:BIAS_INDEX] -= table[:BIAS_INDEX].sum(axis=1, keepdims=True) * tare
     return MetricWeights(table, _compute_delay_weights(run, expected, lane), rest)
 
 
 def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, period: float) -> np.ndarray:
-    """Return the weights of the restitution.
+    """Return the weights of the force readings in the restitution; NaN if there is no rebound.
 
-    By momentum and energy, an additional force r changes e by -(sum of r v T)/(M v_0 |v_1|).
+    According to the balance of momentum and energy, an additional force r changes e by -(sum of r v T)/(M v_0
+    |v_1|), with the speeds v_0 before and v_1 after the contact.
     """
     x = run.position_desired
     speed = np.gradient(x, period) if run.velocity_desired is None else run.velocity_desired
@@ -121,7 +130,7 @@ def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, 
 
 
 def _compute_delay_weights(run: LoggedRun, expected: PredictedReadings, lane: int) -> np.ndarray:
-    """Return the weights of the position's delay, which are independent of a constant offset."""
+    """Return the weights of the position readings in the lag of motion; a constant offset has no effect."""
     velocity = expected.velocity[: len(run.tick), lane]
     read = run.valid & np.isfinite(run.position_measured)
     varied = np.where(read, velocity - velocity[read].mean(), 0.0)
@@ -131,12 +140,12 @@ def _compute_delay_weights(run: LoggedRun, expected: PredictedReadings, lane: in
 
 @dataclass
 class NoiseColour:
-    """Colour of the noise, from the rows at rest of all contacts so far."""
+    """Autocorrelation of a sensor's noise, estimated from readings of the contacts so far."""
 
-    rows: np.ndarray
+    rows: np.ndarray  # latest readings, without their mean
 
     def factor(self, more: np.ndarray) -> float:
-        """Add rows, and return the standard deviation of a mean over that of a mean of white noise."""
+        """Add readings, and return by which factor the autocorrelation increases the error of a mean."""
         self.rows = np.concatenate([self.rows, more - more.mean()])[-MAX_NOISE_ROWS:]
         filter_ = fit_whitening_filter(self.rows)
         return float(np.sqrt(compute_whitened_share(filter_)) / abs(np.sum(filter_)))
@@ -148,22 +157,28 @@ def compute_metrics(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the metrics of a contact and their covariance due to noise; NaN marks a missing metric.
 
-    `colours` are those of force and position; they are updated.
+    Args:
+        run: Run with the contact.
+        expected: Predicted readings of several runs.
+        lane: Index of the run in the predicted readings.
+        weights: Weights of the readings in the metrics.
+        sensors: Properties of the force sensor.
+        colours: Autocorrelations of the force and position noise, which are updated with this run.
     """
     rows = len(run.tick)
     parts = (expected.force, expected.position, expected.velocity, expected.depth)
     force, position, velocity, depth = (part[:rows, lane] for part in parts)
     force_error = np.nan_to_num(np.asarray(run.force_measured, float) - force)
-    late = np.nan_to_num(run.position_measured - position)
-    value = weights.shift(force_error, late)
-    value[NOISE_INDEX], unsure, std = _compute_noise_metric(force_error[weights.rest], sensors, colours[0])
-    left = late - late.mean() + value[LAG_INDEX] * (velocity - velocity.mean())
-    scatter = float(left.std()) * colours[1].factor(left) if np.isfinite(value[LAG_INDEX]) else np.nan
+    position_error = np.nan_to_num(run.position_measured - position)
+    value = weights.shift(force_error, position_error)
+    value[NOISE_INDEX], noise_std, std = _compute_noise_metric(force_error[weights.rest], sensors, colours[0])
+    residual = position_error - position_error.mean() + value[LAG_INDEX] * (velocity - velocity.mean())
+    scatter = float(residual.std()) * colours[1].factor(residual) if np.isfinite(value[LAG_INDEX]) else np.nan
     covariance = np.zeros((len(METRIC_NAMES), len(METRIC_NAMES)))
     covariance[FORCE_METRICS, FORCE_METRICS] = (
         max(std, MIN_MODEL_ERROR * np.abs(force).max()) ** 2 * weights.force @ weights.force.T
     )
-    covariance[NOISE_INDEX, NOISE_INDEX] = unsure**2
+    covariance[NOISE_INDEX, NOISE_INDEX] = noise_std**2
     covariance[LAG_INDEX, LAG_INDEX] = (
         max(scatter, MIN_MODEL_ERROR * depth.max()) ** 2 * weights.position @ weights.position
     )
@@ -173,7 +188,10 @@ def compute_metrics(
 def _compute_noise_metric(
     rest: np.ndarray, sensors: ForceSensorSpec, colour: NoiseColour
 ) -> tuple[float, float, float]:
-    """Return the metric of the force noise, its standard deviation, and the noise level [N] for sums."""
+    """Return the noise metric, its standard deviation, and the noise level [N] for weighted sums.
+
+    The noise level includes the effect of the autocorrelation.
+    """
     stated = float(np.hypot(sensors.std, sensors.quantum / np.sqrt(12.0)))
     if len(rest) < MIN_METRIC_ROWS:
         return np.nan, np.nan, stated

@@ -1,4 +1,4 @@
-"""Monitor of a rig, contact by contact: detection of deviations from the mechanism file, and their start."""
+"""Monitor of a rig: detects when the contacts begin to deviate from the mechanism file."""
 
 from __future__ import annotations
 
@@ -29,39 +29,62 @@ from tuning.identification.monitor.predicted_readings import (
 from tuning.identification.monitor.uncertain_parameters import UncertainParameter, list_uncertain_parameters
 from tuning.identification.records import Campaign, CampaignTiming, LoggedRun
 
-RUNS_PER_BATCH = 64  # runs that are computed together
+RUNS_PER_BATCH = 64  # number of runs that are computed together
 SENSOR_DELAY_KEYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
 ContactState = Literal["good", "watch", "bad"]
 
 
 @dataclass(frozen=True)
 class ContactDeviation:
-    """Metrics of one contact relative to the file, in SI units and the order of `METRIC_NAMES`."""
+    """Metrics of one contact and their deviation from the prediction.
 
-    source: str  # name of its log
-    value: np.ndarray  # 0 if the file is correct, NaN if the log does not determine it
-    predicted_std: np.ndarray  # standard deviation of the prediction
-    z: np.ndarray  # (value - prediction) over predicted_std
+    Arrays contain one value per metric, in SI units and in the order of `METRIC_NAMES`.
+
+    Attributes:
+        source: Name of the log file.
+        value: Metrics relative to the mechanism file; NaN if the log does not determine a metric.
+        predicted_std: Predicted standard deviation of each metric.
+        z: Normalized deviation: (value - predicted value) / `predicted_std`.
+        state: "good"; "watch" after a change that the file's uncertainty covers; "bad" after a larger change.
+    """
+
+    source: str
+    value: np.ndarray
+    predicted_std: np.ndarray
+    z: np.ndarray
     state: ContactState
 
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of one metric, averaged over the contacts since the change."""
+    """Change of one metric that raised an alarm, averaged over the contacts since the change.
+
+    Attributes:
+        name: Name of the metric.
+        value: Mean of the metric relative to the mechanism file, in SI units.
+        std: Standard deviation of this mean due to noise.
+    """
 
     name: str
-    value: float  # relative to the file, in SI units
-    std: float  # due to the noise of these contacts
+    value: float
+    std: float
 
 
 @dataclass(frozen=True)
 class MonitorResult:
-    """Result of monitoring a log."""
+    """Result of monitoring the contacts of a campaign.
+
+    Attributes:
+        contacts: Metrics of each contact.
+        alarm: Index of the contact that raised the alarm, or None.
+        since: Index of the contact at which the change probably began, or None.
+        changes: Metrics that raised an alarm, the most significant metric first.
+    """
 
     contacts: tuple[ContactDeviation, ...]
-    alarm: int | None  # index of the contact that raised the alarm
-    since: int | None  # index of the contact with which the change probably began
-    changes: tuple[MetricChange, ...]  # metrics that raised an alarm, the most significant first
+    alarm: int | None
+    since: int | None
+    changes: tuple[MetricChange, ...]
 
     @property
     def state(self) -> ContactState:
@@ -71,12 +94,12 @@ class MonitorResult:
     def verdict(self) -> str:
         number = len(self.contacts)
         if self.alarm is None or self.since is None:
-            return f"Good: the rig is that of the file in all of {number} contacts"
+            return f"Good: the rig agrees with the file in all of {number} contacts"
         causes = ", ".join(_describe_change(change) for change in self.changes)
         where = f"since contact {self.since + 1} of {number} ({self.contacts[self.since].source}): {causes}"
         if self.state == "watch":
             return f"Watch: {where}; the file's uncertainty covers it: identify again when convenient"
-        return f"Bad: {where}; beyond the file's uncertainty: gains tuned on it are no longer vouched for"
+        return f"Bad: {where}; beyond the file's uncertainty: do not rely on gains tuned with it"
 
 
 def _describe_change(change: MetricChange) -> str:
@@ -86,10 +109,14 @@ def _describe_change(change: MetricChange) -> str:
 
 
 def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
-    """Compare the contacts of a campaign, in order, with a mechanism.
+    """Compare the contacts of a campaign with a mechanism and detect changes of the rig.
+
+    Args:
+        campaign: Runs in the order of their contacts.
+        mechanism: Mechanism of the rig, with its uncertainty.
 
     Raises:
-        InputError: If there is no contact, or the mechanism cannot be compared with a log.
+        InputError: If the logs have no contact, or cannot be compared with the mechanism.
     """
     reject_separate_clocks(campaign.timing)
     runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
@@ -98,13 +125,13 @@ def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
     numbers, correlation = list_uncertain_parameters(mechanism)
     sensor = mechanism.rig.force_sensor
     prediction = MetricFilter(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
-    watch = _MonitorState(prediction)
+    monitor = _MonitorState(prediction)
     for run, features in zip(runs, _compute_run_metrics(runs, mechanism, campaign, numbers), strict=True):
-        watch.add(run.source, *features)
-    if not any(np.isfinite(contact.value[0]) for contact in watch.contacts):
-        text = f"found {mechanism.rig.contact_plane:g} m, which none of the contacts in the logs goes beyond"
-        raise InputError(f"rig.contact_plane: {text}, expected where the hardware touches")
-    return watch.outcome()
+        monitor.add(run.source, *features)
+    if not any(np.isfinite(contact.value[0]) for contact in monitor.contacts):
+        text = f"found {mechanism.rig.contact_plane:g} m, which no contact in the logs exceeds"
+        raise InputError(f"rig.contact_plane: {text}, expected the position at which the hardware touches")
+    return monitor.outcome()
 
 
 def _compute_run_metrics(
@@ -139,7 +166,7 @@ def _predict_with_sensitivities(
     timing: CampaignTiming,
     numbers: Sequence[UncertainParameter],
 ) -> tuple[PredictedReadings, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return predicted readings, and their changes for one standard deviation of each parameter."""
+    """Return the predicted readings, and their changes for an increase of each parameter by its std."""
     slack = max(number.std for number in numbers if number.path in SENSOR_DELAY_KEYS)
     motion, differences = simulate_motion(mechanism, runs, timing, slack), []
     expected = predict_readings(mechanism, runs, motion)
@@ -156,28 +183,29 @@ def _predict_with_sensitivities(
 
 
 class _MonitorState:
-    """State of the monitor after the contacts so far; the prediction is not updated after an alarm."""
+    """State of the monitor after the contacts so far; an alarm ends the updates of the prediction."""
 
     def __init__(self, prediction: MetricFilter):
         self.prediction = prediction
-        self.seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.measurements: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self.contacts: list[ContactDeviation] = []
         self.alarm: int | None = None
         self.since = 0
-        self.beyond = np.zeros(len(METRIC_NAMES), bool)  # metrics that raised an alarm
+        self.alarms = np.zeros(len(METRIC_NAMES), bool)  # metrics that raised an alarm
 
     def add(self, source: str, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> None:
         deviation, std = self.prediction.deviation(value, slopes, noise)
-        self.seen.append((value, slopes, noise))
+        self.measurements.append((value, slopes, noise))
         self.contacts.append(ContactDeviation(source, value, std, deviation / std, "good"))
-        likelier, began = detect_changes(np.array([contact.z for contact in self.contacts]))
-        self.beyond |= likelier > ALARM_THRESHOLD
-        if not self.beyond.any():
+        ratio, first_contact = detect_changes(np.array([contact.z for contact in self.contacts]))
+        self.alarms |= ratio > ALARM_THRESHOLD
+        if not self.alarms.any():
             self.prediction.learn(value, slopes, noise)
             return
         if self.alarm is None:
-            # Keep the first estimate: later contacts of a drift would give the time of its steepest part.
-            self.alarm, self.since = len(self.contacts) - 1, int(began[np.argmax(likelier)])
+            # Keep the first estimate: during a drift, a later estimate would be the time of the steepest
+            # change.
+            self.alarm, self.since = len(self.contacts) - 1, int(first_contact[np.argmax(ratio)])
         covered = self.prediction.covers(*self._mean())
         self.contacts[-1] = replace(self.contacts[-1], state="watch" if covered else "bad")
 
@@ -186,13 +214,15 @@ class _MonitorState:
             return MonitorResult(tuple(self.contacts), None, None, ())
         value, _, noise = self._mean()
         std = np.sqrt(np.diag(noise))
-        order = sorted(np.flatnonzero(self.beyond), key=lambda i: -abs(value[i] / std[i]))
+        order = sorted(np.flatnonzero(self.alarms), key=lambda i: -abs(value[i] / std[i]))
         result = tuple(MetricChange(METRIC_NAMES[i], float(value[i]), float(std[i])) for i in order)
         return MonitorResult(tuple(self.contacts), self.alarm, self.since, result)
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return metrics, slopes and covariance, averaged over the contacts since the change."""
-        values, slopes, noises = (np.array(part) for part in zip(*self.seen[self.since :], strict=True))
+        """Return metrics, derivatives and covariance, averaged over the contacts since the change."""
+        values, slopes, noises = (
+            np.array(part) for part in zip(*self.measurements[self.since :], strict=True)
+        )
         number = np.isfinite(values).sum(axis=0)
         counted = np.maximum(number, 1)
         value = np.where(number > 0, np.nansum(values, axis=0) / counted, np.nan)

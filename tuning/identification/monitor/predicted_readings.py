@@ -1,4 +1,4 @@
-"""Predicted readings of a mechanism file's rig under the logged commands; nothing is fitted here."""
+"""Sensor readings that a mechanism file predicts for the logged commands, without any fit."""
 
 from __future__ import annotations
 
@@ -25,33 +25,41 @@ from tuning.identification.sensor_filter import compute_lag_weights
 
 @dataclass(frozen=True)
 class PredictedReadings:
-    """Predicted readings without noise, (rows, lanes); shorter runs are padded."""
+    """Predicted sensor readings of several runs, without noise.
 
-    force: np.ndarray  # N, including bias and dead zone
-    elastic: np.ndarray  # N, part that does not depend on the rate
-    rate: np.ndarray  # m/s, rate of the depth; 0 out of contact
-    touching: np.ndarray  # 1 in contact, 0 out of contact; values between with a sensor lag
-    depth: np.ndarray  # m, at the time of the force
-    position: np.ndarray  # m
-    velocity: np.ndarray  # m/s, rate of the position that is read
+    Arrays have the shape (rows, lanes), with one run per lane; shorter runs are padded.
+    """
+
+    force: np.ndarray  # N, force reading, including bias and dead zone
+    elastic: np.ndarray  # N, part of the force that does not depend on the rate of the depth
+    rate: np.ndarray  # m/s, rate of the depth as the force sensor experiences it; 0 out of contact
+    # 1 in contact, 0 out of contact; between 0 and 1 near an edge if the sensor has a lag
+    touching: np.ndarray
+    depth: np.ndarray  # m, penetration at the time of the force reading; negative out of contact
+    position: np.ndarray  # m, position reading
+    velocity: np.ndarray  # m/s, rate of the position reading
 
 
 def simulate_motion(
     mechanism: Mechanism, runs: Sequence[LoggedRun], timing: CampaignTiming, slack: float
 ) -> MotionResponse:
-    """Return the response of the rig's motion simulator to the commands of runs.
+    """Compute the response of the rig's motion simulator to the logged commands.
 
-    `slack` [s] is the amount by which the sensors' delays may exceed the file's.
+    Args:
+        mechanism: Mechanism with the motion simulator.
+        runs: Runs, one per lane.
+        timing: Timing of commands and readings.
+        slack: Time [s] by which a sensor delay may later exceed that of the mechanism.
 
     Raises:
-        InputError: If G has direct feedthrough.
+        InputError: If the transfer function G(s) of the motion simulator has direct feedthrough.
     """
     rig, model = mechanism.rig, make_motion_model(mechanism)
     above, below = model.fraction
     if len(above) == len(below) > 1:
-        allowed = "fewer coefficients than in the denominator"
-        raise InputError(f"rig.simulator.numerator: found {len(above)} coefficients, expected {allowed}")
-    # The force does not depend on the position sensor's delay.
+        expected = "fewer coefficients than in the denominator"
+        raise InputError(f"rig.simulator.numerator: found {len(above)} coefficients, expected {expected}")
+    # Exclude the position sensor's delay, which has no effect on the force.
     model = MotionModel(model.structure, np.append(model.parameters[:-1], rig.simulator.delay))
     longest = max(rig.force_sensor.delay, rig.position_sensor.delay) + slack + timing.control_period
     return MotionResponse(model, runs, timing, longest)
@@ -60,10 +68,15 @@ def simulate_motion(
 def predict_readings(
     mechanism: Mechanism, runs: Sequence[LoggedRun], motion: MotionResponse
 ) -> PredictedReadings:
-    """Return the predicted readings of runs with at most one contact each.
+    """Predict the sensor readings of runs with at most one contact each.
+
+    Args:
+        mechanism: Mechanism with the contact law and the sensors.
+        runs: Runs, one per lane.
+        motion: Motion of the mechanism in these runs.
 
     Raises:
-        InputError: If the contact law cannot be compared with a log.
+        InputError: If the contact law is not supported, or there are two surfaces.
     """
     rig, sensor, period = mechanism.rig, mechanism.rig.force_sensor, motion.period
     law = make_regression_law(mechanism.contact)
@@ -73,7 +86,7 @@ def predict_readings(
     table = np.array(
         [get_regression_coefficients(mechanism.contact, find_contact_entry(run)) for run in runs]
     ).T
-    # A lag integrates the force from row to row.
+    # A sensor lag integrates the force, which is therefore also computed half a period before each row.
     parts = (0.0,) if sensor.time_constant == 0.0 else (0.0, 0.5)
     moved = [motion.at(sensor.delay + part * period) for part in parts]
     columns = [_compute_force_columns(law, table, x - rig.contact_plane, v) for x, v in moved]
@@ -87,14 +100,21 @@ def predict_readings(
 
 
 def find_contact_entry(run: LoggedRun) -> int:
-    """Return the index in the contact lists for a run's contact."""
+    """Return the index into the contact lists for the contact of a run."""
     if run.contact_index is None or run.force_measured is None:
         return 0
     return max(int(run.contact_index[np.argmax(np.abs(np.nan_to_num(run.force_measured)))]), 0)
 
 
 def _compute_force_columns(law: Law, table: np.ndarray, depth: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return force, force at zero rate, rate, and a contact flag; all are 0 out of contact."""
+    """Return the force, the force at zero rate, the rate, and a contact flag; all are 0 out of contact.
+
+    Args:
+        law: Contact law.
+        table: Coefficients of the law, shape (coefficients, lanes).
+        depth: Penetration [m], shape (rows, lanes).
+        rate: Rate of the penetration [m/s], shape (rows, lanes).
+    """
     inside = np.maximum(depth, 0.0)
 
     def force(v):
@@ -106,7 +126,13 @@ def _compute_force_columns(law: Law, table: np.ndarray, depth: np.ndarray, rate:
 
 
 def _apply_sensor_lag(columns: list[np.ndarray], period: float, time_constant: float) -> np.ndarray:
-    """Return the columns after a first-order lag, from values at every row and half a period earlier."""
+    """Apply the first-order lag of the force sensor to signals.
+
+    Args:
+        columns: Signals at every row and, with a lag, half a period before every row.
+        period: Control period [s].
+        time_constant: Time constant of the lag [s]; 0 for none.
+    """
     if time_constant == 0.0:
         return columns[0]
     pole, (now, half, last) = compute_lag_weights(period / time_constant)

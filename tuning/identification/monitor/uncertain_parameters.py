@@ -1,4 +1,4 @@
-"""Uncertainty of a mechanism file's parameters: standard deviations, correlation, and steps."""
+"""Uncertain parameters of a mechanism file, with their standard deviations and correlation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import draw
 
 UNCERTAINTY_DRAWS = 4096  # number of draws for standard deviations and correlations
+# Prefixes of the parameters that affect the sensor readings.
 READING_PREFIXES = (
     "contact.",
     "rig.simulator.",
@@ -18,17 +19,17 @@ READING_PREFIXES = (
     "rig.position_sensor.",
     "rig.contact_plane",
 )
-# Least standard deviations of a clock [s] and of a force sensor's scale [1].
+# Minimum standard deviations: of a delay [s], because of the clock, and of the force sensor's scale [1].
 MIN_DELAY_STD, MIN_SCALE_STD = 2e-5, 1e-3
 DELAY_KEYS, STIFFNESS_KEY = ("rig.simulator.delay", "rig.force_sensor.delay"), "contact.stiffness"
 
 
 class UncertainParameter(NamedTuple):
-    """Parameter of a mechanism file, or one entry of a list, with its standard deviation."""
+    """Uncertain parameter of a mechanism file, or entry of a list parameter, with its standard deviation."""
 
-    path: str
-    entry: tuple[int, ...] | None  # index in a list; None: all entries together
-    std: float  # in the key's unit; for a whole list, that of its first entry
+    path: str  # dotted key
+    entry: tuple[int, ...] | None  # index of the list entry; None: a scalar, or all entries together
+    std: float  # in the key's unit; for all entries together, the standard deviation of the first entry
 
     def step_parameter(self, mechanism: Mechanism) -> Mechanism:
         """Return the mechanism with this parameter increased by one standard deviation."""
@@ -42,17 +43,17 @@ class UncertainParameter(NamedTuple):
 
 
 def list_uncertain_parameters(mechanism: Mechanism) -> tuple[list[UncertainParameter], np.ndarray]:
-    """Return the parameters that affect the readings, and their correlation.
+    """Return the uncertain parameters that affect the sensor readings, and their correlation matrix.
 
-    These are the entries of `[uncertainty]`, and in any case the delays and the stiffness.
+    These are entries of the file's `[uncertainty]`. The delays and the stiffness are always included.
     """
     result, columns = [], []
     drawn = draw(mechanism, UNCERTAINTY_DRAWS, 0)
     for path in [name for name in mechanism.uncertainty if name.startswith(READING_PREFIXES)]:
         values = drawn[path].reshape(UNCERTAINTY_DRAWS, -1)
         independent = mechanism.uncertainty[path].independent
-        places = [*np.ndindex(drawn[path].shape[1:])] if independent else [None]
-        for index, column in zip(places, values.T, strict=False):
+        indices = [*np.ndindex(drawn[path].shape[1:])] if independent else [None]
+        for index, column in zip(indices, values.T, strict=False):
             if column.std() > 0.0:
                 result.append(
                     UncertainParameter(path, index, max(float(column.std()), get_min_std(mechanism, path)))
@@ -69,19 +70,19 @@ def list_uncertain_parameters(mechanism: Mechanism) -> tuple[list[UncertainParam
 
 
 def get_min_std(mechanism: Mechanism, path: str) -> float:
-    """Return the least standard deviation of a parameter."""
+    """Return the minimum standard deviation that is assumed for a parameter."""
     if path in DELAY_KEYS:
         return MIN_DELAY_STD
     return MIN_SCALE_STD * float(np.ravel(value_at(mechanism, path))[0]) if path == STIFFNESS_KEY else 0.0
 
 
 def _step_value(value: Any, entry: tuple[int, ...] | None, step: float) -> Any:
-    """Return a scalar or list after a step of one entry, or of all entries if `entry` is None."""
+    """Return a scalar or list after an increase of one entry, or of all entries if `entry` is None."""
     table = np.array(value, float)
     if entry is not None and table.ndim:
         table[entry] += step
     elif table.ndim and np.ptp(table) > 0.0:
-        table *= 1.0 + step / table.flat[0]  # Draws scale a list in the same way.
+        table *= 1.0 + step / table.flat[0]  # As in `draw`, all entries change by the same factor.
     else:
         table += step
     return table.tolist()
