@@ -142,7 +142,7 @@ def test_tune_continues_after_unusable_files(jaxhil, tmp_path):
     assert "nowhere.toml" in missing and "name" in twice
     # Problems are reported when they occur, and again at the end.
     assert ran.err.count(missing) == ran.err.count(twice) == 2
-    assert ran.err.endswith(f"jaxhil: 2 could not be done:\njaxhil: {missing}\njaxhil: {twice}\n")
+    assert ran.err.endswith(f"jaxhil: 2 problems:\njaxhil: {missing}\njaxhil: {twice}\n")
     assert [entry["mechanism"] for entry in ran.document["mechanisms"]] == ["rig-300kg"]
     assert (tmp_path / "rig-300kg" / "gains.json").exists()
 
@@ -223,13 +223,18 @@ def test_tune_pareto_writes_gain_file_for_each_point(jaxhil, tmp_path):
     assert front["plot"] == str(folder / "pareto.png") and (folder / "pareto.png").stat().st_size > 0
     assert jaxhil("verify", paths[2], "--scenarios", "1").code == 0
     table = jaxhil(*arguments, "--pareto", "3", "--limit", "1")
-    for word in ("noise weight", "literature's rule", "front", "Quietest within 1: point", "pareto.png"):
+    for word in ("noise weight", "literature's rule", "front", "Least noise within 1: point", "pareto.png"):
         assert word in table.out
 
 
 def test_tune_rejects_impossible_pareto_option(jaxhil, tmp_path):
     arguments = ["tune", "rig-300kg", "-o", tmp_path / "out"]
-    refused(jaxhil(*arguments, "--pareto", "8", "--compensator", "none"), "--pareto", "none", "no trade-off")
+    refused(
+        jaxhil(*arguments, "--pareto", "8", "--compensator", "none"),
+        "--pareto",
+        "none",
+        "does not depend on its gains",
+    )
     refused(jaxhil(*arguments, "--pareto", "1"), "--pareto", "0 or an integer >= 2")
     refused(jaxhil(*arguments, "--pareto", "-3"), "--pareto", "-3")
     assert not (tmp_path / "out").exists()

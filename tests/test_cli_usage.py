@@ -50,10 +50,13 @@ def test_cli_exits_with_130_on_interrupt(jaxhil, monkeypatch):
         (["simulate", "--gains", "nowhere.json"], ["nowhere.json"]),
         (
             ["simulate", "--compensator", "phase_lead", "--setting", "sharp"],
-            ["sharp", "none, phase_lead has"],
+            ["sharp", "none: phase_lead has"],
         ),
-        (["simulate", "--gains", "x.json", "--setting", "sharp"], ["--setting", "none beside a gain file"]),
-        (["tune", "--setting", "sharp"], ["--setting", "sharp", "none, response_error has"]),
+        (
+            ["simulate", "--gains", "x.json", "--setting", "sharp"],
+            ["--setting", "none together with --gains"],
+        ),
+        (["tune", "--setting", "sharp"], ["--setting", "sharp", "none: response_error has"]),
         (["simulate", "--limit", "nan"], ["--limit"]),
         (["simulate", "--plot=plot.doc"], ["--plot", "plot.doc", ".png"]),
         (["simulate", "--seed", "-1"], ["--seed", "-1"]),
@@ -161,7 +164,7 @@ def test_init_command_overwrites_nothing(jaxhil, tmp_path, taken):
     path = tmp_path / "rig.toml"
     taken(path)
     before = os.lstat(path)
-    refused(jaxhil("init", "-o", path), str(path), "nothing is overwritten")
+    refused(jaxhil("init", "-o", path), str(path), "no file is overwritten")
     assert os.lstat(path) == before and list(tmp_path.iterdir()) == [path]
 
 

@@ -27,7 +27,7 @@ def fit():
 def test_identify_rejects_bootstrap_options_without_bootstrap(jaxhil, asked):
     run = jaxhil("identify", "x.csv", *asked)
     assert run.code == 2
-    assert f"{asked[0]}: found no --bootstrap, expected beside one" in run.err
+    assert f"{asked[0]}: found no --bootstrap, expected --bootstrap" in run.err
 
 
 @pytest.mark.slow

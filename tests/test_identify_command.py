@@ -64,7 +64,7 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     # The file explains its own logs; a file of another rig does not.
     mechanism_file, map = tmp_path / "mechanism.toml", ("--map", drafted(jaxhil, day))
     ran = jaxhil("identify", "--check", *logs(day), mechanism_file, *map)
-    assert ran.code == 0 and "What identified leaves of runs: 9 contact, 1 free, 1 rest" in ran.out
+    assert ran.code == 0 and "What identified does not explain in runs: 9 contact, 1 free, 1 rest" in ran.out
     mechanism_file.write_text(mechanism_file.read_text().replace("stiffness = [1", "stiffness = [2"))
     ran = jaxhil("identify", "--check", *logs(day), *map, "--prior", mechanism_file, "--json")
     assert ran.code == 1 and ran.document["estimates"] == [] and "contact law" in ran.document["reason"]
@@ -72,7 +72,7 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     # A file that this program did not write is not overwritten.
     (tmp_path / "identification.json").unlink()
     refused = jaxhil(*command)
-    assert refused.code == 2 and "mechanism.toml: found a file of something else" in refused.err
+    assert refused.code == 2 and "mechanism.toml: found a file that jaxhil did not write" in refused.err
 
 
 def test_identify_command_verdict_is_bad_for_wrong_mapping(jaxhil, day, tmp_path):
@@ -117,7 +117,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
         (["LOGS", "--fix", "contact.damping=[650, nan]"], ["found [650, nan], expected a number, or a list"]),
         (["--check", "LOG"], ["--check: found no mechanism"]),
         (["--check", "LOG", "rig-300"], ["did you mean rig-300kg"]),
-        (["--check", "LOG", "rig-300kg", "--law", "linear"], ["--check: found --law beside it"]),
+        (["--check", "LOG", "rig-300kg", "--law", "linear"], ["--law: found together with --check"]),
         (["--design"], ["--design: found 0 mechanisms"]),
         (["--design", "rig-300"], ["did you mean rig-300kg"]),
         (["--design", "rig-300kg", "--stroke", "0"], ["--stroke: found 0 m, expected a number > 0"]),

@@ -36,7 +36,7 @@ def test_bode_plot_shows_response_of_the_rig(identified):
     true = np.exp(-0.0043 * s) / (1.0 + 2.0 * 0.8 * s / w + (s / w) ** 2) * np.sinc(1e-3 * frequency) ** 2
     np.testing.assert_allclose(10.0 ** (measured / 20.0), np.abs(true), rtol=0.02)
     np.testing.assert_allclose(line(phase, "model")[1], np.degrees(np.unwrap(np.angle(true))), atol=1.0)
-    share, chance = line(off, "measured off the model")[1], line(off, "95 % of noise")[1]
+    share, chance = line(off, "|measured / model - 1|")[1], line(off, "95 % of noise")[1]
     assert 0.85 < np.mean(share < chance) <= 1.0 and line(coherence, "coherence")[1].min() > 0.99
     assert {axes.get_xlabel() for axes in (off, coherence)} == {"frequency [Hz]"}
 

@@ -42,15 +42,15 @@ def refused(ran, *words):
 
 
 def test_results_do_not_replace_third_party_files(jaxhil, thesis, untouched):
-    refused(jaxhil(*COMPARE, "-o", thesis), "errors.png: found a file of something else")
+    refused(jaxhil(*COMPARE, "-o", thesis), "errors.png: found a file that jaxhil did not write")
     tune = ("tune", "rig-300kg", "-o", thesis.parent, "--set", "name='thesis'")
-    refused(jaxhil(*tune), "thesis/errors.png: found a file of something else")
+    refused(jaxhil(*tune), "thesis/errors.png: found a file that jaxhil did not write")
 
 
 def test_overview_does_not_replace_a_third_party_picture(jaxhil, thesis):
     (thesis / "overview.png").write_text("years")
     names = ("rig-300kg", "varying", "layered", "rattling", "claw-350kg")
-    refused(jaxhil("tune", *names, "-o", thesis), "overview.png: found a file of something else")
+    refused(jaxhil("tune", *names, "-o", thesis), "overview.png: found a file that jaxhil did not write")
     assert (thesis / "overview.png").read_text() == "years"
 
 
@@ -58,9 +58,9 @@ def test_overview_does_not_replace_a_third_party_picture(jaxhil, thesis):
 def test_third_party_document_is_not_replaced(jaxhil, tmp_path, content):
     for name in ("compare.json", "gains.json"):
         (tmp_path / name).write_text(content)
-    refused(jaxhil(*COMPARE, "-o", tmp_path), "compare.json: found a file of something else")
+    refused(jaxhil(*COMPARE, "-o", tmp_path), "compare.json: found a file that jaxhil did not write")
     tune = ("tune", "rig-300kg", "-o", tmp_path.parent, "--set", f"name='{tmp_path.name}'")
-    refused(jaxhil(*tune), "gains.json: found a file of something else")
+    refused(jaxhil(*tune), "gains.json: found a file that jaxhil did not write")
     assert [(tmp_path / name).read_text() for name in ("compare.json", "gains.json")] == [content] * 2
 
 
@@ -111,7 +111,7 @@ def test_results_of_another_mechanism_are_not_replaced(jaxhil, tmp_path, kind):
     before = path.read_bytes()
     file = named(tmp_path / "rig.toml", "a_b")
     ran = jaxhil(command, file, *options, "-o", tmp_path / "out")
-    refused(ran, f"{document}: found results of mechanism 'a b', expected those of 'a_b'")
+    refused(ran, f"{document}: found results of mechanism 'a b', expected results of 'a_b'")
     assert path.read_bytes() == before
 
 
@@ -119,7 +119,7 @@ def test_identified_values_of_another_mechanism_are_not_replaced(jaxhil, tmp_pat
     content = {"estimates": [], "mechanism": {"name": "a b"}}
     (tmp_path / "identification.json").write_text(json.dumps(content))
     ran = jaxhil("identify", "none.csv", "--prior", "rig-300kg", "-o", tmp_path)
-    refused(ran, "found results of mechanism 'a b', expected those of 'rig-300kg'")
+    refused(ran, "found results of mechanism 'a b', expected results of 'rig-300kg'")
 
 
 @pytest.mark.parametrize("names", [("a b", "a_b"), ("Rig", "rig"), ("..", "..."), ("é", "e\u0301")])

@@ -138,7 +138,7 @@ def test_front_plot_has_units_numbers_and_the_literature():
         "noise" in axes.get_xlabel() and "[1]" in axes.get_xlabel() and "rms of e - e*" in axes.get_ylabel()
     )
     assert labels(axes) == [
-        *("front", "beaten by another", "literature's rule", "tuned", "limit 0.015"),
+        *("front", "dominated by another point", "literature's rule", "tuned", "limit 0.015"),
     ]
     # Points with the same result share a place.
     assert {text.get_text(): text.xy for text in axes.texts} == {

@@ -113,10 +113,10 @@ def test_report_verdict_is_that_of_the_requirements(put):
 @pytest.mark.parametrize(
     ("document", "said"),
     [
-        (identified() | {"effect": 0.0}, "it was changed"),
+        (identified() | {"effect": 0.0}, "the file was changed"),
         (identified(estimates=[{"key": 1}]), "Expected `str`, got `int` - at `$.estimates[0].key`"),
         (identified(schema="other/1"), "found the schema 'other/1'"),
-        (signed(mapped() | {"error": [[0.0]]}), "tables that do not fit their axes"),
+        (signed(mapped() | {"error": [[0.0]]}), "a table whose shape differs from its axes"),
         ({"some": "thing"}, "no schema of jaxhil"),
         ([1, 2], "found no JSON object"),
         ('{"schema": NaN}', "found no JSON"),

@@ -155,7 +155,7 @@ def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
     gains = tmp_path / "gains.json"
     write_gain_file(gains, document())
     ran = jaxhil("verify", gains, "--key", key[1])
-    assert (ran.code, ran.out) == (2, "") and "only with a bundle: gain files are not signed" in ran.err
+    assert (ran.code, ran.out) == (2, "") and "no key for a gain file: only bundles are signed" in ran.err
     ran = jaxhil("export", gains, "-o", tmp_path / "new", "--sign", key[1])
     assert (ran.code, ran.out) == (2, "") and not (tmp_path / "new").exists()
 

@@ -308,7 +308,7 @@ def test_bodies_at_rest_do_not_diverge():
 
 def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
     for arguments, reason in (
-        (["simulate", "petals", "--setting", "x"], "--setting: found 'x', expected none: in six axes"),
+        (["simulate", "petals", "--setting", "x"], "--setting: found 'x', expected none: compensators"),
         (
             ["simulate", "petals", "--animate", "x.avi"],
             "--animate: found 'x.avi', expected a name that ends in .gif",
@@ -317,11 +317,11 @@ def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
         (["simulate", "petals", "--reference", "--plot", "x.png"], "expected none beside --reference"),
         (
             ["simulate", "rig-300kg", "--reference"],
-            "--reference: found one axis, expected a mechanism of six",
+            "--reference: found a one-axis mechanism, expected a six-axis mechanism",
         ),
         (
             ["simulate", "rig-300kg", "--animate", "x.gif"],
-            "expected none: there is an animation of six axes only",
+            "expected no animation of a one-axis mechanism",
         ),
     ):
         ran = jaxhil(*arguments)

@@ -108,7 +108,7 @@ def test_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
 
 
 def test_closed_standard_output_is_refused_before_any_work():
-    refused(run("simulate", shell=">&-"), "standard output: found it closed")
+    refused(run("simulate", shell=">&-"), "standard output: found a closed stream")
 
 
 def test_full_standard_output_is_reported_in_one_line():

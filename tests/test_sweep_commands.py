@@ -179,7 +179,7 @@ def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
     no_study(monkeypatch, "compute_error_indices", "estimate_rare_failure")
     second = jaxhil(*again, *STUDIES, "--json")
     assert second[1] == first[1]
-    assert all(f"as kept in {folder / one}\n" in second[2] for one in KEPT)
+    assert all(f"read from {folder / one}\n" in second[2] for one in KEPT)
     # Nothing is saved for another argument.
     with pytest.raises(pytest.fail.Exception):
         jaxhil(*again, "--drivers", "32")
@@ -306,7 +306,9 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
     refused(jaxhil("sweep", gains, *new, "--acceptable", "2"), "--acceptable")
     refused(jaxhil("sweep", gains, *new, "--until-width", "0"), "--until-width: found 0")
     sobol = ["--until-width", "0.1", "--sampling", "sobol"]
-    refused(jaxhil("sweep", gains, *new, *sobol), "--until-width: found with --sampling sobol")
+    refused(
+        jaxhil("sweep", gains, *new, *sobol), "--until-width: found sampling sobol, expected sampling random"
+    )
     refused(jaxhil("sweep", gains, *new, "--drivers", "100"), "--drivers: found 100", "power of two")
     refused(jaxhil("sweep", gains, *new, "--rare", "0.001"), "--rare: found 0.001", "at least --limit")
     refused(jaxhil("sweep", gains, *new, "--rare", "--limit", "inf"), "--rare")

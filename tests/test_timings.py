@@ -10,13 +10,13 @@ def test_timings_count_overlapping_times_once():
     assert timings.union_duration([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
     spans = {
         "importing": [(0.0, 1.0)],
-        "reading kept programs": [(2.0, 2.25)],
+        "reading cached programs": [(2.0, 2.25)],
         "compiling": [(2.0, 3.0)],
         "tracing": [(0.5, 2.0), (1.0, 1.5)],
     }
     assert timings.format_timings(0.0, 10.0, spans) == (
         "10.00 s in all: all else 7.00 s, importing 1.00 s, tracing 1.00 s, compiling 0.75 s, "
-        "reading kept programs 0.25 s"
+        "reading cached programs 0.25 s"
     )
 
 
@@ -25,7 +25,7 @@ def test_timings_record_events_of_jax(capsys):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 9.5)
         jax.monitoring.record_event_duration_secs("/jax/compilation_cache/cache_retrieval_time_sec", 4.24)
     output = capsys.readouterr().err
-    assert "compiling 5." in output and "reading kept programs 4.24 s" in output
+    assert "compiling 5." in output and "reading cached programs 4.24 s" in output
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])

@@ -157,7 +157,10 @@ def test_priority_that_cannot_be_set_is_reported(jaxhil, tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
     ran = jaxhil("rig", gain_file(tmp_path), "--realtime")
-    assert ran.code == 2 and "--realtime: found no such priority (Operation not permitted)" in ran.err
+    assert (
+        ran.code == 2
+        and "--realtime: found no permission for real-time priority (Operation not permitted)" in ran.err
+    )
 
 
 def test_rig_help_has_an_example(jaxhil):

@@ -1,9 +1,8 @@
-"""Tuning, verification and the command line, on top of `jaxhil`.
+"""Functions to tune, evaluate and export compensators, and the command line `jaxhil`.
 
-    import tuning
-
-offers the functions behind the commands of the same names: `tune`, `sweep`, `compare`, `map`, `export`,
-`verify` and `report`. Each function is imported on first use, so that this module does not import jax.
+The functions `tune`, `sweep`, `compare`, `map`, `export`, `verify` and `report` do the work of the commands
+with these names. Each function is imported when it is first used, so that `import tuning` does not import
+jax.
 """
 
 from importlib import import_module
@@ -22,7 +21,7 @@ __all__ = ["compare", "export", "map", "report", "sweep", "tune", "verify"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public function on its first use, and store it in the module."""
+    """Import the public function `name` when it is first used, and store it in the module."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     function = getattr(import_module(f"{__name__}.api.{name}"), name)
@@ -31,5 +30,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the module's names, including the functions that are not imported yet."""
+    """Return the names in this module, including public functions that are not imported yet."""
     return sorted({*globals(), *__all__})

@@ -1,7 +1,8 @@
-"""Command `jaxhil`, also `python -m tuning`: converts arguments to an exit code, without a traceback.
+"""Entry point of the command `jaxhil` and of `python -m tuning`.
 
-Exit codes: 0 for success with a good verdict, 1 for success with a bad verdict, 2 for unusable input or
-output that cannot be written (reported in one line), and 130 for an interrupted command.
+The exit code is 0 if the command succeeds and its verdict, if any, is good; 1 if the verdict is bad; 2 if the
+input is unusable or the output cannot be written; 130 if the command is interrupted. Errors are reported in
+one line, without a traceback.
 """
 
 import gc
@@ -13,37 +14,39 @@ from collections.abc import Sequence
 from jaxhil.errors import InputError, to_one_line
 
 EXIT_GOOD, EXIT_BAD, EXIT_UNUSABLE_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
-TRACEBACK_VARIABLE = (
-    "JAXHIL_TRACEBACK"  # environment variable; if it is set, internal errors are shown with a traceback
-)
+# Environment variable; if it is set, internal errors are shown with a traceback.
+TRACEBACK_VARIABLE = "JAXHIL_TRACEBACK"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    `--help` and wrong arguments raise `SystemExit`. An internal error is raised if the environment variable
-    `JAXHIL_TRACEBACK` is set, and reported in one line otherwise.
+    `--help` and wrong arguments raise `SystemExit`. An internal error is reported in one line; if the
+    environment variable `JAXHIL_TRACEBACK` is set, the error is raised instead.
     """
     for stream in (sys.stdout, sys.stderr):
-        # A character that the terminal's encoding lacks must not make the command fail.
+        # The command must not fail because the terminal's encoding lacks a character.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
         if sys.stdout is None:
-            # The next opened file would get the descriptor of standard output, and the prints.
-            raise InputError("standard output: found it closed, expected it open, or sent to /dev/null")
+            # The next opened file would get the descriptor of standard output, and the printed text with it.
+            raise InputError(
+                "standard output: found a closed stream, expected an open one: to discard the output, "
+                "redirect it to /dev/null"
+            )
         from tuning.cli.parser import parse
 
         code = parse(arguments)()
         sys.stdout.flush()
         return code
     except InputError as error:
-        # An error in an argument of a function is reported as an error in the option of that name.
+        # If the error has a text that names the command's option, that text is printed.
         return _print_error(getattr(error, "option", str(error)), EXIT_UNUSABLE_INPUT)
     except KeyboardInterrupt:
         return _print_error("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # Only output without a verdict, such as a list or the help, ends here.
+        # Only commands without a verdict get here, for example a list or the help.
         _discard_output()
         return EXIT_GOOD
     except OSError as error:
@@ -58,22 +61,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _print_error(str(problem), EXIT_UNUSABLE_INPUT)
         reason = to_one_line(f"{type(error).__name__}: {error}", 200)
         return _print_error(
-            f"internal error: {reason} (set {TRACEBACK_VARIABLE}=1 to see where)", EXIT_UNUSABLE_INPUT
+            f"internal error: {reason} (set {TRACEBACK_VARIABLE}=1 for a traceback)", EXIT_UNUSABLE_INPUT
         )
 
 
 def command() -> None:
-    """Run `main` as a process of its own, which ends with its exit code."""
+    """Run `main`, and end the process with the exit code that `main` returns."""
     _open_closed_streams()
     os.environ["MPLBACKEND"] = "agg"  # plots are files, so a window system must not be used
     code = main()
-    # Without freezing, the last garbage collection takes a fifth of a short command's time.
+    # Frozen objects are not collected at exit, which would take a fifth of a short command's time.
     gc.freeze()
     sys.exit(code)
 
 
 def _open_closed_streams() -> None:
-    """Open the null device for a closed standard input or error, so that no file gets its descriptor."""
+    """Replace a closed standard input or standard error by the null device.
+
+    Otherwise the next opened file would get the descriptor of the closed stream.
+    """
     for number, name, mode in ((0, "stdin", "r"), (2, "stderr", "w")):
         if getattr(sys, name) is None:
             opened = os.open(os.devnull, os.O_RDWR)
@@ -84,7 +90,7 @@ def _open_closed_streams() -> None:
 
 
 def _print_error(text: str, code: int) -> int:
-    """Print a message on standard error, if it is open, and return the exit code."""
+    """Print an error message on standard error, and return `code`; a broken stream is ignored."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:
@@ -93,7 +99,10 @@ def _print_error(text: str, code: int) -> int:
 
 
 def _discard_output() -> None:
-    """Redirect the output streams to the null device, so that the interpreter's last flush does not fail."""
+    """Redirect standard output and standard error to the null device.
+
+    At exit, the interpreter flushes both streams, which would fail for a broken pipe.
+    """
     try:
         null = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):

@@ -1,8 +1,8 @@
 """Writing of gain files (`schema = "jaxhil/gains/1"`), which later commands and the rig read.
 
-A gain file holds a compensator's gains with units and bounds, the mechanism that they were tuned for, the
-range of the scenarios and the metrics reached. `build_document` builds its content, `write_gain_file` writes
-it with a checksum, and `jaxhil.simulation.gain_file.load_gain_file` reads it.
+A gain file contains a compensator's gains with units and bounds, the mechanism for which the gains were
+tuned, the ranges of the scenarios, and the metrics of the gains. `build_document` builds the content,
+`write_gain_file` writes the file with a checksum, and `jaxhil.simulation.gain_file.load_gain_file` reads it.
 """
 
 import json
@@ -43,11 +43,11 @@ def build_document(
     seed: int,
     timings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the content of a gain file with its checksum, as JSON data with null for non-finite numbers.
+    """Return the content of a gain file, with a checksum, as JSON data with null for non-finite numbers.
 
-    Units and bounds come from the registry of compensators. A gain that exceeds a bound by rounding is set to
-    the bound. Raise `InputError` for an unknown compensator, gains of another compensator, or a gain that is
-    not finite or not within its bounds.
+    Units and bounds come from the registry of compensators. A gain that exceeds a bound by a rounding error
+    is set to the bound. Raise `InputError` if the compensator is unknown, if the gains are not those of this
+    compensator, or if a gain is not finite or not within its bounds.
     """
     source = "gains"
     law = find_compensator(compensator, source, axes_of(mechanism)).gains
@@ -71,9 +71,10 @@ def build_document(
 
 
 def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -> None:
-    """Write the document with its checksum; after an error an existing file is unchanged.
+    """Write a gain file with its checksum; if this fails, an existing file remains unchanged.
 
-    Raise `InputError` if the file cannot be written, ValueError or TypeError for values that JSON lacks.
+    Raise `InputError` if the file cannot be written, and ValueError or TypeError if JSON cannot represent a
+    value of the document.
     """
     target = Path(path)
     signed = {**document, "sha256": digest(document)}
@@ -83,34 +84,45 @@ def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -
 
 
 def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, dict[str, Any]]:
-    """Return the range {"low", "high", "unit"} of four quantities over a batch of scenarios.
+    """Return the ranges of contact frequency, delay, approach velocity and force in a batch of scenarios.
 
-    The quantities are contact_frequency sqrt(k/M)/(2 pi) [Hz], delay of force sensor plus motion simulator
-    [s], approach_velocity of the first contact [m/s], and force v sqrt(k M) [N]. k is the stiffness of the
-    undamped linear contact with the same peak force at the same approach speed v: k = (F_peak/v)^2/M, with
-    F_peak from the energy M v^2/2 = integral of F. `scenarios` holds NumPy arrays with one batch axis.
+    Args:
+        mechanism: mechanism of the scenarios.
+        scenarios: scenarios as NumPy arrays with one batch axis.
+
+    Returns:
+        A dictionary {"low", "high", "unit"} for each of four quantities: `contact_frequency`, sqrt(k/M)/(2
+        pi) [Hz]; `delay`, the delay of force sensor plus motion simulator [s]; `approach_velocity`, the speed
+        v before the first contact [m/s]; `force`, the undamped peak force F_peak [N], from the energy M v^2/2
+        = integral of F. k = (F_peak/v)^2/M is the stiffness of the undamped linear contact with this peak
+        force.
     """
     peak = _peak_forces(mechanism, scenarios)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     slots = np.arange(len(peak))[:, None]
-    made = slots < np.asarray(scenarios.contacts)
+    is_used = slots < np.asarray(scenarios.contacts)
     # F_peak = v sqrt(k M), hence sqrt(k/M) = F_peak/(v M).
     frequency = peak / (velocity * mass) / (2 * math.pi)
     delay = np.asarray(scenarios.force_sensor.delay) + np.asarray(scenarios.simulator.delay)
     return {
-        "contact_frequency": _range_with_unit(frequency[made], "Hz"),
+        "contact_frequency": _range_with_unit(frequency[is_used], "Hz"),
         "delay": _range_with_unit(delay, "s"),
         "approach_velocity": _range_with_unit(velocity, "m/s"),
-        "force": _range_with_unit(peak[made], "N"),
+        "force": _range_with_unit(peak[is_used], "N"),
     }
 
 
 def six_axis_validity_envelope(scenarios: Any, outcome: Any) -> dict[str, dict[str, Any]]:
-    """Return the range {"low", "high", "unit"} of four quantities over a batch of six-axis scenarios.
+    """Return the ranges of contact frequency, delay, approach velocity and force of six-axis scenarios.
 
-    The quantities are the contact frequency 1/(2 duration) [Hz] and approach velocity [m/s] at the first
-    touches, the delay of force sensor plus axes [s], and the peak force of the ideal contact [N]. Only the
-    contacts of `outcome` that ended count.
+    Args:
+        scenarios: batch of six-axis scenarios.
+        outcome: outcome of these scenarios; only contacts that ended count.
+
+    Returns:
+        A dictionary {"low", "high", "unit"} for each of four quantities: `contact_frequency`, 1/(2 duration)
+        [Hz]; `approach_velocity` at the first touch [m/s]; `force`, the ideal contact's peak force [N];
+        `delay`, the delay of force sensor plus motion simulator [s].
     """
     ended = outcome.good
     quantities = {
@@ -128,9 +140,10 @@ def six_axis_validity_envelope(scenarios: Any, outcome: Any) -> dict[str, dict[s
 
 
 def to_json_data(value: Any) -> Any:
-    """Convert `value` to JSON data: mappings, lists and numbers, with null for non-finite numbers.
+    """Convert `value` to JSON data, with null for non-finite numbers.
 
-    Accept NumPy and JAX arrays and scalars, and named tuples; raise TypeError for any other type.
+    Accept numbers, texts, mappings, sequences, named tuples, and NumPy and JAX arrays; raise TypeError for
+    any other type.
     """
     if isinstance(value, Mapping):
         return {str(key): to_json_data(entry) for key, entry in value.items()}
@@ -143,12 +156,12 @@ def to_json_data(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if not hasattr(value, "__array__"):
-        raise TypeError(f"a {type(value).__name__} has no place in a gain file")
+        raise TypeError(f"gain file: found a {type(value).__name__}, expected data that JSON can represent")
     return to_json_data(np.asarray(value).tolist())
 
 
 def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """Return the peak force [N] of every contact, (slots, lanes), entered undamped at the approach speed."""
+    """Return the peak force [N] of every contact at the approach speed without damping, (slots, lanes)."""
     contact = jax.tree.map(np.asarray, scenarios.contact)
     motion = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     return find_contact_law(mechanism.contact.law).undamped_peak_force(contact, *motion)

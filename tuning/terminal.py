@@ -1,4 +1,4 @@
-"""Output of the commands: tables and JSON on standard output, progress and notes on standard error."""
+"""Terminal output of commands: tables and JSON on standard output, progress and notes on standard error."""
 
 import json
 import math
@@ -19,14 +19,14 @@ from rich.text import Text
 
 from jaxhil.errors import InputError, to_one_line
 
-DEFAULT_WIDTH = 110  # width of lines without a terminal
-PROGRESS_INTERVAL = 10.0  # time between lines of progress without a terminal
-MAX_SILENCE = 20.0  # time after which the last line is repeated, with the current time left
-MIN_SHARE_FOR_RATE = 0.05  # share of the work after which a rate is shown
+DEFAULT_WIDTH = 110  # characters; width of lines if the output is not a terminal
+PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal
+MAX_SILENCE = 20.0  # s; after this time without a line, the progress is printed again
+MIN_SHARE_FOR_RATE = 0.05  # finished share of the work above which the rate is accurate enough to be shown
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
-    """Print on standard output and wrap long texts. A closed pipe is no error."""
+    """Print tables and texts on standard output, wrapping long texts if `wrap`; ignore a closed pipe."""
     with _convert_output_errors():
         for thing in things:
             console = _make_console(sys.stdout)
@@ -42,7 +42,7 @@ def emit_line(text: str) -> None:
 
 
 def emit_json(document: Mapping[str, Any]) -> None:
-    """Print one JSON document in the form of `format_json`."""
+    """Print a document as JSON on standard output, in the form of `format_json`."""
     with _convert_output_errors():
         print(format_json(document), end="", flush=True)
 
@@ -59,7 +59,7 @@ def warn(texts: Iterable[str]) -> None:
 
 
 def note(text: str) -> None:
-    """Print a text on standard error; the work continues if this fails."""
+    """Print a text on standard error; ignore it if standard error cannot be written."""
     try:
         _make_console(sys.stderr).print(text, soft_wrap=True)
     except OSError:
@@ -69,8 +69,8 @@ def note(text: str) -> None:
 def build_table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
-    """Return a table; columns whose number is in `texts` contain text, the others numbers."""
-    # The title is one line, also above a narrow table.
+    """Return a table; `texts` are the indices of the columns that contain text instead of numbers."""
+    # The title is on one line even if the table is narrower.
     heading = Text(title, style="bold", no_wrap=True, overflow="ignore")
     result = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(headings):
@@ -84,25 +84,25 @@ def build_table(
 
 
 def format_number(value: Any, digits: int = 4) -> str:
-    """Return a number as text with `digits` significant digits, or a dash for none."""
+    """Return a number as text with `digits` significant digits, or a dash if it is None or not finite."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def format_error(value: float | None) -> str:
-    """Return a restitution error as text with its sign, or a dash for none."""
+    """Return a restitution error as text with its sign, or a dash if it is None or NaN."""
     return "-" if value is None or value != value else f"{value:+.4f}"
 
 
 def format_ratio(value: float, ideal: float) -> str:
-    """Return a value relative to that of the ideal contact as text with three decimals, or a dash."""
+    """Return `value / ideal` as text with three decimals, or a dash if the ratio is not finite."""
     quotient = value / ideal if ideal else math.nan
     return f"{quotient:.3f}" if math.isfinite(quotient) and math.isfinite(ideal) else "-"
 
 
 def to_json_data(value: Any) -> Any:
-    """Convert a value to plain data for JSON, with None for numbers that are not finite."""
+    """Convert a value to data that JSON can represent, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): to_json_data(entry) for key, entry in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -115,10 +115,10 @@ def to_json_data(value: Any) -> Any:
 
 
 class Progress:
-    """Display of the progress of a known amount of work on standard error.
+    """Progress display on standard error for a known amount of work.
 
-    It shows the work done, the rate, the time left and the current activity: by a bar on a terminal, else by
-    a line at regular intervals and when the activity changes, unless `quiet`.
+    The display shows the work done, the rate, the time left and the current activity. On a terminal, it is a
+    bar. Otherwise, a line is printed at regular intervals and when the activity changes, unless `quiet`.
     """
 
     def __init__(self, total: float, unit: str, bar: rich.progress.Progress | None, quiet: bool):
@@ -131,53 +131,59 @@ class Progress:
 
     @property
     def rate(self) -> float | None:
-        """Return the rate in units per second, without skipped units; None if it is unknown."""
+        """Return the units done per second, not counting skipped units; None if no unit is done yet."""
         worked, duration = self._done - self._skipped, time.monotonic() - self._begun
         return worked / duration if worked > 0 and duration > 0 else None
 
     def skip(self, number: float) -> None:
-        """Count units that were done before."""
+        """Count `number` units as done by an earlier run; they do not affect the rate."""
         self._done += number
         self._skipped += number
         self._begun = time.monotonic()
 
     def advance(self, number: float, text: str | None = None) -> None:
-        """Count further units as done; `text` replaces the current activity or result."""
+        """Count `number` further units as done; if given, `text` becomes the current activity or result."""
         self.reach(self._done + number, text)
 
     def reach(self, done: float, text: str | None = None) -> None:
-        """Set the total number of units done."""
+        """Set the total number of units done; if given, `text` becomes the current activity or result."""
         with self._lock:
             self._done = max(self._done, done)
             self._text = self._text if text is None else text
             self._show(due=PROGRESS_INTERVAL)
 
     def say(self, text: str) -> None:
-        """Show the current activity."""
+        """Show `text` as the current activity."""
         with self._lock:
             is_new, self._text = text != self._text, text
             self._show(due=0.0 if is_new else PROGRESS_INTERVAL)
 
     def tell(self, text: str, done: float, skipped: float = 0.0) -> None:
-        """Show the current activity, and set the total units done and the units done before."""
+        """Show `text` as the current activity.
+
+        `done` is the number of units done in total, and `skipped` the number done by an earlier run.
+        """
         with self._lock:
             self._done, self._skipped = max(self._done, done), skipped
             self.say(text)
 
     def begin(self, text: str) -> None:
-        """Count the previous unit, if any, as done, and show that `text` begins."""
+        """Count the previous unit, if any, as done, and show `text` as the activity of the next unit."""
         with self._lock:
             self._end_unit()
             self.say(text)
 
     def turn_to(self, text: str) -> None:
-        """Begin a unit that may be short: without a bar its `text` is shown only if it takes long."""
+        """Count the previous unit, if any, as done, and begin a unit that may be short.
+
+        Without a bar, `text` is printed only if no line was printed for `PROGRESS_INTERVAL`.
+        """
         with self._lock:
             self._end_unit()
             self.reach(self._done, text)
 
     def remind(self) -> None:
-        """Repeat the last line, with the current progress, if nothing was shown for long."""
+        """Print the current progress again if no line was printed for `MAX_SILENCE`."""
         with self._lock:
             self._show(due=MAX_SILENCE)
 
@@ -187,23 +193,24 @@ class Progress:
         self._begun_stage = True
 
     def _show(self, due: float) -> None:
-        """Update the bar, or print a line if the last one is at least `due` seconds old."""
+        """Update the bar, or print a line if the last line is at least `due` seconds old."""
         if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, description=self._text, pace=self._pace())
+            rate = self._format_rate()
+            self._bar.update(self._task, completed=self._done, description=self._text, pace=rate)
         elif time.monotonic() - self._shown >= due and (self._done < self._total or due == 0.0):
             self._shown = time.monotonic()
-            self._note(", ".join(filter(None, [self._how_far(), self._pace(), self._text])))
+            self._note(", ".join(filter(None, [self._format_done(), self._format_rate(), self._text])))
 
-    def _how_far(self) -> str:
-        """Return the work done as text."""
+    def _format_done(self) -> str:
+        """Return the work done as text, in units or, for a single unit, in percent."""
         if self._done <= 0:
             return ""
         if self._total == 1:
             return f"{100 * self._done:.0f} %"
         return f"{math.floor(self._done)} of {self._total} {self._unit}"
 
-    def _pace(self) -> str:
-        """Return the rate and the time left as text, or the time so far."""
+    def _format_rate(self) -> str:
+        """Return the rate and the time left as text; at the beginning, the time elapsed."""
         if (rate := self.rate) is None or self._done < MIN_SHARE_FOR_RATE * self._total:
             return f"{_format_duration(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
@@ -216,7 +223,7 @@ class Progress:
 
 @contextmanager
 def show_progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
-    """Display progress by a bar on a terminal, else by lines at intervals; not at all unless `shown`."""
+    """Provide a progress display: a bar on a terminal, lines otherwise, and nothing unless `shown`."""
     with _show_bar(
         shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _ActivityColumn()
     ) as bar:
@@ -239,15 +246,15 @@ def show_progress(total: float, unit: str, shown: bool = True) -> Iterator[Progr
 
 
 def show_stages(total: int, shown: bool = True) -> AbstractContextManager[Progress]:
-    """Display progress through `total` stages."""
+    """Provide a progress display, like `show_progress`, for work in `total` stages."""
     return show_progress(total, "stages", shown)
 
 
 class _ActivityColumn(TextColumn):
-    """Column with rate and current activity, the only one that a narrow terminal truncates."""
+    """Progress-bar column with rate and current activity; a narrow terminal truncates only this column."""
 
     def __init__(self) -> None:
-        # The table narrows this column first, because it believes that the column can be wrapped.
+        # The table narrows this column first, because the column appears to allow line breaks.
         super().__init__("{task.fields[pace]}  {task.description}", markup=False, table_column=Column())
 
     def render(self, task: rich.progress.Task) -> Text:
@@ -258,7 +265,7 @@ class _ActivityColumn(TextColumn):
 
 @contextmanager
 def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
-    """Display a bar if it is `shown` and there is a terminal; else yield None."""
+    """Provide a progress bar, or None unless it is `shown` and standard error is a terminal."""
     console = _make_console(sys.stderr)
     if not shown or not console.is_terminal:
         yield None
@@ -268,9 +275,10 @@ def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[r
 
 
 def _table_width(table: Table, console: Console) -> int:
-    """Return the width, at least the terminal's, at which a table truncates no digit and breaks no word.
+    """Return the width for a table, at least the terminal's, such that no number or word is broken.
 
-    If the terminal is too narrow, each heading has one word per line; the terminal wraps what is still wider.
+    If the terminal is too narrow, put each word of a heading on its own line; the terminal then wraps lines
+    that are still too long.
     """
 
     def full_width() -> int:
@@ -289,21 +297,21 @@ def _table_width(table: Table, console: Console) -> int:
 
 
 def _format_duration(seconds: float) -> str:
-    """Return a duration as text, h:mm:ss."""
+    """Return a duration [s] as text in the form h:mm:ss."""
     rounded = round(seconds)
     return f"{rounded // 3600}:{rounded // 60 % 60:02d}:{rounded % 60:02d}"
 
 
 class _Console(Console):
-    """Console on which a closed pipe is no error."""
+    """Console that ignores a closed pipe."""
 
     def on_broken_pipe(self) -> None:
         _redirect_to_null(self.file)
 
 
 def _make_console(stream) -> Console:
-    """Return a console for a stream."""
-    # Names come from files, so that they must not be interpreted as markup.
+    """Return a console that prints to a stream."""
+    # Names come from files and must not be interpreted as markup.
     console = _Console(file=stream, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
         console.width = DEFAULT_WIDTH
@@ -312,7 +320,7 @@ def _make_console(stream) -> Console:
 
 @contextmanager
 def _convert_output_errors() -> Iterator[None]:
-    """Raise `InputError` if standard output cannot be written; a closed pipe is no error."""
+    """Convert an `OSError` of standard output to an `InputError`; ignore a closed pipe."""
     try:
         yield
     except BrokenPipeError:
@@ -324,7 +332,7 @@ def _convert_output_errors() -> Iterator[None]:
 
 
 def _redirect_to_null(stream: Any) -> None:
-    """Redirect further output of a stream to the null device, so that the exit code does not change."""
+    """Redirect a stream to the null device, so that later writes do not fail and change the exit code."""
     try:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

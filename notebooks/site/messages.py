@@ -80,7 +80,7 @@ HEAD = f"""\
 Standard output has the result alone (with `--json` one JSON document); progress, notes and lines that begin
 with `warning:` go to standard error. A refusal is one line, `jaxhil: ` and what was found and what is
 allowed; from Python it is a `jaxhil.InputError` of the same text. `internal error` is a fault of the program:
-set `JAXHIL_TRACEBACK=1` to see where.
+set `JAXHIL_TRACEBACK=1` for a traceback.
 
 ## Every refusal
 

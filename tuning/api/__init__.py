@@ -1,5 +1,5 @@
-"""Functions behind `import tuning`, one per module.
+"""Public functions of `tuning`, one per module.
 
-They compute and return what the commands of the same names print. Arguments are checked before jax is
-imported; an unusable argument raises `InputError` with a message of one line.
+Each function computes and returns the results that the command with its name prints. Arguments are checked
+before jax is imported; an unusable argument raises `InputError` with a message of one line.
 """

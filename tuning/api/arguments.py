@@ -1,7 +1,7 @@
-"""Checks of the arguments of public functions; each raises an error with a message of one line.
+"""Checks of the arguments of public functions; each check raises an error with a message of one line.
 
-The same message serves the function and the command: an `ArgumentError` also has a text with the option's
-name.
+The commands use the same checks: an `ArgumentError` contains a second text, which names the command's option
+instead of the function's argument.
 """
 
 import functools
@@ -31,34 +31,45 @@ SIX_AXIS_COMPENSATOR_NAMES = built_in_compensators(6)
 
 
 class ArgumentError(InputError):
-    """Error for an unusable argument: "name: found X, expected Y".
+    """Error for an unusable argument, with the message "name: found X, expected Y".
 
-    `option` is the text for the command's option. `which` names the entry of an argument with several values.
+    Attributes:
+        option: the same message for the command line, which begins with the option "--name".
     """
 
-    def __init__(self, name: str, found: str, allowed: str, which: str = ""):
-        """Create the error from the argument's name, the value found and the allowed values, in words."""
-        text = f"{f': {which}' if which else ''}: found {found}, expected {allowed}"
+    def __init__(self, name: str, found: str, allowed: str, entry: str = ""):
+        """Create the error.
+
+        Args:
+            name: name of the argument.
+            found: unusable value, as text.
+            allowed: description of the allowed values.
+            entry: name of the wrong entry, if the argument has several entries.
+        """
+        text = f"{f': {entry}' if entry else ''}: found {found}, expected {allowed}"
         super().__init__(name + text)
         self.option = f"--{name.replace('_', '-')}{text}"
 
 
 def convert_os_errors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a public function, so that an `OSError` in it becomes an `InputError`."""
+    """Decorate a public function so that an `OSError` raised in it is converted to an `InputError`."""
 
     @functools.wraps(function)
-    def called(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+    def wrapper(*arguments: Parameters.args, **keywords: Parameters.kwargs) -> Result:
         try:
-            return function(*arguments, **named)
+            return function(*arguments, **keywords)
         except OSError as error:
             where = f"{to_one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
             raise InputError(f"{where}{to_one_line(error.strerror or str(error), 200)}") from None
 
-    return called
+    return wrapper
 
 
 def check_integers(least: int, most: int | None = None, **values: Any) -> None:
-    """Raise `ArgumentError` unless every argument is an integer from `least` to `most`."""
+    """Raise `ArgumentError` unless every value is an integer from `least` to `most`.
+
+    The keywords are the names of the arguments.
+    """
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise ArgumentError(name, format_value(value), f"an integer >= {least}")
@@ -69,32 +80,35 @@ def check_integers(least: int, most: int | None = None, **values: Any) -> None:
 
 
 def check_choice(allowed: Sequence[str], **values: Any) -> None:
-    """Raise `ArgumentError` unless every argument is one of the `allowed` names."""
+    """Raise `ArgumentError` unless every value is one of the `allowed` names.
+
+    The keywords are the names of the arguments.
+    """
     for name, value in values.items():
         if value not in allowed:
             raise ArgumentError(name, format_value(value), ", ".join(allowed))
 
 
 def check_limit(value: Any) -> None:
-    """Raise `ArgumentError` unless a limit of the restitution error is a number >= 0; it may be infinite."""
+    """Raise `ArgumentError` unless the argument `limit` is a number >= 0, possibly infinite."""
     if not is_number(value) or math.isnan(value) or value < 0:
         raise ArgumentError("limit", str(value) if is_number(value) else format_value(value), "a number >= 0")
 
 
 def check_booleans(**values: Any) -> None:
-    """Raise `ArgumentError` unless every argument is true or false."""
+    """Raise `ArgumentError` unless every value is true or false; the keywords are the arguments' names."""
     for name, value in values.items():
         if not isinstance(value, bool):
             raise ArgumentError(name, format_value(value), "true or false")
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is an `int` or `float` (also NumPy's `float64`), and not a `bool`."""
+    """Return whether a value is an `int` or `float` (this includes NumPy's `float64`), but not a `bool`."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def check_compensators(names: Iterable[Any], argument: str = "compensator") -> None:
-    """Raise `ArgumentError` unless every name is a compensator, built in or registered."""
+    """Raise `ArgumentError` unless every name is that of a built-in or registered compensator."""
     allowed = compensator_names()
     for name in names:
         check_choice(allowed, **{argument: name})
@@ -103,7 +117,10 @@ def check_compensators(names: Iterable[Any], argument: str = "compensator") -> N
 def check_supports_mechanism(
     compensator: Any, mechanism: AnyMechanism | None, argument: str = "compensator"
 ) -> None:
-    """Raise `ArgumentError` unless the compensator supports the mechanism's axes, or any if it is None."""
+    """Raise `ArgumentError` unless the compensator exists for the number of axes of the mechanism.
+
+    If the mechanism is None, compensators for one axis and for six axes are accepted.
+    """
     if mechanism is None:
         check_choice(
             tuple(dict.fromkeys([*compensator_names(), *SIX_AXIS_COMPENSATOR_NAMES])),
@@ -112,43 +129,50 @@ def check_supports_mechanism(
     elif not isinstance(mechanism, SixAxisMechanism):
         check_compensators([compensator], argument)
     elif compensator not in SIX_AXIS_COMPENSATOR_NAMES:
-        allowed = f"{', '.join(SIX_AXIS_COMPENSATOR_NAMES)}: in six axes there are no others so far"
+        allowed = f"one of {', '.join(SIX_AXIS_COMPENSATOR_NAMES)} for six axes"
         raise ArgumentError(argument, format_value(compensator), allowed)
 
 
 def check_one_axis_arguments(mechanism: AnyMechanism, **values: Any) -> None:
-    """Raise `ArgumentError` if the mechanism has six axes and any of the arguments is set."""
+    """Raise `ArgumentError` if the mechanism has six axes and a value is set that only one axis supports.
+
+    The keywords are the names of the arguments.
+    """
     for name, value in values.items():
         if isinstance(mechanism, SixAxisMechanism) and value:
             found = "a function" if callable(value) else format_value(value)
-            raise ArgumentError(name, found, "nothing: in six axes there is none so far")
+            raise ArgumentError(name, found, "none: six axes do not support it")
 
 
 def compensator_names() -> tuple[str, ...]:
-    """Return the names of all compensators, the registered ones last.
+    """Return the names of all built-in compensators, then those of the registered compensators.
 
-    This does not import jax: registered compensators exist only if jax is already imported.
+    This function does not import jax: a compensator can be registered only after jax was imported.
     """
-    loaded = sys.modules.get("jaxhil.laws.compensators")
-    return tuple(dict.fromkeys([*built_in_compensators(), *(loaded.COMPENSATORS if loaded else ())]))
+    module = sys.modules.get("jaxhil.laws.compensators")
+    return tuple(dict.fromkeys([*built_in_compensators(), *(module.COMPENSATORS if module else ())]))
 
 
 def check_setting_name(compensator: str, value: Any) -> None:
-    """Raise `ArgumentError` unless a given setting is one of the compensator's. This may import jax."""
+    """Raise `ArgumentError` unless `value` is None or the name of one of the compensator's settings.
+
+    Unless `value` is None, this function imports jax.
+    """
     if value is None:
         return
     from jaxhil.laws.compensators import get_compensator
 
     names = get_compensator(compensator).settings
     if value not in names:
-        allowed = ", ".join(names) or f"none, {compensator} has no settings"
+        allowed = ", ".join(names) or f"none: {compensator} has no settings"
         raise ArgumentError("setting", format_value(value), allowed)
 
 
 def as_list(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
-    """Return a value as a list, and whether it was a list.
+    """Return a value as a list, and whether it was an iterable of several values.
 
-    A value of one of the `kinds`, a mapping, or a value that is not iterable becomes a list of one entry.
+    A value of one of the types `kinds`, a mapping, or a value that is not iterable becomes a list of one
+    entry.
     """
     if isinstance(value, kinds) or not isinstance(value, Iterable) or isinstance(value, Mapping):
         return [value], False
@@ -156,16 +180,17 @@ def as_list(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
 
 
 def check_path(name: str, value: Any) -> Path:
-    """Return a path, which need not exist. Raise `ArgumentError` if the value is not a path."""
+    """Convert an argument to a path, which need not exist; raise `ArgumentError` if it is not a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise ArgumentError(name, format_value(value), "a path")
     return Path(value)
 
 
 def load_mechanisms(value: Any) -> tuple[list[LoadedMechanism], bool]:
-    """Return one-axis mechanisms as a list, and whether several were given.
+    """Return a list of loaded one-axis mechanisms, and whether `value` was a list of mechanisms.
 
-    Each is given as the result of `jaxhil.load`, or as a name or path that it accepts. Raise `InputError`.
+    A mechanism is a result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts. Raise `InputError`
+    if a mechanism is unusable or has six axes.
     """
     listed, is_list = _as_mechanism_list(value)
     checked = [as_mechanism(entry) for entry in listed]
@@ -175,7 +200,11 @@ def load_mechanisms(value: Any) -> tuple[list[LoadedMechanism], bool]:
 
 
 def load_any_mechanisms(value: Any) -> tuple[list[LoadedAnyMechanism], bool]:
-    """Return mechanisms with one axis or six as a list, like `load_mechanisms`."""
+    """Return a list of loaded mechanisms with one or six axes, and whether `value` was a list of mechanisms.
+
+    A mechanism is a result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts. Raise `InputError`
+    if a mechanism is unusable.
+    """
     listed, is_list = _as_mechanism_list(value)
     checked = [as_any_mechanism(entry) for entry in listed]
     return [
@@ -184,7 +213,7 @@ def load_any_mechanisms(value: Any) -> tuple[list[LoadedAnyMechanism], bool]:
 
 
 def _as_mechanism_list(value: Any) -> tuple[list[Any], bool]:
-    """Return mechanisms as a list, and whether it was a list. Raise `ArgumentError` for an empty one."""
+    """Return mechanisms as a list, and whether `value` was a list; raise `ArgumentError` if it is empty."""
     listed, is_list = as_list(value, (Mechanism, SixAxisMechanism, str, os.PathLike))
     if not listed:
         raise ArgumentError("mechanism", "an empty list", "one mechanism or more")
@@ -192,9 +221,19 @@ def _as_mechanism_list(value: Any) -> tuple[list[Any], bool]:
 
 
 def load_gains(value: Any, argument: str = "gains", any_axes: bool = False) -> "LoadedGains":
-    """Return the loaded gains of a path, a folder, or an object with a gain file's `document`.
+    """Load and check a gain file.
 
-    Six axes are accepted only with `any_axes`.
+    Args:
+        value: path of a gain file or of its folder, or an object whose attribute `document` is the content of
+            a gain file, such as a result of `tuning.tune`.
+        argument: name of the argument in error messages.
+        any_axes: accept gains for six axes too.
+
+    Returns:
+        The gains with their compensator and mechanism.
+
+    Raises:
+        InputError: If the gains cannot be read or are not valid.
     """
     from jaxhil.simulation.gain_file import check_document, load_gain_file
 
@@ -206,7 +245,10 @@ def load_gains(value: Any, argument: str = "gains", any_axes: bool = False) -> "
 
 
 def find_gain_file(value: Any, argument: str = "gains") -> Path:
-    """Return the path of a gain file, given itself or its folder. Raise `InputError` if it is unreadable."""
+    """Return the path of a gain file from its own path or that of its folder.
+
+    Raise `InputError` if the file cannot be read.
+    """
     try:
         path = check_path(argument, value)
         if path.is_dir():
@@ -223,11 +265,11 @@ def find_gain_file(value: Any, argument: str = "gains") -> Path:
 
 
 def check_has_runtime(compensator: str) -> None:
-    """Raise `InputError` if the compensator was registered without a runtime for the rig."""
+    """Raise `InputError` if the compensator was registered without a runtime class for the rig."""
     from jaxhil.rig import COMPENSATORS
 
     if compensator not in COMPENSATORS:
         raise InputError(
-            f"{compensator}: found no runtime class for the rig, "
-            f"expected a law registered with one: jaxhil.register(law, runtime=...)"
+            f"{compensator}: found no runtime class for the rig, expected a compensator that was registered "
+            "with a runtime class: jaxhil.register(compensator, runtime=...)"
         )

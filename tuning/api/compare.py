@@ -1,4 +1,4 @@
-"""Function `tuning.compare`: compares compensators, each tuned, on the same fresh scenarios."""
+"""Function `tuning.compare`: tunes compensators, and compares them on the same fresh scenarios."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,13 +30,18 @@ if TYPE_CHECKING:
 
 
 class IntervalEstimate(float):
-    """Number with a 95 % confidence interval from `low` to `high`."""
+    """Number with its 95 % confidence interval.
+
+    Attributes:
+        low: lower end of the interval, in the unit of the number.
+        high: upper end of the interval, in the unit of the number.
+    """
 
     low: float
     high: float
 
     def __new__(cls, value: float, low: float, high: float) -> "IntervalEstimate":
-        """Create a number with its interval."""
+        """Create a number with its confidence interval."""
         number = super().__new__(cls, value)
         number.low, number.high = low, high
         return number
@@ -53,11 +58,12 @@ class Board:
 
     Attributes:
         document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
-        figures: metrics by compensator, then by its gains ("literature", "tuned", or a setting's name), with
-            rms, p99, worst, early, late, slope, peak and more, each a number with `low` and `high`.
-        gains: gains [SI units] by compensator, by the same names as in `figures`, then by gain.
-        winners: for each metric the compensator that is better than all others by more than the confidence
-            intervals, or None.
+        figures: metrics by compensator, then by the name of its gains ("literature", "tuned", or that of a
+            setting). The metrics are attributes rms, p99, worst, early, late, slope, peak [1] and more, each
+            an `IntervalEstimate`.
+        gains: gains [SI units] by compensator, then by the names of `figures`, then by the gain's name.
+        winners: for each metric, the compensator that is better than all others by more than the confidence
+            intervals, or None if there is no such compensator.
     """
 
     document: dict[str, Any]
@@ -76,24 +82,24 @@ class CompareOptions:
     ] = ()
     untuned: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Tune nothing: evaluate the literature's gains and the compensators' settings."),
+        text_option(None, "Do not tune: evaluate the literature's gains and the compensators' settings."),
     ] = False
     scenarios: Annotated[int, number_option("Scenarios to tune on."), AllowedValues(1)] = 32
     judged: Annotated[int, number_option("Fresh scenarios for the evaluation."), AllowedValues(2)] = 256
     limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error that counts as a failure."), LimitRange
+        float, arg(metavar="NUMBER", help="Restitution error above which a scenario fails."), LimitRange
     ] = 0.01
-    seed: Annotated[int, number_option("SeedRange of scenarios, starts and resampling."), SeedRange] = 0
+    seed: Annotated[int, number_option("Seed of scenarios, starts and resampling."), SeedRange] = 0
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Check all options. Raise `InputError`."""
+        """Raise `InputError` if the value of an option is not allowed."""
         check_options(self)
         arguments.check_compensators(self.laws, "compensators")
 
     @property
     def laws(self) -> tuple[str, ...]:
-        """Return the compensators to compare, each once; all built-in ones if none is named."""
+        """Return the names of the compensators to compare, each once; by default all built-in ones."""
         return tuple(dict.fromkeys(self.compensators or built_in_compensators()))
 
 
@@ -106,20 +112,20 @@ def compare(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Compare compensators for a mechanism, each tuned, on the same fresh scenarios, with intervals.
+    """Tune compensators for a mechanism, and compare their errors on the same fresh scenarios.
 
-    The metrics equal those of `jaxhil compare`. They are computed in this process; the command starts a
-    process for each core.
+    The metrics equal those of `jaxhil compare`. This function computes them in the current process, whereas
+    the command starts a process for each core.
 
     Args:
-        mechanism: result of `jaxhil.load`, or a name or path that it accepts; or a list of these.
-        compensators: names of compensators, built in or registered; by default all built-in ones.
-            Compensators with settings use these, the others are tuned.
+        mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these.
+        compensators: names of built-in or registered compensators; by default all built-in ones. A
+            compensator that has settings is evaluated with each setting instead of being tuned.
         progress: report the progress on standard error.
         **options: OPTIONS
 
     Returns:
-        A `Board`, or a list of them for a list of mechanisms.
+        A `Board` with metrics, gains and winners; for a list of mechanisms, a list of boards.
 
     Raises:
         InputError: If an argument is unusable; the message has one line.
@@ -148,11 +154,19 @@ def compare_each(
     options: CompareOptions,
     processes: int,
     bar: terminal.Progress,
-    pieces: "Checkpoints | None" = None,
+    checkpoints: "Checkpoints | None" = None,
 ) -> Iterator[Any]:
-    """Yield the results of `tuning.benchmark.comparison.compare`, as they are finished.
+    """Yield the metrics, or the failure, of each compensator for each mechanism, as soon as it is known.
 
-    Work stored in the checkpoints `pieces` is not repeated, and new work is stored there.
+    Args:
+        loaded: mechanisms.
+        options: options of the comparison.
+        processes: number of processes; 0 for the current process.
+        bar: progress display.
+        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+
+    Yields:
+        Results of `tuning.benchmark.comparison.compare_laws`.
     """
     from tuning.benchmark.comparison import CompareSettings, compare_laws
     from tuning.caches.checkpoints import NO_CHECKPOINTS
@@ -167,9 +181,14 @@ def compare_each(
     for entry in loaded:
         mechanism_summary.check_can_be_simulated(entry.mechanism, entry.label)
     mechanisms = [entry.mechanism for entry in loaded]
-    checkpoints = pieces or NO_CHECKPOINTS
     yield from compare_laws(
-        mechanisms, options.laws, settings, processes, bar.tell, checkpoints, options.scheduler
+        mechanisms,
+        options.laws,
+        settings,
+        processes,
+        bar.tell,
+        checkpoints or NO_CHECKPOINTS,
+        options.scheduler,
     )
 
 
@@ -180,7 +199,7 @@ def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
         name = entry.mechanism.name
         if name in labels:
             raise InputError(
-                f"{entry.label}: name: found {name}, expected a name other than that of {labels[name]}"
+                f"{entry.label}: name: found {name}, expected another name than in {labels[name]}"
             )
         labels[name] = entry.label
 
@@ -188,7 +207,7 @@ def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
 def build_board(
     entry: LoadedMechanism, options: CompareOptions, results: "Mapping[str, LawMetrics]"
 ) -> Board:
-    """Return the result for one mechanism, from the compensators that are finished."""
+    """Return the comparison for one mechanism, from the results of the finished compensators."""
     from jaxhil.laws.compensators import COMPENSATORS
     from tuning.benchmark.tables import find_winners
 
@@ -221,7 +240,7 @@ def build_board(
 
 
 def _as_compensator_list(value: Any) -> list[Any]:
-    """Return the names of compensators as a list. Raise `InputError` if one is not a text."""
+    """Return names of compensators as a list; raise `InputError` if a name is not a text."""
     names, _ = arguments.as_list(value, (str,))
     for name in names:
         if not isinstance(name, str):

@@ -35,7 +35,7 @@ class ExportResult:
 
     Attributes:
         document: all results, as `jaxhil export --json` prints them.
-        sizes: size of each of the bundle's files [bytes].
+        sizes: sizes of the bundle's files by file name [bytes].
     """
 
     document: dict[str, Any]
@@ -45,14 +45,15 @@ class ExportResult:
     def verdict(self) -> str:
         """Return the verdict: "good", "bad" or "unknown".
 
-        It is "bad" if the rig's controller differs from the simulated one, or gives wrong alarms more often
-        than allowed, and "unknown" if nothing is bad, but too few runs determine the alarm rates.
+        The verdict is "bad" if the rig's controller differs from the simulated one, or if its watchdog gives
+        wrong alarms more often than allowed. It is "unknown" if too few runs are known to determine the rates
+        of wrong alarms.
         """
         return self.document["verdict"]
 
     @property
     def good(self) -> bool:
-        """Return whether nothing is bad, that is, whether `jaxhil export` ends with exit code 0."""
+        """Return whether the verdict is not "bad"; `jaxhil export` then ends with exit code 0."""
         return self.verdict != "bad"
 
     @property
@@ -62,7 +63,10 @@ class ExportResult:
 
     @property
     def unknown(self) -> list[str]:
-        """Return what is not known, with the sweep that would show it; empty for a good verdict."""
+        """Return the alarm rates that are unknown, each with the sweep that would determine it.
+
+        The list is empty if the verdict is "good".
+        """
         return list(self.document["unknown"])
 
 
@@ -77,16 +81,16 @@ class ExportOptions:
         float,
         arg(
             metavar="PROBABILITY",
-            help="Acceptable share of good runs (error at most half the limit) that are stopped.",
+            help="Acceptable share of good runs (error at most half the limit) that the watchdog stops.",
         ),
         ProbabilityRange,
     ] = 0.01
     missed: Annotated[
         float,
-        arg(metavar="PROBABILITY", help="Acceptable share of bad runs that the watchdog misses."),
+        arg(metavar="PROBABILITY", help="Acceptable share of bad runs that the watchdog does not stop."),
         ProbabilityRange,
     ] = 0.02
-    seed: Annotated[int, number_option("SeedRange of the test vectors."), SeedRange] = 0
+    seed: Annotated[int, number_option("Seed of the test vectors."), SeedRange] = 0
     sign: Annotated[
         str | None,
         text_option("KEY", "Sign the bundle with this private key (Ed25519, PEM); needs jaxhil[sign]."),
@@ -105,15 +109,16 @@ def export(
     progress: bool = False,
     **options: Any,
 ) -> ExportResult:
-    """Write a bundle for the rig: gains, controller, test vectors and self-test, without dependencies.
+    """Write a bundle for the rig: gains, a controller without dependencies, test vectors and a self-test.
 
     Args:
         gains: result of `tuning.tune`, or the path of a gain file or of its folder.
-        folder: folder of the bundle: a new or empty one, or a bundle, which is replaced.
-        sweep: result of `tuning.sweep` for these gains, or the folder of its store, from which limits and
-            alarm rates are computed.
+        folder: folder of the bundle. A new or empty folder, or a bundle, which is replaced.
+        sweep: result of `tuning.sweep` for these gains, or the folder with such a result. Limits and alarm
+            rates are computed from its runs.
         formats: additional formats of the gains: "ros2", "matlab", "csv", "c99"; None for all.
-        limits: limits of this rig by name [SI units], None for no limit; they replace the computed ones.
+        limits: limits of this rig by name [SI units], which replace the computed limits; a value of None
+            removes a limit.
         progress: report the progress on standard error.
         **options: OPTIONS
 
@@ -121,8 +126,8 @@ def export(
         The verdict with its reasons, all results, and the sizes of the files.
 
     Raises:
-        InputError: If an argument is unusable, the compensator has no runtime, or the folder cannot be
-            written; the message has one line.
+        InputError: If an argument is unusable, the compensator has no runtime for the rig, or the folder
+            cannot be written; the message has one line.
 
     Example:
         >>> import tempfile
@@ -165,12 +170,12 @@ def export(
 
 
 def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
-    """Return the document of the export, without the path of the bundle."""
+    """Return the JSON document of the export; its path of the bundle is None."""
     from tuning.verification.stops import describe_limit_changes
 
     stops = []
     if bundle.stop is not None:
-        # A nominal run that the limits stop here is also stopped on the rig.
+        # A nominal run that the limits stop in the simulation would also be stopped on the rig.
         stops = [f"the nominal run is {bundle.stop.text}; {describe_limit_changes(bundle.passing)}"]
     elif bundle.ended and bundle.ended[0]:
         stops = [f"the nominal run, {bundle.ended[0]}"]
@@ -198,7 +203,10 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
 def _calibrate_limits(
     loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
 ):
-    """Return the calibrated limits, and the rates of false and missed alarms."""
+    """Compute the watchdog's limits, and its rates of false and missed alarms.
+
+    `replaced` contains limits that the user set, and `allowed` the acceptable rates of both kinds of alarms.
+    """
     from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
     from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios
     from tuning.watchdog.verdict import AllowedAlarmRates
@@ -207,7 +215,7 @@ def _calibrate_limits(
     with _open_sweep(sweep) as store:
         runs = DEFAULT_DRAWS if store is None else count_stored_scenarios(store)
         with terminal.show_progress(runs + len(INJECTED_FAULTS) * faulty, "runs", progress) as bar:
-            bar.reach(0, "working out the limits")
+            bar.reach(0, "computing the limits")
             return calibrate(
                 loaded,
                 store,
@@ -220,7 +228,7 @@ def _calibrate_limits(
 
 @contextmanager
 def _open_sweep(sweep: Any) -> "Iterator[SweepStore | None]":
-    """Open the store of a sweep; None without a sweep."""
+    """Open the rows of a sweep, given as a result of `tuning.sweep` or as a folder; None without a sweep."""
     from tuning.api.sweep import SweepStudy
     from tuning.sweeps.store import read_store
 
@@ -232,7 +240,10 @@ def _open_sweep(sweep: Any) -> "Iterator[SweepStore | None]":
 
 
 def _parse_limits(limits: Any) -> dict[str, float | None]:
-    """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
+    """Check the limits that the user set, and return them by name; None removes a limit.
+
+    Raise `InputError` if a name or a value is not allowed.
+    """
     if not isinstance(limits, Mapping):
         raise ArgumentError("limits", format_value(limits), "limits by name")
     for name, value in limits.items():
@@ -244,13 +255,13 @@ def _parse_limits(limits: Any) -> dict[str, float | None]:
 
 
 def allowed_values(name: str) -> str:
-    """Return the allowed values of a limit, in words."""
+    """Return a text that describes the allowed values of the limit `name`."""
     limit = LIMITS[name]
     return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
 
 
 def _check_formats(formats: Any) -> None:
-    """Raise `InputError` for a format that does not exist."""
+    """Raise `InputError` if one of the formats does not exist."""
     from tuning.bundle.writers import WRITERS
 
     for name in formats or ():
@@ -258,7 +269,7 @@ def _check_formats(formats: Any) -> None:
 
 
 def _select_formats(formats: Sequence[str] | None) -> list[str]:
-    """Return the requested formats, by default all, in the order of `WRITERS`."""
+    """Return the names of the requested formats, by default all, in the order of `WRITERS`."""
     from tuning.bundle.writers import WRITERS
 
     return [name for name in WRITERS if not formats or name in formats]

@@ -1,4 +1,4 @@
-"""Function `tuning.map`: computes where the loop diverges over two keys, and the nominal point's margins."""
+"""Function `tuning.map`: computes the restitution error over two keys, and margins of the nominal point."""
 
 import os
 from collections.abc import Mapping
@@ -34,29 +34,43 @@ if TYPE_CHECKING:
 
 SCHEMA = "jaxhil/map/1"
 DOCUMENT_FILE, PLOT = "map.json", "map.png"
-MAX_POINTS = 1000
+MAX_POINTS = 1000  # points along an axis; the number of runs is the square of this number
 
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Result of `map`; arrays are NumPy's, with rows along y and columns along x."""
+    """Result of `map`: restitution and its error at every point of a grid over two keys.
 
-    document: dict[str, Any]  # all results, as `jaxhil map --json` prints them
-    x: np.ndarray  # values along x, (columns,), in the unit of its key
-    y: np.ndarray  # values along y, (rows,)
-    error: np.ndarray  # e - e* of largest magnitude of any contact, (rows, columns) [1]; NaN: no end
-    restitution: np.ndarray  # e of that contact, (rows, columns) [1]
-    found: "MapResults" = field(repr=False)
+    Attributes:
+        document: all results, as `jaxhil map --json` prints them.
+        x: values of the key along x, (columns,), in the unit of the key.
+        y: values of the key along y, (rows,), in the unit of the key.
+        error: error e - e* with the largest magnitude among the contacts, (rows, columns) [1]; NaN if a
+            contact did not end.
+        restitution: restitution e of the contact with this error, (rows, columns) [1].
+        results: the same results as arrays, with theory and margins (`tuning.stability_map.grid.MapResults`).
+    """
+
+    document: dict[str, Any]
+    x: np.ndarray
+    y: np.ndarray
+    error: np.ndarray
+    restitution: np.ndarray
+    results: "MapResults" = field(repr=False)
 
     def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw the map to a .png, .pdf or .svg file. Raise `InputError` if it cannot be written."""
+        """Write a plot of the map to a .png, .pdf or .svg file.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
         from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.stability_map import map_plot
 
         title = f"{self.document['mechanism']}, compensation: {self.document['compensator']}"
         target = arguments.check_path("path", path)
         with report_write_errors(target):
-            save_figure(map_plot(self.found, title, self.document["limit"]), target)
+            save_figure(map_plot(self.results, title, self.document["limit"]), target)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,12 +81,12 @@ class MapOptions:
         int, number_option("Number of points along each axis."), AllowedValues(2, MAX_POINTS)
     ] = 100
     limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error up to which margins are computed."), LimitRange
+        float, arg(metavar="NUMBER", help="Restitution error that limits the margins."), LimitRange
     ] = 0.01
     resume: Resume = False
     scheduler: Scheduler = None
     seed: Annotated[
-        int, number_option("SeedRange of the sensor noise, the same at every point."), SeedRange
+        int, number_option("Seed of the sensor noise, which is the same at every point."), SeedRange
     ] = 0
 
 
@@ -89,27 +103,28 @@ def map(
     progress: bool = False,
     **options: Any,
 ) -> StabilityMap:
-    """Compute the restitution error over two keys of a mechanism, and closed-form theory.
+    """Compute a stability map: the restitution error as a function of two keys, with closed-form theory.
 
-    The gains are the same at every point, those of the nominal mechanism: the map shows the effect of changes
-    that the controller does not know. If compensator and contact law are linear, the map also has the
-    spectral radius of the sampled loop in contact and, at the nominal point, its derivative by every gain.
+    The gains at every point are those of the nominal mechanism, so that the map shows the effect of changes
+    that the controller does not know. If compensator and contact law are linear, the map also contains the
+    spectral radius of the sampled loop in contact and, at the nominal point, its derivative with respect to
+    each gain.
 
     Args:
-        mechanism: a `Mechanism`, the name of a built-in one, or a file's path.
+        mechanism: a `Mechanism`, the name of a built-in mechanism, or the path of a mechanism file.
         x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is that of
-            the file's [uncertainty], else 0.3 to 3 times the nominal value; for a gain its bounds. A list is
-            scaled as a whole, and the values are those of its first entry; "contact.stiffness[1]" is a single
-            entry.
-        y: key along y, like `x`.
+            the file's [uncertainty], or else 0.3 to 3 times the nominal value; for a gain, its bounds. The
+            entries of a list are scaled together, and the values along the axis are those of the first entry;
+            "contact.stiffness[1]" varies a single entry.
+        y: key along y, in the format of `x`.
         compensator: name of a compensator.
-        gains: gains, as for `jaxhil.simulate`.
+        gains: gains, in one of the forms that `jaxhil.simulate` accepts.
         folder: folder for map.json and map.png; None writes nothing.
         progress: report the progress on standard error.
         **options: OPTIONS
 
     Returns:
-        The values along both axes, the errors, and all results.
+        The values along both axes, the errors and restitutions, and all further results.
 
     Raises:
         InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
@@ -124,11 +139,9 @@ def map(
     check_options(settings)
     arguments.check_booleans(progress=progress)
     if settings.resume and folder is None:
-        raise arguments.ArgumentError("resume", "without a folder", "with that of a map")
-    checked, target = (
-        as_mechanism(mechanism),
-        None if folder is None else arguments.check_path("folder", folder),
-    )
+        raise arguments.ArgumentError("resume", "no folder", "the folder of an interrupted map")
+    checked = as_mechanism(mechanism)
+    target = None if folder is None else arguments.check_path("folder", folder)
     with jax_context():
         return _compute(checked, (x, y), compensator, gains, settings, target, progress)
 
@@ -182,7 +195,7 @@ def _axes(
 
 
 def _write(stability_map: StabilityMap, folder: Path) -> None:
-    """Write map.json and map.png."""
+    """Write a map to map.json and map.png in a folder."""
     with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / DOCUMENT_FILE, terminal.format_json(stability_map.document).encode("ascii"))
@@ -197,7 +210,7 @@ def _build_document(
     limit: float,
     seed: int,
 ) -> dict[str, Any]:
-    """Return the JSON document of a map."""
+    """Return the JSON document of a map: axes, errors, theory, spectral radii and margins."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS
     from jaxhil.simulation.source_fingerprint import dependency_versions
     from tuning.gain_file import VERSIONED_PACKAGES, to_json_data

@@ -1,4 +1,4 @@
-"""Summary of a mechanism before a computation, and a check that the computation would end."""
+"""Summary of a mechanism, and a check that its contacts can be simulated in reasonable time."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,10 @@ from tuning import terminal
 
 
 def check_can_be_simulated(mechanism: AnyMechanism, label: str | None = None) -> None:
-    """Check that the contacts of a mechanism can be simulated.
+    """Raise `InputError` if the contacts of a mechanism cannot be simulated.
 
-    Raise `InputError` if a contact, nominal or drawn, takes too many ticks or, in six axes, if the nominal
-    run cannot begin. This imports jax.
+    For one axis, this is the case if a nominal or drawn contact takes too many ticks; for six axes, if the
+    nominal run cannot begin. This function imports jax.
     """
     if isinstance(mechanism, SixAxisMechanism):
         from jaxhil.sixdof.building import build_scenarios
@@ -25,9 +25,10 @@ def check_can_be_simulated(mechanism: AnyMechanism, label: str | None = None) ->
 
 
 def report_summary(mechanism: AnyMechanism, tell: Callable[[str], None] | None) -> None:
-    """Report the summary of a one-axis mechanism by `tell`, if given, and warn of implausible values.
+    """Report the summary of a one-axis mechanism, and print warnings of implausible values.
 
-    This imports jax. In six axes it does nothing; `jaxhil simulate` reports the summary.
+    The summary is passed to `tell`, unless `tell` is None. For six axes, this function does nothing; only
+    `jaxhil simulate` reports such a summary. This function imports jax.
     """
     if isinstance(mechanism, SixAxisMechanism):
         return

@@ -1,8 +1,8 @@
-"""Options that commands and public functions share: type, range, default and help.
+"""Options that commands and public functions share: type, allowed values, default and help.
 
-One frozen dataclass per command defines its options. The command line reads it with tyro, the decorator
-`add_options` gives its fields to the Python function as keyword arguments, and `check_options` checks the
-ranges.
+Each command has a frozen dataclass that defines its options. tyro turns the fields into options of the
+command line, the decorator `add_options` turns them into keyword arguments of the Python function, and
+`check_options` checks their values.
 """
 
 import dataclasses
@@ -26,26 +26,26 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class AllowedValues:
-    """Allowed values of an option; None, for its default, is also allowed."""
+    """Allowed values of an option; if the option's type includes None, None is always allowed."""
 
-    least: float = -math.inf
-    most: float = math.inf
-    names: tuple[str, ...] = ()
-    words: str = ""  # allowed values in words, if the range is not enough
+    least: float = -math.inf  # smallest number, in the unit of the option
+    most: float = math.inf  # largest number, in the unit of the option
+    names: tuple[str, ...] = ()  # allowed names; empty for a number
+    words: str = ""  # text for error messages; empty for a text made from `least` and `most`
 
 
 def number_option(meaning: str):
-    """Return tyro's description of an option that is a number."""
+    """Return tyro's description of an option whose value is a number."""
     return arg(metavar="NUMBER", help=meaning)
 
 
 def folder_option(meaning: str):
-    """Return tyro's description of an option that is an output folder."""
+    """Return tyro's description of an option whose value is an output folder."""
     return arg(aliases=("-o",), metavar="DIR", help=meaning)
 
 
 def text_option(metavar: str | None, meaning: str, **more: Any):
-    """Return tyro's description of an option whose help itself states the default."""
+    """Return tyro's description of an option whose help text states the default value."""
     return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
 
 
@@ -61,7 +61,7 @@ Overrides = Annotated[
     UseAppendAction[tuple[str, ...]],
     text_option(
         "PATH=VALUE",
-        "Set a key of the mechanism file by its dotted path, as approach.velocity=0.01; repeatable.",
+        "Set a key of the mechanism file by its dotted path, such as approach.velocity=0.01; repeatable.",
         name="set",
     ),
 ]
@@ -69,7 +69,7 @@ Unset = Annotated[
     UseAppendAction[tuple[str, ...]],
     text_option(
         "PATH",
-        "Remove a key, and its entry in [uncertainty], from the mechanism file, after all --set; repeatable.",
+        "Remove a key, and its entry in [uncertainty], from the mechanism, after all --set; repeatable.",
         name="unset",
     ),
 ]
@@ -82,7 +82,7 @@ Json = Annotated[
     FlagCreatePairsOff[bool], text_option(None, "Print only one JSON document on standard output.")
 ]
 Timings = Annotated[
-    FlagCreatePairsOff[bool], text_option(None, "Report on standard error how the time was spent.")
+    FlagCreatePairsOff[bool], text_option(None, "Print the time of each kind of work on standard error.")
 ]
 Scheduler = Annotated[
     str | None,
@@ -95,24 +95,24 @@ Resume = Annotated[
     arg(name="resume", metavar="", help="Continue after an interruption; finished work is not repeated."),
 ]
 CompensatorName = Annotated[
-    str | None, arg(metavar="NAME", help="Compensator, with the literature's gains; 'none' by default.")
+    str | None, arg(metavar="NAME", help="Compensator, with the literature's gains; by default 'none'.")
 ]
 GainSource = Annotated[
     str | None,
-    arg(metavar="GAINS", help="Gain file: its compensator and gains and, without FILE, its mechanism."),
+    arg(metavar="GAINS", help="Gain file: compensator, gains and, if FILE is not given, mechanism."),
 ]
 
 
 Setting = Annotated[
-    str | None, text_option("NAME", "Name of a set of gains that the compensator has for any mechanism.")
+    str | None, text_option("NAME", "Name of a predefined set of the compensator's gains for any mechanism.")
 ]
 
 
 def check_options(options: Any) -> None:
-    """Check the type and range of every option that states them.
+    """Check the type and the allowed values of every option whose definition states them.
 
     Raises:
-        InputError: If a value is not allowed; one line, "name: found X, expected Y".
+        InputError: If a value is not allowed; the message is "name: found X, expected Y".
     """
     for name, (kind, allowed) in _checked_options(type(options)).items():
         value = getattr(options, name)
@@ -122,14 +122,14 @@ def check_options(options: Any) -> None:
 
 @functools.cache
 def _checked_options(options: type) -> dict[str, tuple[Any, AllowedValues]]:
-    """Return the type and the allowed values of the options that are flags or state allowed values."""
-    stated = {}
+    """Return type and allowed values of each option that is a flag or states its allowed values."""
+    checked = {}
     for name, hint in typing.get_type_hints(options, include_extras=True).items():
         kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
         allowed = [mark for mark in marks if isinstance(mark, AllowedValues)]
         if allowed or kind is bool:
-            stated[name] = kind, allowed[0] if allowed else AllowedValues()
-    return stated
+            checked[name] = kind, allowed[0] if allowed else AllowedValues()
+    return checked
 
 
 def _check_option(name: str, value: Any, kind: Any, allowed: AllowedValues) -> None:
@@ -142,25 +142,25 @@ def _check_option(name: str, value: Any, kind: Any, allowed: AllowedValues) -> N
         if value not in allowed.names:
             raise ArgumentError(name, format_value(value), ", ".join(allowed.names))
         return
-    whole = int in (kind, *typing.get_args(kind))
+    is_integer_option = int in (kind, *typing.get_args(kind))
     words = allowed.words or (
-        f"an integer >= {allowed.least:g}" if whole else f"a number >= {allowed.least:g}"
+        f"an integer >= {allowed.least:g}" if is_integer_option else f"a number >= {allowed.least:g}"
     )
-    usable = is_number(value) and (isinstance(value, int) or not whole)
-    if not usable or not value >= allowed.least:
-        raise ArgumentError(name, str(value) if usable else format_value(value), words)
+    has_right_type = is_number(value) and (isinstance(value, int) or not is_integer_option)
+    if not has_right_type or not value >= allowed.least:
+        raise ArgumentError(name, str(value) if has_right_type else format_value(value), words)
     if value > allowed.most:
         raise ArgumentError(name, str(value), allowed.words or f"at most {allowed.most:.15g}")
 
 
 def add_options(options: type) -> Callable[[Function], Function]:
-    """Return a decorator that adds the fields of `options` to a function's signature and docstring.
+    """Return a decorator that adds the fields of the dataclass `options` to a function's signature.
 
-    The function accepts them as `**options`; the line `**options: OPTIONS` of its docstring is
-    replaced by their help.
+    The function must accept the fields as `**options`. In its docstring, the line `**options: OPTIONS` is
+    replaced by the help texts of the fields.
     """
 
-    def stated(function: Function) -> Function:
+    def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
         *first, _ = signature.parameters.values()
         taken = {parameter.name for parameter in first}
@@ -177,11 +177,11 @@ def add_options(options: type) -> Callable[[Function], Function]:
         )
         return function
 
-    return stated
+    return decorate
 
 
 def _option_help(options: type, name: str) -> str:
-    """Return the line of a docstring that describes an option."""
+    """Return the lines of a docstring's `Args` section that describe one option."""
     hint = typing.get_type_hints(options, include_extras=True)[name]
     (meaning,) = (mark.help for mark in typing.get_args(hint)[1:] if getattr(mark, "help", None))
     return textwrap.fill(f"{name}: {meaning}", 110, initial_indent=" " * 8, subsequent_indent=" " * 12) + "\n"

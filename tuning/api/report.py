@@ -1,4 +1,4 @@
-"""Function `tuning.report`: makes one page for a review board from the results of the other commands."""
+"""Function `tuning.report`: builds an HTML page for a review board from the results of the other commands."""
 
 import os
 from collections.abc import Iterable
@@ -13,14 +13,20 @@ from tuning.api.arguments import ArgumentError
 
 @dataclass(frozen=True)
 class Report:
-    """Result of `report`: the page and its verdict."""
+    """Result of `report`: the page and its verdict.
 
-    html: bytes  # the page
-    verdict: str  # "good", "bad", or "unknown" if the given results do not decide it
-    requirements: list[dict[str, str]]  # each with what, required, result, margin and verdict
+    Attributes:
+        html: HTML page, encoded as UTF-8.
+        verdict: "good", "bad", or "unknown" if the results do not suffice for a verdict.
+        requirements: texts what, required, result, margin and verdict of each requirement.
+    """
+
+    html: bytes
+    verdict: str
+    requirements: list[dict[str, str]]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page atomically.
+        """Write the page to a file; if this fails, an existing file remains unchanged.
 
         Raises:
             InputError: If the file cannot be written.
@@ -35,19 +41,20 @@ class Report:
 def report(
     results: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, progress: bool = False
 ) -> Report:
-    """Make one page of results: verdict, requirements, assumptions, gains, runs, errors and commands.
+    """Build an HTML page of results: verdict, requirements, assumptions, gains, runs, errors and commands.
 
     Args:
         results: paths of the results of `identify`, `tune`, `sweep`, `compare`, `map` and `export`, at most
-            one of each: a folder or the JSON file in it; for `monitor` a file with the output of `--json`.
+            one result of each command. A path is that of a folder or of the JSON file in the folder; for
+            `monitor`, it is that of a file with the output of `--json`.
         progress: report the progress on standard error.
 
     Returns:
         The page with its verdict and requirements.
 
     Raises:
-        InputError: If a path is no result, a result was changed after it was written, or results belong to
-            different mechanisms or gains; the message has one line.
+        InputError: If a path contains no result, if a result was changed after it was written, or if results
+            belong to different mechanisms or gains; the message has one line.
 
     Example:
         >>> import tempfile
@@ -56,7 +63,7 @@ def report(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     tuned.save(f"{folder}/gains.json")
         ...     page = tuning.report(folder)
-        >>> page.verdict  # gains alone do not show how robust they are: that takes a sweep
+        >>> page.verdict  # the robustness of the gains is unknown without a sweep
         'unknown'
     """
     arguments.check_booleans(progress=progress)

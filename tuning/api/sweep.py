@@ -1,7 +1,8 @@
-"""Function `tuning.sweep`: computes the probability of failure and the worst scenarios.
+"""Function `tuning.sweep`: estimates the probability of failure, and finds the worst scenarios.
 
-The rows are in a store (`tuning.sweeps.store`), in a permanent or a temporary folder. The results are one
-document, which `jaxhil sweep --json` prints.
+A row contains the inputs and the outcome of one scenario. The rows are written to a store
+(`tuning.sweeps.store`) in a permanent or temporary folder. All other results are in one JSON document, which
+`jaxhil sweep --json` prints.
 """
 
 import os
@@ -31,7 +32,12 @@ if TYPE_CHECKING:
 
 
 class ConfidenceInterval(NamedTuple):
-    """Confidence interval of 95 %."""
+    """95 % confidence interval of a probability.
+
+    Attributes:
+        low: lower end [1].
+        high: upper end [1].
+    """
 
     low: float
     high: float
@@ -43,10 +49,10 @@ class SweepStudy:
 
     Attributes:
         document: all results, as `jaxhil sweep --json` prints them.
-        manifest: everything that determines the rows.
-        folder: folder of the rows; None if they are only in memory.
-        rows: rows in memory; None if they are in a folder.
-        unwritten: errors for files that could not be written beside the rows.
+        manifest: all inputs that determine the rows (`tuning.sweeps.manifest.Manifest`).
+        folder: folder with the rows; None if the rows are only in memory.
+        rows: rows in memory, one per scenario; None if the rows are in a folder.
+        unwritten: errors of files, other than the rows, that could not be written.
     """
 
     document: dict[str, Any]
@@ -57,10 +63,10 @@ class SweepStudy:
 
     @cached_property
     def table(self) -> "pyarrow.Table":
-        """Return the rows, one per scenario, as an Arrow table with units and meanings as field metadata.
+        """Return the rows, one per scenario, as an Arrow table whose field metadata state unit and meaning.
 
-        Rows in a folder are read on first use, because they may exceed the memory. Raise `InputError` if they
-        no longer exist.
+        Rows in a folder are read when this property is first used, because they may exceed the memory. Raise
+        `InputError` if the rows no longer exist.
         """
         from tuning.sweeps.store import read_store
 
@@ -68,14 +74,18 @@ class SweepStudy:
             return self.rows
         assert self.folder is not None
         table = _read_table(read_store(self.folder))
-        if table.num_rows != (there := self.document["scenarios"]):
-            found = f"found {table.num_rows} scenarios, expected the study's {there}"
-            raise InputError(f"{to_one_line(str(self.folder))}: {found}")
+        if table.num_rows != (scenarios := self.document["scenarios"]):
+            problem = f"found {table.num_rows} scenarios, expected {scenarios}, as when the sweep ended"
+            raise InputError(f"{to_one_line(str(self.folder))}: {problem}")
         return table
 
     @property
     def failure_probability(self) -> float:
-        """Return the share of failed scenarios: an error beyond the limit, or a run that did not end well."""
+        """Return the estimated probability [1] that a scenario fails.
+
+        A scenario fails if an error exceeds the limit, if a contact does not end, or if a real contact is
+        much harder, shorter or longer than the ideal contact.
+        """
         return self.document["failure_probability"]["value"]
 
     @property
@@ -88,14 +98,14 @@ class SweepStudy:
     def verdict(self) -> str:
         """Return the verdict, "good" or "bad".
 
-        It is "good" if no scenario failed or, with an acceptable probability, if the interval ends at or
-        below it.
+        The verdict is "good" if no scenario failed. If an acceptable failure probability is given, the
+        verdict is "good" if the upper end of the confidence interval is at most this probability.
         """
         return self.document["verdict"]
 
     @contextmanager
     def store(self) -> Iterator["SweepStore"]:
-        """Provide the rows in a store: that of the folder, or a temporary one within the context."""
+        """Provide a store with the rows: the store in the folder, or a temporary store within the context."""
         from tuning.sweeps.chunk_file import from_table
         from tuning.sweeps.store import open_store, read_store, write_chunk
 
@@ -119,18 +129,18 @@ def sweep(
     progress: bool = False,
     **options: Any,
 ) -> SweepStudy:
-    """Compute the Monte Carlo robustness of a gain file on scenarios drawn from its mechanism's uncertainty.
+    """Estimate the failure probability of gains on scenarios drawn from the mechanism's uncertainty.
 
-    Scenario i depends only on the seed and on i; its row equals that of `jaxhil sweep` to the last bit.
+    Scenario i depends only on the seed and on i. Its results equal those of `jaxhil sweep` to the last bit.
 
     Args:
         gains: path of a gain file or of its folder, or a result of `tuning.tune`.
-        folder: folder for the rows and plots; None keeps the rows in memory.
+        folder: folder for the results of the scenarios and for plots; None keeps the results in memory.
         progress: report the progress on standard error.
         **options: OPTIONS
 
     Returns:
-        The failure probability with its interval, the verdict, the rows, and all results.
+        The failure probability with its confidence interval, the verdict, and the results of all scenarios.
 
     Raises:
         InputError: If an argument is unusable, or the folder cannot be written; the message has one line.
@@ -148,7 +158,7 @@ def sweep(
         target = arguments.check_path("folder", folder)
         return run_study(gains, settings, target, progress)
     if settings.resume:
-        raise ArgumentError("resume", "without a folder", "with the folder of a sweep")
+        raise ArgumentError("resume", "no folder", "the folder of an interrupted sweep")
     with tempfile.TemporaryDirectory(prefix="jaxhil-sweep-") as temporary:
         return run_study(gains, settings, Path(temporary), progress, keep=False)
 
@@ -156,7 +166,11 @@ def sweep(
 def run_study(
     gains: Any, options: SweepOptions, folder: Path, progress: bool, keep: bool = True
 ) -> SweepStudy:
-    """Compute what the store in the folder lacks; with `keep`, also write plots and the document."""
+    """Compute the scenarios that the store in `folder` lacks, and the additional studies of the options.
+
+    With `keep`, also write plots and the JSON document to the folder; otherwise, the result contains the
+    rows.
+    """
     path = gains if hasattr(gains, "document") else arguments.find_gain_file(gains)
     with jax_context(), _connect_workers(options.scheduler) as workers:
         from tuning.statistics.intervals import estimate_sequence_scenarios
@@ -182,7 +196,7 @@ def run_study(
                     if options.until_width is None:
                         return text
                     needed = estimate_sequence_scenarios(probability.value, options.until_width)
-                    return f"{text}, about {needed} wanted"
+                    return f"{text}, about {needed} needed"
 
                 bar.reach(0, "running scenarios")
                 finished_sweep, tally = run_sweep(
@@ -201,7 +215,7 @@ def run_study(
 
 
 def _connect_workers(address: str | None) -> AbstractContextManager["ClusterWorkers | None"]:
-    """Connect to the workers of a cluster; None if no address is given."""
+    """Provide a connection to the workers of a cluster, or None if no address is given."""
     from tuning.caches.cluster import connect_workers
 
     return nullcontext() if address is None else connect_workers(address)
@@ -216,9 +230,10 @@ def _add_studies(
     keep: bool,
     workers: "ClusterWorkers | None",
 ) -> list[InputError]:
-    """Add plots and additional studies to the document, and write it after every step.
+    """Add plots and additional studies to the document; with `keep`, write the document after every step.
 
-    Return the errors for files that could not be written, so that a full disk does not cost the verdict.
+    Return the errors of files that could not be written. These errors are not raised, so that the results are
+    not lost if the disk is full.
     """
     from tuning.plots.sweep import write_plots
     from tuning.sweeps.run_sweep import compare_precisions
@@ -258,7 +273,7 @@ def _add_studies(
 def _build_document(
     options: SweepOptions, store: "SweepStore", finished_sweep, tally, rate: float | None
 ) -> dict[str, Any]:
-    """Return the JSON document of a sweep, without the additional studies."""
+    """Return the JSON document of a sweep, before the additional studies are added."""
     from tuning.sweeps.run_sweep import count_outcomes
     from tuning.sweeps.tally import estimate_error_quantiles, estimate_failure_probability
 
@@ -291,7 +306,7 @@ def _build_document(
 
 
 def _scenario_entry(store: "SweepStore", mechanism: Any, index: int) -> dict[str, Any]:
-    """Return the document's entry of one scenario: outcome, worst error, its contact, and inputs."""
+    """Return the JSON entry of one scenario: outcome, inputs, and the worst error with its contact."""
     from tuning.sweeps.columns import list_allowed_texts, list_contact_columns
     from tuning.sweeps.store import read_row
 
@@ -304,14 +319,14 @@ def _scenario_entry(store: "SweepStore", mechanism: Any, index: int) -> dict[str
         "index": index,
         "outcome": list_allowed_texts("outcome")[int(row["outcome"][0])],
         "worst_error": worst,
-        # None if no contact ended.
+        # The number is None if no contact ended.
         "worst_contact": next((slot.number for slot, value in errors.items() if value == worst), None),
         "inputs": {column.name: numbers[column.name] for column in columns if column.kind == "input"},
     }
 
 
 def _read_table(store: "SweepStore") -> "pyarrow.Table":
-    """Return all rows of the store, sorted by index."""
+    """Return all intact rows of the store as an Arrow table, sorted by scenario index."""
     import pyarrow
 
     from tuning.sweeps.chunk_file import build_arrow_schema, to_table

@@ -20,8 +20,8 @@ from tuning.api.options import (
 )
 from tuning.sweeps import MAX_CHUNK_SIZE, MAX_SCENARIOS, MAX_SEED, PRECISIONS, SAMPLINGS
 
-MAX_SOBOL_SCENARIOS = 2**20  # largest number of scenarios for each input
-DEFAULT_SOBOL_SCENARIOS = 1024
+MAX_SOBOL_SCENARIOS = 2**20  # scenarios for the Sobol indices of each input
+DEFAULT_SOBOL_SCENARIOS = 1024  # scenarios for the Sobol indices of each input, a power of two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,16 +32,21 @@ class SweepOptions:
         int, number_option("Scenarios to draw and run."), AllowedValues(1, MAX_SCENARIOS)
     ] = 100_000
     seed: Annotated[
-        int, number_option("Seed; scenario i depends only on the seed and on i."), AllowedValues(0, MAX_SEED)
+        int,
+        number_option("Seed of the scenarios; scenario i depends only on the seed and on i."),
+        AllowedValues(0, MAX_SEED),
     ] = 0
     sampling: Annotated[
         str,
-        arg(metavar="NAME", help="random, or sobol (scrambled, several replicates)."),
+        arg(metavar="NAME", help="Sampling: random, or sobol (several replicates of scrambled sequences)."),
         AllowedValues(names=SAMPLINGS),
     ] = "random"
     precision: Annotated[
         str,
-        arg(metavar="NAME", help="float64, or float32: faster, and compared with float64 on a subset."),
+        arg(
+            metavar="NAME",
+            help="float64; or float32, which is faster and is compared with float64 on a subset.",
+        ),
         AllowedValues(names=PRECISIONS),
     ] = "float64"
     works: Annotated[
@@ -49,51 +54,56 @@ class SweepOptions:
         arg(
             name="works",
             metavar="",
-            help="Also compute the mechanical work of the real force, to 1e-6; tens of times slower.",
+            help="Also compute the mechanical work of the real force to 1e-6; this is tens of times slower.",
         ),
     ] = False
     limit: Limit = 0.01
     until_width: Annotated[
         float | None,
-        text_option("WIDTH", "Stop once the probability's interval is this narrow, or after --scenarios."),
+        text_option(
+            "WIDTH",
+            "Stop as soon as the failure probability's interval is at most this wide, or after --scenarios.",
+        ),
         AllowedValues(math.ulp(0.0), 1.0, words="a width above 0, at most 1"),
     ] = None
     drivers: Annotated[
         int | None,
         text_option(
             "[NUMBER]",
-            "Also Sobol indices of the error, from a power of two of scenarios; bare: "
-            f"{DEFAULT_SOBOL_SCENARIOS}.",
+            "Also compute Sobol indices of the error, from this number of scenarios (a power of two); "
+            f"without a number from {DEFAULT_SOBOL_SCENARIOS}.",
         ),
         AllowedValues(2, MAX_SOBOL_SCENARIOS, words=f"a power of two, 2 to {MAX_SOBOL_SCENARIOS}"),
     ] = None
     rare: Annotated[
         float | None,
         text_option(
-            "[LIMIT]", "Also subset simulation of rare errors beyond this limit; bare, or 0: --limit."
+            "[LIMIT]",
+            "Also estimate the probability of rare errors above this limit by subset simulation; without a "
+            "number, or for 0, the limit is --limit.",
         ),
     ] = None
     acceptable: Annotated[
         float | None,
         text_option(
             "PROBABILITY",
-            "Failure probability that the interval may reach; by default no run may fail.",
+            "Acceptable failure probability, for the interval's upper end; by default no scenario may fail.",
         ),
         AllowedValues(0.0, 1.0, words="a probability, 0 to 1"),
     ] = None
     resume: Resume = False
     chunk: Annotated[
         int,
-        number_option("Scenarios computed at a time, and rows of each chunk of the store."),
+        number_option("Number of scenarios that are computed together and stored as one chunk."),
         AllowedValues(1, MAX_CHUNK_SIZE),
     ] = 16384
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Check all options. Raise `InputError`."""
+        """Raise `InputError` if an option's value, or a combination of options, is not allowed."""
         check_options(self)
         if self.until_width is not None and self.sampling != "random":
-            raise ArgumentError("until_width", f"with --sampling {self.sampling}", "with random")
+            raise ArgumentError("until_width", f"sampling {self.sampling}", "sampling random")
         if self.drivers is not None and self.drivers & (self.drivers - 1):
             raise ArgumentError("drivers", str(self.drivers), f"a power of two, 2 to {MAX_SOBOL_SCENARIOS}")
         if (rare := self.rare) is not None:
@@ -101,9 +111,9 @@ class SweepOptions:
             if not (is_number and (rare == 0 or (math.isfinite(rare) and rare >= self.limit))):
                 raise ArgumentError("rare", _format_value(rare), "a finite error, at least --limit")
             if rare == 0 and not math.isfinite(self.limit):
-                raise ArgumentError("rare", "without a limit", "with a finite --limit")
+                raise ArgumentError("rare", "an infinite --limit", "a finite --limit")
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as text for a message."""
+    """Return a number, or any other value of an option, as text for an error message."""
     return str(value) if arguments.is_number(value) else format_value(value)

@@ -1,4 +1,7 @@
-"""Additional studies of `tuning.sweep`, which are computed, or read from the store on resuming."""
+"""Additional studies of `tuning.sweep`: Sobol indices and subset simulation.
+
+With `--resume`, a study that is already in the store is read instead of computed.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +15,10 @@ from tuning import terminal
 def compute_sobol_indices(
     options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
 ) -> dict[str, Any]:
-    """Return the document's entry of Sobol indices; write errors are added to `unwritten`."""
+    """Compute or read the Sobol indices of the error, and return their JSON entry.
+
+    If the indices cannot be written to the store, the error is added to `unwritten` instead of raised.
+    """
     from tuning.statistics.sobol_indices import count_evaluations
     from tuning.sweeps.stored_studies import IndicesRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import compute_error_indices, group_independent_inputs
@@ -23,7 +29,7 @@ def compute_sobol_indices(
     if indices is not None:
         _report_stored("drivers", study_path(store, request), progress)
         return indices._asdict()
-    # Sensor noise adds an input, which the progress bar may ignore.
+    # Sensor noise is a further input, which this estimate for the progress bar ignores.
     total = count_evaluations(len(group_independent_inputs(sweep.mechanism)), number)
     with _study_runner(options, store, total, "scenarios", "drivers", progress, workers) as running:
         indices = compute_error_indices(sweep, number, running)
@@ -36,7 +42,10 @@ def compute_sobol_indices(
 def run_subset_simulation(
     options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
 ) -> dict[str, Any]:
-    """Return the document's entry of the subset simulation; write errors are added to `unwritten`."""
+    """Compute or read the subset simulation of rare failures, and return its JSON entry.
+
+    If the result cannot be written to the store, the error is added to `unwritten` instead of raised.
+    """
     from tuning.sweeps.stored_studies import RareFailureRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import count_most_scenarios, estimate_rare_failure
 
@@ -61,7 +70,7 @@ def run_subset_simulation(
 def _study_runner(
     options: Any, store, total: int, unit: str, study: str, progress: bool, workers: Any
 ) -> Iterator[Any]:
-    """Provide the function that runs a study's scenarios, here or on a cluster, with checkpoints."""
+    """Provide the settings for running a study's scenarios: process or cluster, checkpoints, progress."""
     from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
     from tuning.sweeps.cluster_computers import BATCHES_PER_STUDY, build_point_computer
     from tuning.sweeps.point_batches import PointRunSettings
@@ -77,7 +86,7 @@ def _study_runner(
 
 @contextmanager
 def collect_input_errors(unwritten: list[InputError]) -> Iterator[None]:
-    """Add an `InputError` within the context to the list, so that it is reported later."""
+    """Catch an `InputError` within the context, and add it to the list `unwritten`."""
     try:
         yield
     except InputError as error:
@@ -85,7 +94,7 @@ def collect_input_errors(unwritten: list[InputError]) -> Iterator[None]:
 
 
 def _subset_simulation_entry(limit: float, estimate) -> dict[str, Any]:
-    """Return the document's entry of a subset simulation."""
+    """Return the JSON entry of a subset simulation: limit, probability with interval, and replicates."""
     from tuning.sweeps.studies import is_spread_beyond_formula
 
     names = ("probability", "low", "high", "coefficient_of_variation", "formula_coefficient_of_variation")
@@ -98,6 +107,6 @@ def _subset_simulation_entry(limit: float, estimate) -> dict[str, Any]:
 
 
 def _report_stored(study: str, path: Path, progress: bool) -> None:
-    """Report that a study was read from a file."""
+    """Print a note that a study was read from a file instead of computed, if `progress` is shown."""
     if progress:
-        terminal.note(f"{study}: as kept in {to_one_line(str(path))}")
+        terminal.note(f"{study}: read from {to_one_line(str(path))}")

@@ -25,23 +25,23 @@ def tune(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Tune a compensator's gains for a mechanism, and evaluate them on fresh scenarios.
+    """Tune a compensator's gains for a mechanism, and evaluate the tuned gains on fresh scenarios.
 
-    Equal arguments give equal gains to the last bit, also with the command `jaxhil tune`.
+    Equal arguments give gains that are equal to the last bit, also with the command `jaxhil tune`.
 
     Args:
-        mechanism: result of `jaxhil.load`, or a name or path that it accepts; or a list of these, which are
-            tuned together.
-        compensator: name of a compensator, built in or registered; in six axes "none", "phase_lead" or
+        mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,
+            whose mechanisms are tuned together.
+        compensator: name of a built-in or registered compensator; for six axes, "none", "phase_lead" or
             "phase_lead_per_axis".
         progress: report the progress on standard error.
         **options: OPTIONS
 
-    `start` also accepts results of `tune`, and `objective` a function of the metrics of all scenarios, which
-    returns a number >= 0 to be minimised.
+    `start` also accepts results of `tune`. `objective` also accepts a function of the metrics of all
+    scenarios that returns a number >= 0, which is minimised.
 
     Returns:
-        A `TunedGains`, or a list of them for a list of mechanisms.
+        A `TunedGains` with gains, errors and verdict; for a list of mechanisms, a list of `TunedGains`.
 
     Raises:
         InputError: If an argument is unusable; the message has one line.
@@ -59,7 +59,7 @@ def tune(
     loaded, is_list = arguments.load_any_mechanisms(mechanism)
     settings.check()
     for entry in loaded:
-        settings.fits(entry.mechanism)
+        settings.check_mechanism(entry.mechanism)
     with jax_context():
         for entry in loaded:
             mechanism_summary.check_can_be_simulated(entry.mechanism, entry.label)
@@ -81,12 +81,18 @@ def tune_each(
     loaded: Sequence[LoadedMechanism | LoadedAnyMechanism],
     options: TuneOptions,
     bar: terminal.Progress,
-    pieces: "Checkpoints | None" = None,
+    checkpoints: "Checkpoints | None" = None,
 ) -> Iterator[tuple[int, TunedGains]]:
-    """Yield the index and the result of every mechanism, as they are finished.
+    """Tune several mechanisms, and yield the index and the result of each as soon as it is finished.
 
-    The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
-    stored there.
+    Args:
+        loaded: mechanisms.
+        options: options of the tuning.
+        bar: progress display.
+        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+
+    Yields:
+        Index into `loaded`, and tuned gains.
     """
     from jaxhil.laws.compensators import axes_of
     from tuning.caches.checkpoints import NO_CHECKPOINTS
@@ -97,14 +103,13 @@ def tune_each(
     settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.known()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
-    checkpoints = pieces or NO_CHECKPOINTS
     results = tune_all(
         mechanisms,
         options.compensator,
         settings,
         work,
         earlier,
-        pieces=checkpoints,
+        pieces=checkpoints or NO_CHECKPOINTS,
         scheduler=options.scheduler,
     )
     for index, result in results:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import EarlierGains
 
-    # The command line accepts names; the function also accepts results and functions.
+    # The command line accepts only texts; the function also accepts results of `tune`, and functions.
     Start = Any
     ObjectiveOption = str | Callable[[Any], Any]
 else:
@@ -47,25 +47,23 @@ class TuneOptions:
     setting: Setting = None
     scenarios: Annotated[
         int | None,
-        text_option("NUMBER", "Scenarios to tune on; by default 32, or 128 where sensors are noisy."),
+        text_option("NUMBER", "Scenarios to tune on; by default 32, or 128 if sensors are noisy."),
         CountRange,
     ] = None
     starts: Annotated[
         int,
-        number_option("Starts of the solver, and number_option of each further group if they disagree."),
+        number_option("Number of starts of the solver, and of starts added each time if results disagree."),
         CountRange,
     ] = 4
     start: Annotated[
         Start,
         text_option(
             "GAINS [GAINS ...]",
-            "Gain files of the same compensator: each mechanism is also tuned from the gains of the most "
-            "similar of their mechanisms.",
+            "Gain files of the same compensator. The tuning of a mechanism also starts from the gains of the "
+            "file whose mechanism is most similar.",
         ),
     ] = ()
-    steps: Annotated[
-        int, number_option("Largest number_option of solver steps from each start."), CountRange
-    ] = 25
+    steps: Annotated[int, number_option("Largest number of solver steps from each start."), CountRange] = 25
     validation: Annotated[int, number_option("Fresh scenarios for the evaluation."), CountRange] = 511
     objective: Annotated[
         ObjectiveOption,
@@ -76,50 +74,51 @@ class TuneOptions:
     ] = "rms"
     divergence_weight: Annotated[
         float,
-        number_option("OptionalWeight of a squared divergence (e > e*) relative to a squared convergence."),
+        number_option("Weight of the squared error of a divergence (e > e*); that of a convergence is 1."),
     ] = 1.0
     command_weight: Annotated[
         OptionalWeight,
         text_option(
             "NUMBER",
-            "Penalty, in multiples of the limit, of a command peak one ideal peak too high; by default 0.3 "
-            "for impulse_ledger, 0 for others.",
+            "Penalty, in multiples of the limit, for each ideal peak force by which the peak command is too "
+            "high; by default 0.3 for impulse_ledger, 0 for others.",
         ),
     ] = None
     noise_weight: Annotated[
         OptionalWeight,
         text_option(
             "NUMBER",
-            "Penalty, in multiples of the limit, of one more amplification of the sensor noise. Default with "
-            "noisy sensors: the quietest gains within the limit; 0: the least error.",
+            "Penalty, in multiples of the limit, for an increase of the noise amplification by 1. By default "
+            "with noisy sensors, the quietest gains within the limit are chosen; 0 chooses the least error.",
         ),
     ] = None
     chatter_weight: Annotated[
         OptionalWeight,
         text_option(
             "NUMBER",
-            "Penalty, in multiples of the limit, of one extra swing of the command by the ideal peak force.",
+            "Penalty, in multiples of the limit, for an additional swing of the command as large as the "
+            "ideal peak force.",
         ),
     ] = None
     transparency_weight: Annotated[
         OptionalWeight,
         text_option(
             "NUMBER",
-            "OptionalWeight of the errors of the same scenarios with a push on the hardware, and with "
-            "more damping; "
+            "Weight of the errors of the same scenarios with a push on the hardware, and with more damping; "
             "by default 1 for impulse_ledger, 0 for others.",
             aliases=("--honesty-weight",),
         ),
     ] = None
     pareto: Annotated[
-        int, number_option("Number of points of a trade-off against the restitution error, each a gain file.")
+        int,
+        number_option("Number of points of a Pareto front of the restitution error, each with a gain file."),
     ] = 0
     pareto_against: Annotated[
         str | None,
         text_option(
             "NAME",
-            "What --pareto trades the error against: noise, peak (of the command) or honesty; by "
-            "default noise, or peak for impulse_ledger.",
+            "Cost that --pareto trades off against the error: noise, peak (of the command) or honesty "
+            "(transparency); by default noise, or peak for impulse_ledger.",
         ),
     ] = None
     global_search: Annotated[
@@ -128,23 +127,26 @@ class TuneOptions:
             name="global-search",
             aliases=("--certify",),
             metavar="",
-            help="Also search the full range of all gains, with 50 times the evaluations, for better ones.",
+            help="Also search the full range of all gains for better gains, with 50 times the evaluations.",
         ),
     ] = False
-    seed: Annotated[int, number_option("SeedRange of scenarios and starts."), SeedRange] = 0
+    seed: Annotated[int, number_option("Seed of scenarios and starts."), SeedRange] = 0
     limit: Limit = 0.01
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Check all options that can be checked without jax. Raise `InputError`."""
+        """Raise `InputError` if a value or a combination of options is not allowed.
+
+        Values that only jax can check are not checked here.
+        """
         check_options(self)
         arguments.check_supports_mechanism(self.compensator, None)
         if callable(self.objective) and self.pareto:
-            raise ArgumentError("objective", "a function beside pareto", "one of rms, cvar, worst")
+            raise ArgumentError("objective", "a function, with pareto", "one of rms, cvar, worst")
         tune_pareto.check_pareto_options(self.pareto, self.pareto_against, self.compensator)
 
-    def fits(self, mechanism: AnyMechanism) -> None:
-        """Raise `InputError` if the mechanism has six axes and an option does not support them."""
+    def check_mechanism(self, mechanism: AnyMechanism) -> None:
+        """Raise `InputError` if an option does not support the number of axes of the mechanism."""
         arguments.check_supports_mechanism(self.compensator, mechanism)
         options = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
         arguments.check_one_axis_arguments(mechanism, **{name: getattr(self, name) for name in options})
@@ -171,7 +173,11 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Return whether the limit is finite and no option of the objective was changed."""
+        """Return whether the quietest gains within the limit are wanted.
+
+        This is the case if the limit is positive and finite, and all options of the objective have their
+        default values.
+        """
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
         is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
         return is_default and 0 < self.limit < math.inf
@@ -190,22 +196,25 @@ class TuneOptions:
             return Objective(self.objective, **weights, limit=limit)
         from tuning.gains.metrics_function import MetricsFunction
 
-        # A user's function gets no default weights: it is minimised as it is.
+        # A user's function is minimised without default weights.
         return Objective(**user_weights, function=MetricsFunction(self.objective), limit=limit)
 
-    def known(self) -> "list[EarlierGains]":
-        """Return the contents of the gain files to start from. Raise `InputError`. This imports jax."""
+    def load_start_gains(self) -> "list[EarlierGains]":
+        """Return the earlier tuned gains that the option `start` names.
+
+        Raise `InputError` if they cannot be read or belong to another compensator. This method imports jax.
+        """
         from tuning.gains.transfer import EarlierGains
 
         start: Any = self.start
-        alone = isinstance(start, (str, os.PathLike)) or hasattr(start, "document")
-        sources: Any = [start] if alone else start
-        tuned = []
+        is_single = isinstance(start, (str, os.PathLike)) or hasattr(start, "document")
+        sources: Any = [start] if is_single else start
+        start_gains = []
         for source in sources:
             loaded = arguments.load_gains(source, "start")
             label = str(source) if isinstance(source, (str, os.PathLike)) else loaded.mechanism.name
             if loaded.compensator != self.compensator:
                 allowed = f"gains of {self.compensator}"
                 raise ArgumentError("start", f"gains of {loaded.compensator}", allowed, to_one_line(label))
-            tuned.append(EarlierGains(loaded.mechanism, loaded.gains, label))
-        return tuned
+            start_gains.append(EarlierGains(loaded.mechanism, loaded.gains, label))
+        return start_gains

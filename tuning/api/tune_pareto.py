@@ -1,4 +1,4 @@
-"""Pareto fronts of `tuning.tune`: gains that trade the error for another cost."""
+"""Pareto fronts of `tuning.tune`: gains that trade off the restitution error against another cost."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,12 @@ if TYPE_CHECKING:
 
 
 def check_pareto_options(number: Any, against: Any, compensator: str) -> None:
-    """Raise `InputError` unless the options describe a possible front.
+    """Raise `InputError` unless a Pareto front with these options can be computed.
 
-    This imports jax if `number` is at least 2.
+    Args:
+        number: number of points; 0 for no front.
+        against: name of the cost; None for the compensator's default.
+        compensator: name of the compensator.
     """
     arguments.check_integers(0, pareto=number)
     if number == 0:
@@ -28,12 +31,12 @@ def check_pareto_options(number: Any, against: Any, compensator: str) -> None:
     if against is not None:
         arguments.check_choice(tuple(PARETO_CRITERIA), pareto_against=against)
     if select_cost_axis(against, compensator) is None:
-        reason = "there is no trade-off, it passes sensor noise on as it is whatever its gains"
+        reason = "its amplification of sensor noise does not depend on its gains"
         raise ArgumentError("pareto", str(number), f"0 for {compensator}: {reason}")
 
 
 def select_cost_axis(against: str | None, compensator: str) -> "ParetoCriterion | None":
-    """Return the cost that the error is traded for, or None if there is no trade-off."""
+    """Return the cost to be traded off against the error, or None if the gains do not affect this cost."""
     from tuning.gains.pareto_search import (
         NOISE_CRITERION,
         PARETO_CRITERIA,
@@ -52,13 +55,21 @@ def compute_fronts(
     number: int,
     against: str | None,
     bar: Progress,
-    pieces: "Checkpoints | None" = None,
+    checkpoints: "Checkpoints | None" = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, list[TradedGains]]]:
-    """Yield the index and the front of every result, as they are finished.
+    """Compute a Pareto front for each tuned mechanism, and yield it as soon as it is finished.
 
-    The `bar` shows the progress. Work stored in the checkpoints `pieces` is not repeated, and new work is
-    stored there. With a `scheduler`, the workers of a cluster compute the fronts.
+    Args:
+        tuned: results of the tuning.
+        number: number of points of a front.
+        against: name of the cost; None for the compensator's default.
+        bar: progress display.
+        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+        scheduler: address of a cluster's scheduler, whose workers compute the fronts; None for this process.
+
+    Yields:
+        Index into `tuned`, and the points of the front.
     """
     from tuning.caches.checkpoints import NO_CHECKPOINTS
     from tuning.gains.pareto import compute_fronts
@@ -69,5 +80,6 @@ def compute_fronts(
     work = SearchProgress(
         lambda text, share, before: bar.tell(text, share * len(results), before * len(results))
     )
-    for index, front in compute_fronts(results, number, work, axis, pieces or NO_CHECKPOINTS, scheduler):
+    checkpoints = checkpoints or NO_CHECKPOINTS
+    for index, front in compute_fronts(results, number, work, axis, checkpoints, scheduler):
         yield index, [TradedGains(tuned[index], front, point) for point in front.points]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tuning.gains.pareto import ParetoFront, ParetoPoint
     from tuning.gains.tune import ErrorMetrics, TuneResult
 
-# Names in files of the objective's weights, where they differ.
+# Names of the objective's weights in files, if they differ from the names of the fields.
 NAMES_IN_FILES = {"transparency_weight": "honesty_weight"}
 
 
@@ -25,9 +25,9 @@ class TunedGains:
 
     Attributes:
         found: all results of the tuning (`tuning.gains.tune.TuneResult`).
-        mechanism_sha256: SHA-256 of the mechanism's file.
-        limit: largest rms error with a good verdict [1].
-        pareto: points of the Pareto front, if one was requested.
+        mechanism_sha256: SHA-256 digest of the mechanism file.
+        limit: largest rms error for which the verdict is good [1].
+        pareto: points of the Pareto front; empty if no front was requested.
     """
 
     found: "TuneResult"
@@ -37,36 +37,40 @@ class TunedGains:
 
     @property
     def mechanism(self) -> AnyMechanism:
-        """Return the mechanism that the gains were tuned for."""
+        """Return the mechanism for which the gains were tuned."""
         return self.found.mechanism
 
     @property
     def compensator(self) -> str:
-        """Return the name of the tuned compensator."""
+        """Return the name of the compensator whose gains were tuned."""
         return self.found.compensator
 
     @property
     def gains(self) -> dict[str, float]:
-        """Return all gains by name [SI units], including those that are not tuned."""
+        """Return all gains of the compensator by name [SI units], including gains that were not tuned."""
         return self.found.gains
 
     @property
     def literature(self) -> dict[str, float]:
-        """Return the gains of the literature's rules, or of the setting, by name [SI units]."""
+        """Return the gains by the literature's rule, or those of the chosen setting, by name [SI units]."""
         return self.found.literature
 
     @property
     def figures(self) -> "dict[str, ErrorMetrics]":
-        """Return the errors on fresh scenarios by gains.
+        """Return the error metrics on fresh scenarios for three sets of gains.
 
-        The keys are "before" (no compensation), "literature" and "tuned"; each value has rms, p99, max [1]
-        and more.
+        The keys are "before" (no compensation), "literature" and "tuned". Each value has the attributes rms,
+        p99, max [1] and more.
         """
         return self.found.figures
 
     @property
     def parts(self) -> "dict[str, dict[str, ErrorMetrics]]":
-        """Return "energy_error" and "twist_error" of six axes, each like `figures`; empty for one axis."""
+        """Return separate metrics of the energy error and the twist error, for six axes.
+
+        The keys are "energy_error" and "twist_error"; each value has the form of `figures`. The dictionary is
+        empty for one axis.
+        """
         from tuning.gains.tune import compute_metrics_by_error
 
         return compute_metrics_by_error(self.found)
@@ -75,36 +79,39 @@ class TunedGains:
     def verdict(self) -> str:
         """Return the verdict, "good" or "bad".
 
-        It is "good" if, with and without sensor noise, every contact ended, the rms error is within the
-        limit, and at most 1 % of the real contacts are harder, shorter or longer than the ideal contact
-        allows.
+        The verdict is "good" if three conditions hold with and without sensor noise: every contact ended; the
+        rms error is within the limit; at most 1 % of the real contacts have a peak force above 2 times, or a
+        duration outside 0.5 to 2 times, that of the ideal contact.
         """
         return "good" if tune_verdict.is_good(self.found, self.limit) else "bad"
 
     @property
     def without_noise(self) -> "ErrorMetrics | None":
-        """Return the errors on the same scenarios without sensor noise; None without noise in the file."""
+        """Return the tuned gains' error metrics on the same scenarios without sensor noise.
+
+        The result is None if the mechanism has no sensor noise.
+        """
         return self.found.without_noise
 
     @functools.cached_property
     def command(self) -> CommandMetrics:
-        """Return the metrics of the force command with the tuned gains.
+        """Return metrics of the force command with the tuned gains.
 
-        `peak_p99` is the 99th percentile of its peak over the ideal contact's peak force [1], and
-        `noise_amplification` the amplification of the sensor noise [1].
+        `peak_p99` is the 99th percentile of the command's peak divided by the ideal contact's peak force [1].
+        `noise_amplification` is the amplification of the sensor noise [1].
         """
         return tune_verdict.command_metrics(self.found)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return a sentence for each metric of `command` beyond its bound."""
+        """Return a sentence for each metric in `command` that exceeds its bound."""
         return tune_verdict.command_warnings(self.found, self.command)
 
     @functools.cached_property
     def meaning(self) -> "MechanismSummary | None":
-        """Return a summary of the mechanism: mass, ideal contacts, rates, warnings of implausible values.
+        """Return a summary of the mechanism: mass, ideal contacts, rates, and warnings of implausible values.
 
-        In six axes this is None; a result of `jaxhil.simulate` has the summary.
+        The summary is None for six axes, where only a result of `jaxhil.simulate` has a summary.
         """
         from jaxhil.simulation import plausibility
 
@@ -148,7 +155,11 @@ class TunedGains:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the gain file. Raise `InputError` if it cannot be written."""
+        """Write the gain file.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
         from tuning.gain_file import write_gain_file
 
         write_gain_file(arguments.check_path("path", path), self.document)
@@ -156,12 +167,12 @@ class TunedGains:
 
 @dataclass(frozen=True)
 class TradedGains:
-    """Point of a Pareto front.
+    """Gains of one point of a Pareto front between the restitution error and another cost.
 
     Attributes:
-        tuned: gains tuned without a trade-off.
-        front: the whole front (`tuning.gains.pareto.Front`).
-        point: this point of the front (`tuning.gains.pareto.Point`).
+        tuned: gains that were tuned for the least error, without regard to the other cost.
+        front: the whole front (`tuning.gains.pareto.ParetoFront`).
+        point: this point of the front (`tuning.gains.pareto.ParetoPoint`).
     """
 
     tuned: TunedGains
@@ -170,17 +181,21 @@ class TradedGains:
 
     @property
     def gains(self) -> dict[str, float]:
-        """Return the gains of the point by name [SI units]."""
+        """Return the gains of this point by name [SI units]."""
         return self.point.gains
 
     @property
     def figures(self) -> "ErrorMetrics":
-        """Return the errors on fresh scenarios."""
+        """Return the error metrics on fresh scenarios with the gains of this point."""
         return self.point.figures
 
     @property
     def traded(self) -> dict[str, Any]:
-        """Return the weight, the cost, the error [1], and whether the point is on the front."""
+        """Return the JSON entry of this point: weight, cost, error [1], and whether it is on the front.
+
+        The weight is that of the cost in the tuning's objective. A point is not on the front if another point
+        has no larger error and cost, and one of them is smaller.
+        """
         axis = self.front.axis
         return {
             NAMES_IN_FILES.get(axis.weight, axis.weight): self.point.weight,
@@ -215,7 +230,11 @@ class TradedGains:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the gain file. Raise `InputError` if it cannot be written."""
+        """Write the gain file of this point.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
         from tuning.gain_file import write_gain_file
 
         write_gain_file(arguments.check_path("path", path), self.document)

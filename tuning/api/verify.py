@@ -1,7 +1,7 @@
 """Function `tuning.verify`: checks that the rig's runtime reproduces the simulated controller.
 
-A bundle is checked file by file, then by its own self-test in an isolated interpreter, and then its gain file
-is verified.
+The checks of a bundle have three steps: compare all files with a new export, run the bundle's self-test in an
+isolated interpreter, and verify the gain file.
 """
 
 import os
@@ -36,7 +36,7 @@ class Verification:
 
     @property
     def good(self) -> bool:
-        """Return whether the runtime agrees with the simulation."""
+        """Return whether the runtime's commands agree with the simulated ones, and all files are intact."""
         return self.document["verdict"]
 
     @property
@@ -52,22 +52,24 @@ class VerifyOptions:
     key: Annotated[
         str | None,
         text_option(
-            "KEY", "The bundle must be signed by this public key (Ed25519, PEM); needs jaxhil[sign]."
+            "KEY", "Require a signature that this public key confirms (Ed25519, PEM); needs jaxhil[sign]."
         ),
     ] = None
     scenarios: Annotated[
-        int, number_option("Runs to replay: the nominal one, then draws."), AllowedValues(1)
+        int,
+        number_option("Number of runs to replay: the nominal run, then drawn scenarios."),
+        AllowedValues(1),
     ] = 6
-    seed: Annotated[int, number_option("SeedRange of the draws."), SeedRange] = 0
+    seed: Annotated[int, number_option("Seed of the drawn scenarios."), SeedRange] = 0
 
 
 @arguments.convert_os_errors
 @add_options(VerifyOptions)
 def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification:
-    """Replay recorded signals through the rig's runtime.
+    """Replay recorded signals through the rig's runtime, and compare its commands with the simulated ones.
 
-    For a bundle, the self-test runs first. No code of a bundle is run unless the bundle is byte for byte what
-    this version exports for its gains.
+    The self-test of a bundle runs first. Code of a bundle is run only if the bundle equals, byte for byte,
+    what this version exports for the bundle's gains.
 
     Args:
         path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.
@@ -78,7 +80,7 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
         The verdict with its reasons, and all results.
 
     Raises:
-        InputError: If there is nothing to read, or the compensator has no runtime; the message has one line.
+        InputError: If the path cannot be read, or the compensator has no runtime; the message has one line.
 
     Example:
         >>> import tuning
@@ -98,24 +100,24 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
         return Verification(_verify_bundle(folder, key, scenarios, seed, progress))
     file = path if is_result else arguments.find_gain_file(path, "path")
     if key is not None:
-        raise ArgumentError("key", format_value(str(key)), "only with a bundle: gain files are not signed")
+        raise ArgumentError("key", format_value(str(key)), "no key for a gain file: only bundles are signed")
     label = {} if is_result else {"file": str(file)}
     return Verification(_verify_gains(file, label, scenarios, seed, progress))
 
 
 def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: bool) -> dict[str, Any]:
-    """Return the document of the verification of a bundle."""
+    """Verify a bundle: files, signature, self-test and gain file; return the JSON document of the result."""
     from tuning.bundle.checking import check_bundle, run_selftest
     from tuning.bundle.signing import load_verifier
 
     signed_by = None if key is None else load_verifier(arguments.check_path("key", key))
     with jax_context(), terminal.show_stages(2, progress) as stages:
-        stages.begin("making the bundle anew from its gains")
+        stages.begin("exporting the bundle again from its gains")
         checked = check_bundle(folder, signed_by)
         document = {"bundle": str(folder), "signature": checked.signature, "self_test": []}
         reasons = checked.reasons
         if not reasons:
-            stages.begin("running its self-test")
+            stages.begin("running the bundle's self-test")
             document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
     if reasons:
         return {**document, "verdict": False, "reasons": reasons}
@@ -123,7 +125,7 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
 
 
 def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
-    """Return the document of the verification of a gain file, or of gains in memory."""
+    """Verify a gain file, or gains in memory; return `document` with the JSON entries of the result added."""
     with jax_context():
         import msgspec
 
@@ -140,7 +142,7 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether a path is a folder; False if it cannot be read."""
+    """Return whether a path is that of a folder; False if the path cannot be accessed."""
     try:
         return path.is_dir()
     except (OSError, ValueError):

@@ -1,1 +1,1 @@
-"""Command line `jaxhil`."""
+"""Command-line interface of `jaxhil`: options, parser and commands."""

@@ -32,7 +32,7 @@ DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
 @dataclass(frozen=True)
 class InitOptions:
-    """Write a mechanism file to start from, with the meaning, unit, range and default of every key.
+    """Write a mechanism file as a template, with the meaning, unit, range and default of every key.
 
     Example: jaxhil init rig-300kg --output my-rig.toml
 
@@ -43,27 +43,29 @@ class InitOptions:
         Positional[str | None],
         text_option(
             "[NAME]",
-            "Built-in mechanism to copy the values from, by default 'varying'; or the file, NAME.toml.",
+            "Built-in mechanism to copy, by default 'varying'; or NAME.toml, the file to write.",
         ),
     ] = None
     output: Annotated[
         str | None, text_option("FILE", "File to write; by default mechanism.toml.", aliases=("-o",))
     ] = None
-    list: Annotated[FlagCreatePairsOff[bool], text_option(None, "Only list the names; write nothing.")] = (
-        False
-    )
+    list: Annotated[
+        FlagCreatePairsOff[bool],
+        text_option(None, "Only list the names of the built-in mechanisms; write nothing."),
+    ] = False
     json: Json = False
     timings: Timings = False
 
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """Run the contacts once; report restitution, reference, error, peak force and duration of each.
+    """Simulate the contacts once; report restitution, error, peak force and duration of each contact.
 
     Example: jaxhil simulate rig-300kg --compensator phase_lead --set approach.velocity=0.01
 
-    Exit code 0 if every |e - e*| is within the limit, every real contact's peak force is at most 2 times, and
-    its duration 0.5 to 2 times that of the ideal contact; otherwise 1.
+    The exit code is 0 if three conditions hold for every contact: |e - e*| is within the limit, the real peak
+    force is at most 2 times the ideal contact's, and the duration is 0.5 to 2 times the ideal contact's.
+    Otherwise it is 1.
     """
 
     file: OptionalFile = None
@@ -73,20 +75,22 @@ class SimulateOptions:
     overrides: Overrides = ()
     unset: Unset = ()
     plot: Annotated[
-        str | None, arg(metavar="[FILE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_PLOT}.")
+        str | None,
+        arg(metavar="[FILE]", help=f"Write a plot (.png, .pdf or .svg); without a name to {DEFAULT_PLOT}."),
     ] = None
     animate: Annotated[
         str | None,
         text_option(
-            "FILM", "Six axes: animate the ideal contact beside the one on the rig, to a .gif or .mp4 file."
+            "FILM",
+            "Six axes only: write an animation of the ideal contact and of the one on the rig (.gif, .mp4).",
         ),
     ] = None
     log: Annotated[
         str | None,
-        text_option("FILE", "Write every tick to a CSV file; for one axis it is a log that identify reads."),
+        text_option("FILE", "Write every tick to a CSV file; jaxhil identify reads such a file of one axis."),
     ] = None
     reference: Annotated[
-        bool, arg(help="Six axes: simulate only the ideal contact of the two bodies, without the rig.")
+        bool, arg(help="Six axes only: simulate the ideal contact of the two bodies, without the rig.")
     ] = False
     limit: Limit = 0.01
     seed: Annotated[int, number_option("Seed of the sensor noise.")] = 0
@@ -96,14 +100,15 @@ class SimulateOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(TuneOptions):
-    """Tune a compensator's gains for every mechanism; evaluate them on fresh scenarios.
+    """Tune a compensator's gains for each mechanism, and evaluate the tuned gains on fresh scenarios.
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots. Exit code 1 if a tuned rms error exceeds the limit, with or without
-    sensor noise, or if more than 1 % of the real contacts have a peak force above 2 times, or a duration
-    below 0.5 or above 2 times that of the ideal contact. Warns if the force command peaks above 1.5 ideal
-    peaks, or amplifies the sensor noise more than twice.
+    Writes DIR/NAME/gains.json and plots for each mechanism NAME. The exit code is 1 if, with or without
+    sensor noise, a contact does not end, the rms error exceeds the limit, or more than 1 % of the real
+    contacts have a peak force above 2 times or a duration outside 0.5 to 2 times the ideal contact's. Warns
+    if the force command exceeds 1.5 times the ideal peak force, or amplifies the sensor noise more than
+    twice.
     """
 
     files: Files = ()
@@ -117,20 +122,20 @@ class Tune(TuneOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(SweepOptions):
-    """Monte Carlo robustness: the probability of failure, and the worst scenarios.
+    """Estimate the probability of failure, and find the worst scenarios, by Monte Carlo simulation.
 
     Example: jaxhil sweep jaxhil-out/varying/gains.json --scenarios 1000000 --output study/sweep
 
-    Exit code 0 if no scenario failed or, with --acceptable, if the confidence interval ends below it;
-    otherwise 1.
+    The exit code is 0 if no scenario failed. With --acceptable, it is 0 if the upper end of the probability's
+    95 % confidence interval is at most the acceptable probability. Otherwise it is 1.
     """
 
-    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder_option.")]
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
     output: Annotated[
         str | None,
         text_option(
             "DIR",
-            "Folder of the store; by default NAME-sweep beside the gain file NAME.json.",
+            "Folder for the results; by default NAME-sweep in the folder of the gain file NAME.json.",
             aliases=("-o",),
         ),
     ] = None
@@ -140,18 +145,21 @@ class Sweep(SweepOptions):
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Run one scenario of a sweep again, and check that all its numbers are the same to the last bit.
+    """Run one scenario of a sweep again, and check that every number equals the stored one bit by bit.
 
     Example: jaxhil replay jaxhil-out/varying/gains-sweep 1234 --plot worst.png
 
-    Exit code 1 if any number differs from the stored one.
+    The exit code is 1 if any number differs from the stored one.
     """
 
-    store: Annotated[Positional[str], arg(metavar="STORE", help="Folder that a sweep wrote.")]
-    index: Annotated[Positional[int], arg(metavar="INDEX", help="Number of the scenario.")]
+    store: Annotated[Positional[str], arg(metavar="STORE", help="Folder with the results of a sweep.")]
+    index: Annotated[Positional[int], arg(metavar="INDEX", help="Index of the scenario, from 0.")]
     plot: Annotated[
         str | None,
-        arg(metavar="[FILE]", help=f"Plot to a .png, .pdf or .svg file; bare: {DEFAULT_REPLAY_PLOT}."),
+        arg(
+            metavar="[FILE]",
+            help=f"Write a plot (.png, .pdf or .svg); without a name to {DEFAULT_REPLAY_PLOT}.",
+        ),
     ] = None
     json: Json = False
     timings: Timings = False
@@ -159,18 +167,19 @@ class ReplayOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(CompareOptions):
-    """Compare compensators, each tuned, on the same fresh scenarios, with confidence intervals.
+    """Tune several compensators, and compare their errors on the same fresh scenarios.
 
-    Compensators with settings for any mechanism use these settings, untuned.
+    A compensator that has predefined settings is not tuned: each setting is evaluated.
 
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
-    Writes DIR/compare.json with all metrics and gains, and plots.
+    Writes DIR/compare.json, which contains all metrics with confidence intervals and all gains, and plots.
     """
 
     files: Files = ()
     suites: Annotated[
-        FlagCreatePairsOff[bool], text_option(None, "Also the standard suites, in addition to the files.")
+        FlagCreatePairsOff[bool],
+        text_option(None, "Compare on the standard suites of mechanisms too, in addition to FILE."),
     ] = False
     output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/compare"
     overrides: Overrides = ()
@@ -182,14 +191,14 @@ class Compare(CompareOptions):
 
 @dataclass(frozen=True)
 class MechanismsOptions:
-    """List the built-in mechanism files, with their sources and paths.
+    """List the built-in mechanism files with their literature sources and paths.
 
     Example: jaxhil mechanisms --json
     """
 
     schema: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Print the JSON Schema of mechanism files instead, for editors."),
+        text_option(None, "Print only the JSON Schema of mechanism files, which editors use to check them."),
     ] = False
     json: Json = False
     timings: Timings = False

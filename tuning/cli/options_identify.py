@@ -10,35 +10,41 @@ from tuning.api.options import Json, Timings, folder_option, number_option, text
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """Estimate a mechanism file with uncertainty from a rig's logs; check that the model explains the logs.
+    """Estimate a mechanism file, with uncertainty, from a rig's logs; check that the model explains the logs.
 
     Example: jaxhil identify day1/*.csv --map logs.toml --prior rig-300kg
 
-    Writes DIR/mechanism.toml, which tune can read, DIR/identification.json and plots; with --check nothing.
-    Exit code 1 if unexplained effects and the uncertainty of the estimates can change e or e - e* by the
-    limit or more.
+    Writes DIR/mechanism.toml (input for jaxhil tune), DIR/identification.json and plots; with --check, writes
+    nothing. The exit code is 1 if unexplained effects and the uncertainty of the estimates can change e or
+    e - e* by the limit or more.
     """
 
     logs: Annotated[
         Positional[tuple[str, ...]],
         text_option(
             "LOG [LOG ...]",
-            "Logs: text_option, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS.",
+            "Log files: text, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS.",
         ),
     ] = ()
     map: Annotated[
         str | None,
         text_option(
-            "FILE", "Meaning of the columns and kind of the runs (TOML); by default those of simulate --log."
+            "FILE",
+            "TOML file with the meaning of the columns and the kind of each run; by default the columns are "
+            "those of jaxhil simulate --log.",
         ),
     ] = None
     guess: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Only print a draft of --map, made from the names and contents of the columns."),
+        text_option(
+            None, "Only print a draft of the file for --map, from the names and values of the columns."
+        ),
     ] = False
     design: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Write the rig commands that best identify a mechanism, given as --prior or LOGS."),
+        text_option(
+            None, "Only write the rig commands that best identify the mechanism given as --prior or LOG."
+        ),
     ] = False
     stroke: Annotated[
         float, number_option("With --design: largest displacement of the rig in either direction [m].")
@@ -46,23 +52,26 @@ class IdentifyOptions:
     prior: Annotated[
         str | None,
         text_option(
-            "MECHANISM", "Mechanism file, or a built-in's name, for values that the logs do not show."
+            "MECHANISM",
+            "Mechanism file, or name of a built-in mechanism: values for what the logs do not determine.",
         ),
     ] = None
     check: Annotated[
         FlagCreatePairsOff[bool],
         text_option(
-            None, "Compare the logs with a mechanism, --prior or the last of LOGS; estimate nothing."
+            None, "Only compare the logs with the mechanism given as --prior or last LOG; estimate nothing."
         ),
     ] = False
     bayes: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Use the normal entries of the prior's [uncertainty] as evidence, with the logs."),
+        text_option(
+            None, "Combine the logs with the normal distributions in the prior's [uncertainty] (Bayesian)."
+        ),
     ] = False
     output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/identified"
     stage: Annotated[
         str | None,
-        text_option("KIND", "Use only runs of this kind (free, press, contact or tap), and runs at rest."),
+        text_option("KIND", "Use only runs at rest and runs of this kind: free, press, contact or tap."),
     ] = None
     order: Annotated[
         str, text_option("NUMBER", "Order of the motion simulator; by default 'auto', chosen from the logs.")
@@ -74,24 +83,27 @@ class IdentifyOptions:
         UseAppendAction[tuple[str, ...]],
         text_option(
             "KEY=VALUE",
-            "Known value, a number_option or a list of numbers, such as rig.contact_plane=0; repeatable.",
+            "Fix a key at a number or a list of numbers, such as rig.contact_plane=0; repeatable.",
         ),
     ] = ()
     hold_out: Annotated[
-        float, number_option("Share of the contacts used to validate the fit to the others.")
+        float, number_option("Share of the contacts that are not fitted, but used to validate the fit.")
     ] = 0.2
     bootstrap: Annotated[
         int,
         number_option(
-            "Fits to resampled contacts; they widen intervals if contacts differ by more than noise."
+            "Number of bootstrap fits; they widen the intervals if contacts differ by more than the noise."
         ),
     ] = 0
     limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error from which the verdict is bad.")
+        float, arg(metavar="NUMBER", help="Smallest effect on e or e - e* for which the verdict is bad.")
     ] = 0.01
     scheduler: Annotated[
         str | None,
-        text_option("ADDRESS", "With --bootstrap: a dask.distributed cluster whose workers run the fits."),
+        text_option(
+            "ADDRESS",
+            "With --bootstrap: scheduler of a dask.distributed cluster whose workers compute the fits.",
+        ),
     ] = None
     resume: Annotated[
         FlagCreatePairsOff[bool],
@@ -106,17 +118,19 @@ class IdentifyOptions:
 
 @dataclass(frozen=True)
 class MonitorOptions:
-    """Check contact by contact that the rig still matches the identified mechanism; find when it changed.
+    """Check for every contact that the rig still matches the identified mechanism; locate a change.
 
     Example: jaxhil monitor identified/mechanism.toml day2/contact_*.csv --map logs.toml
 
-    Good: nothing changed. Watch: a change within the file's [uncertainty]. Bad: a change beyond it; exit code
-    1.
+    The state is "good" if nothing changed, "watch" if a change is within the file's [uncertainty], and "bad"
+    if a change exceeds it. The exit code is 1 if the state is "bad".
     """
 
     mechanism: Annotated[
         Positional[str],
-        text_option("MECHANISM", "Mechanism file, such as identify writes, or a built-in's name."),
+        text_option(
+            "MECHANISM", "Mechanism file, for example from jaxhil identify, or name of a built-in mechanism."
+        ),
     ]
     logs: Annotated[
         Positional[tuple[str, ...]],
@@ -125,7 +139,9 @@ class MonitorOptions:
     map: Annotated[
         str | None,
         text_option(
-            "FILE", "Meaning of the columns and kind of the runs (TOML); by default those of simulate --log."
+            "FILE",
+            "TOML file with the meaning of the columns and the kind of each run; by default the columns are "
+            "those of jaxhil simulate --log.",
         ),
     ] = None
     json: Json = False

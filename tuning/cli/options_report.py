@@ -24,22 +24,23 @@ AXIS_METAVAR = "PATH[=LOW:HIGH]"
 
 @dataclass(frozen=True, kw_only=True)
 class Map(MapOptions):
-    """Stability map: the restitution error over two keys, its contours, and closed-form theory.
+    """Compute a stability map: the restitution error as a function of two keys, with closed-form theory.
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
 
-    Writes DIR/map.json and DIR/map.png. Every point uses the gains of the nominal mechanism.
+    Writes DIR/map.json and DIR/map.png. The gains are those of the nominal mechanism at every point.
     """
 
     x: Annotated[
         str,
         text_option(
             AXIS_METAVAR,
-            "Key along x, in SI units, or gains.NAME. Default range: the key's uncertainty, else 0.3 to 3 "
-            "times its value; for a gain its bounds.",
+            "Key of the mechanism file (in SI units), or gains.NAME, on the horizontal axis. The default "
+            "range is the key's [uncertainty], or else 0.3 to 3 times the nominal value; for a gain, its "
+            "bounds.",
         ),
     ]
-    y: Annotated[str, text_option(AXIS_METAVAR, "Key along y, like x.")]
+    y: Annotated[str, text_option(AXIS_METAVAR, "Key or gain on the vertical axis, in the format of --x.")]
     file: OptionalFile = None
     compensator: CompensatorName = None
     setting: Setting = None
@@ -57,20 +58,20 @@ class ReportOptions:
 
     Example: jaxhil report jaxhil-out/varying jaxhil-out/varying/gains-sweep jaxhil-out/bundle
 
-    The page needs no other file, and is readable without JavaScript and on paper. Exit code 1 if its verdict
-    is bad.
+    The page needs no other file, and is readable without JavaScript and on paper. The exit code is 1 if the
+    page's verdict is bad.
     """
 
     results: Annotated[
         Positional[tuple[str, ...]],
         text_option(
             "RESULT [RESULT ...]",
-            "Results for one mechanism, at most one of each command: folders or files; for monitor the "
-            "output of --json.",
+            "Folders or files with the results for one mechanism, at most one result of each command; for "
+            "monitor, a file with the output of --json.",
         ),
     ] = ()
     output: Annotated[
-        str, text_option("FILE", "File of the page; by default jaxhil-out/report.html.", aliases=("-o",))
+        str, text_option("FILE", "HTML file to write; by default jaxhil-out/report.html.", aliases=("-o",))
     ] = "jaxhil-out/report.html"
     json: Json = False
     timings: Timings = False

@@ -14,27 +14,27 @@ DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
 
 @dataclass(frozen=True, kw_only=True)
 class Export(ExportOptions):
-    """Write a bundle for the rig: gains, controller, test vectors and self-test, without dependencies.
+    """Write a bundle for the rig: gains, a controller without dependencies, test vectors and a self-test.
 
     Example: jaxhil export jaxhil-out/varying/gains.json -o bundle --sweep jaxhil-out/varying/gains-sweep
 
-    Exit code 1 if the rig's controller differs from the simulated one, or if its watchdog is known to stop
-    good runs, or to miss bad ones, more often than allowed.
+    The exit code is 1 if the rig's controller differs from the simulated one, or if its watchdog is known to
+    stop good runs, or to miss bad ones, more often than allowed.
     """
 
-    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder_option.")]
+    gains: Annotated[Positional[str], arg(metavar="GAINS", help="Gain file, or its folder.")]
     output: Annotated[str, folder_option("Folder of the bundle.")] = "jaxhil-out/bundle"
     sweep: Annotated[
         str | None,
         text_option(
-            "STORE", "Folder of a sweep of these gains, from which limits and alarm rates are computed."
+            "STORE", "Folder with a sweep of these gains, from which limits and alarm rates are computed."
         ),
     ] = None
     formats: Annotated[
         UseAppendAction[tuple[str, ...]],
         text_option(
             "NAME[,NAME]",
-            "Also write the gains for ros2, matlab, csv, c99; repeatable; by default all.",
+            "Additional format of the gains: ros2, matlab, csv or c99; repeatable; by default all.",
             name="format",
         ),
     ] = ()
@@ -42,7 +42,7 @@ class Export(ExportOptions):
         UseAppendAction[tuple[str, ...]],
         text_option(
             "LIMIT=VALUE",
-            "Limit of this rig, such as command_lowest=-0.05 (SI), or none; repeatable.",
+            "Set a limit of this rig, such as command_lowest=-0.05 (SI units), or LIMIT=none; repeatable.",
             name="set",
         ),
     ] = ()
@@ -52,16 +52,17 @@ class Export(ExportOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Verify(VerifyOptions):
-    """Replay recorded signals through the rig's runtime; the exit code is the verdict.
+    """Replay recorded signals through the rig's runtime, and compare its commands with the simulated ones.
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
 
-    The self-test of a bundle runs first. Exit code 1 also if a file is corrupt, was changed, or is not
-    exported by this version; no code of such a bundle is run.
+    The self-test of a bundle runs first. The exit code is 1 if the commands differ, or if a file of the
+    bundle is corrupt or differs from what this version exports. Code of such a bundle is not run.
     """
 
     path: Annotated[
-        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or its folder_option.")
+        Positional[str],
+        arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or folder of a gain file."),
     ]
     json: Json = False
     timings: Timings = False
@@ -69,30 +70,33 @@ class Verify(VerifyOptions):
 
 @dataclass(frozen=True)
 class RigOptions:
-    """Run the controller in real time, as its own process, against a simulated rig over UDP.
+    """Run the controller in real time, in a separate process, against a simulated rig over UDP.
 
     Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
 
-    An empty loop runs first, for comparison. Exit code 1 if the controller causes a missed tick, a
-    restitution error exceeds the limit, or the controller trips although no faults are injected.
+    First, a loop without control law runs for comparison. The exit code is 1 if the controller causes a
+    missed tick, a restitution error exceeds the limit, or the controller trips although no faults are
+    injected.
     """
 
     path: Annotated[
-        Positional[str], arg(metavar="BUNDLE_OR_GAINS", help="Bundle, gain file, or its folder_option.")
+        Positional[str],
+        arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or folder of a gain file."),
     ]
     duration: Annotated[float, arg(metavar="SECONDS", help="Duration of the run.")] = 10.0
     drops: Annotated[
         float,
-        arg(metavar="PROBABILITY", help="Injected: probability that a packet is lost, in either direction."),
+        arg(metavar="PROBABILITY", help="Injected fault: probability that a packet is lost, per direction."),
     ] = 0.0
     jitter: Annotated[
         float,
         arg(
-            metavar="SECONDS", help="Injected: width of a random delay of every packet, in either direction."
+            metavar="SECONDS",
+            help="Injected fault: largest random delay of a packet (uniform from 0), per direction.",
         ),
     ] = 0.0
     delay: Annotated[
-        float, arg(metavar="SECONDS", help="Injected: constant delay of every packet, in either direction.")
+        float, arg(metavar="SECONDS", help="Injected fault: constant delay of every packet, per direction.")
     ] = 0.0
     realtime: Annotated[
         FlagCreatePairsOff[bool], text_option(None, "Request real-time priority for both processes.")
@@ -102,7 +106,7 @@ class RigOptions:
         str | None,
         arg(
             metavar="[FILE]",
-            help=f"Plot latencies to a .png, .pdf or .svg file; bare: {DEFAULT_RIG_PLOT}.",
+            help=f"Write a plot of latencies (.png, .pdf or .svg); without a name to {DEFAULT_RIG_PLOT}.",
         ),
     ] = None
     limit: Limit = 0.01

@@ -1,6 +1,7 @@
-"""Parser of the command line `jaxhil`, which selects the module that runs the command.
+"""Parser of the command line `jaxhil`.
 
-Neither `--help` nor a wrong argument imports jax: a command's module is imported when it runs.
+The module of a command is imported only when the command runs, so that `--help` and errors in arguments do
+not import jax.
 """
 
 import importlib
@@ -56,7 +57,7 @@ Command = (
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Parse the arguments and return the command as a function, which returns the exit code."""
+    """Parse the arguments, and return a function that runs the command and returns the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words == ["--version"]:
         return _print_version
@@ -82,7 +83,7 @@ def _print_version() -> int:
 
 
 def complete_bare_options(arguments: list[str]) -> list[str]:
-    """Add the default value to each `--plot`, `--drivers` or `--rare` without a value."""
+    """Insert the default value after each `--plot`, `--drivers` or `--rare` that has no value."""
     completed = []
     default_plots = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
     plot = default_plots.get(arguments[0], DEFAULT_PLOT) if arguments else DEFAULT_PLOT

@@ -1,6 +1,6 @@
-"""Time of a command by kind of work: imports, compilation, reading of cached programs, and the rest.
+"""Measurement of a command's time by kind of work: imports, tracing, compilation, reading of cached programs.
 
-Overlapping times, such as a program traced within another, are counted once.
+Overlapping time intervals, for example of a program that is traced within another one, count once.
 """
 
 import builtins
@@ -11,21 +11,21 @@ from contextlib import contextmanager
 
 from tuning import terminal
 
-# Kind of work of jax's monitoring events.
+# Kind of work for each monitoring event of jax.
 EVENT_KINDS = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "tracing",
     "/jax/core/compile/backend_compile_duration": "compiling",
-    "/jax/compilation_cache/cache_retrieval_time_sec": "reading kept programs",
+    "/jax/compilation_cache/cache_retrieval_time_sec": "reading cached programs",
 }
-# Kinds by priority: time that counts for one kind does not count for a later one.
-WORK_KINDS = ("importing", "reading kept programs", "compiling", "tracing")
+# Kinds by priority: time that belongs to several kinds counts only for the first of these kinds.
+WORK_KINDS = ("importing", "reading cached programs", "compiling", "tracing")
 TimeInterval = tuple[float, float]
 
 
 @contextmanager
 def report_timings(wanted: bool) -> Iterator[None]:
-    """Report on standard error how the time within the context was spent, if wanted."""
+    """Measure the time spent within the context; if `wanted`, report it by kind of work on standard error."""
     if not wanted:
         yield
         return
@@ -38,20 +38,20 @@ def report_timings(wanted: bool) -> Iterator[None]:
 
 
 def format_timings(begun: float, ended: float, spans: dict[str, list[TimeInterval]]) -> str:
-    """Return a text with the time of each kind of work [s], the largest first."""
-    shares, counted, before = {}, [], 0.0
+    """Return a text with the total time and the time of each kind of work [s], the longest time first."""
+    times, counted, previous = {}, [], 0.0
     for kind in WORK_KINDS:
         counted += spans[kind]
-        together = union_duration(counted)
-        shares[kind], before = together - before, together
-    shares["all else"] = max(ended - begun - before, 0.0)
-    parts = sorted(shares.items(), key=lambda part: -part[1])
-    listed = ", ".join(f"{kind} {seconds:.2f} s" for kind, seconds in parts if seconds >= 0.005)
+        total = union_duration(counted)
+        times[kind], previous = total - previous, total
+    times["all else"] = max(ended - begun - previous, 0.0)
+    longest_first = sorted(times.items(), key=lambda item: -item[1])
+    listed = ", ".join(f"{kind} {seconds:.2f} s" for kind, seconds in longest_first if seconds >= 0.005)
     return f"{ended - begun:.2f} s in all: {listed}"
 
 
 def union_duration(spans: list[TimeInterval]) -> float:
-    """Return the length of the union of time intervals [s]."""
+    """Return the total length [s] of the union of time intervals."""
     total, until = 0.0, float("-inf")
     for begin, end in sorted(spans):
         total += max(0.0, end - max(begin, until))
@@ -61,32 +61,32 @@ def union_duration(spans: list[TimeInterval]) -> float:
 
 @contextmanager
 def _record_times(spans: dict[str, list[TimeInterval]]) -> Iterator[None]:
-    """Record the times of imports and, once jax is imported, of its events in `spans`."""
-    plain, listening = builtins.__import__, []
+    """Add the time intervals of imports to `spans` and, once jax is imported, those of jax's events."""
+    original_import, listening = builtins.__import__, []
 
     def listen() -> None:
         if not listening and hasattr(sys.modules.get("jax"), "monitoring"):
             listening.append(True)
-            sys.modules["jax"].monitoring.register_event_duration_secs_listener(heard)
+            sys.modules["jax"].monitoring.register_event_duration_secs_listener(record_event)
 
-    def heard(event: str, seconds: float, **_: object) -> None:
+    def record_event(event: str, seconds: float, **_: object) -> None:
         if event in EVENT_KINDS:
             now = time.monotonic()
             spans[EVENT_KINDS[event]].append((now - seconds, now))
 
-    def timed(name: str, *arguments, **keywords):
+    def timed_import(name: str, *arguments, **keywords):
         begun = time.monotonic()
         try:
-            return plain(name, *arguments, **keywords)
+            return original_import(name, *arguments, **keywords)
         finally:
             ended = time.monotonic()
-            if ended - begun > 1e-4:  # the module was imported for the first time
+            if ended - begun > 1e-4:  # s; a shorter time means that the module was already imported
                 spans["importing"].append((begun, ended))
             listen()
 
     listen()
-    builtins.__import__ = timed
+    builtins.__import__ = timed_import
     try:
         yield
     finally:
-        builtins.__import__ = plain
+        builtins.__import__ = original_import

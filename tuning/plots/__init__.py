@@ -1,1 +1,1 @@
-"""Plots of results; `jaxhil.simulation.contact_plot` has the plot of a run, the colours and the layout."""
+"""Plots of results; the plot of a run, the colours and the layout are in `jaxhil.simulation.contact_plot`."""

@@ -19,13 +19,16 @@ from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 from tuning.plots.six_axes import AXIS_NAMES, VIEWS, find_shown_ticks, find_time_origin, quaternion_of
 
 FRAME_COUNT, FRAME_RATE = 60, 12  # number of frames, and frames per second
-MARGIN_FACTOR = 3.0  # margin around the contact, relative to the motion
+MARGIN_FACTOR = 3.0  # margin around the points of contact, divided by the displacement during the contact
 COLUMN_TITLES = ("in space", "on the rig")
 
 
 @matplotlib.style.context("default")
 def animate(recorded: Recorded, title: str, path: str | Path) -> None:
-    """Write an animation of both mechanisms near the contact, in two views. Raise OSError if this fails."""
+    """Write an animation of target and chaser near the contact, in two views: ideal contact and rig.
+
+    Raise OSError if the file cannot be written.
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     ticks_shown = find_shown_ticks(recorded)
@@ -49,14 +52,18 @@ def animate(recorded: Recorded, title: str, path: str | Path) -> None:
 
 
 def _select_writer(target: Path) -> AbstractMovieWriter:
-    """Return the writer for a file's format."""
+    """Return the animation writer for the format of a file, .gif or .mp4."""
     return PillowWriter(fps=FRAME_RATE) if target.suffix.lower() == ".gif" else FFMpegWriter(fps=FRAME_RATE)
 
 
 def _draw_scene(
     figure: Figure, recorded: Recorded
 ) -> list[tuple[LineCollection, list[Polyline], np.ndarray, Any]]:
-    """Draw the target in every axes; return each axes' chaser lines, chaser outline in C, poses and view."""
+    """Draw the target in four axes: two views, each of the ideal contact and of the contact on the rig.
+
+    Return for each axes what is needed to draw a frame: the lines of the chaser, its outline in C axes, its
+    pose at each tick, and the view.
+    """
     target, chaser = outlines(recorded.groups)
     middle, half = _shown_region(recorded)
     moving = []
@@ -74,7 +81,7 @@ def _draw_scene(
 
 
 def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
-    """Return middle and half width [m] of the region shown: the points of contact, and a margin."""
+    """Return middle (3,) and half width [m] of the region shown: all contact points, and a margin."""
     touching = recorded.depth > 0
     points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]
     ticks = find_shown_ticks(recorded)
@@ -84,7 +91,7 @@ def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
 
 
 def _format_axes(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
-    """Set limits, labels and grid of an axes."""
+    """Set limits, labels and grid of the axes for a view of the region with `middle` and half width [m]."""
     across, up = (1e3 * (centre + half * np.array([-1, 1])) for centre in middle)
     axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
     axes.set(xlabel=f"{AXIS_NAMES[view[0]]} of T [mm]", ylabel=f"{AXIS_NAMES[view[1]]} of T [mm]")
@@ -92,6 +99,6 @@ def _format_axes(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, i
 
 
 def _project_outline(chaser: list[Polyline], pose: np.ndarray, view: tuple[int, int]) -> Any:
-    """Return the chaser's outline at a pose in a view, in mm."""
+    """Return the lines [mm] of the chaser's outline at a pose, projected onto the plane of a view."""
     rotation = rotation_matrix(quaternion_of(pose[3:]))
     return [1e3 * (line @ rotation.T + pose[:3])[:, list(view)] for line in chaser]

@@ -1,4 +1,4 @@
-"""Plot on the summary page of a bundle: restitution error, and the ranges that the gains were tuned over."""
+"""Plot for the summary page of a bundle: restitution errors, and ranges of the scenarios of the tuning."""
 
 import io
 from collections.abc import Mapping
@@ -15,6 +15,7 @@ from jaxhil.simulation.contact_plot import BLACK, BLUE, CURVE_LABELS, ORANGE, VE
 COLOURS = {"before": VERMILION, "literature": ORANGE, "tuned": BLUE}
 HATCHES = {"before": "///", "literature": "...", "tuned": ""}
 ERROR_STATISTICS = {"rms": "rms", "p99": "99th percentile", "max": "largest"}  # statistics of |e - e*|
+# Label, displayed unit, and factor from the SI unit, of each quantity in a gain file's "envelope".
 ENVELOPE_QUANTITIES = {
     "contact_frequency": ("contact frequency", "Hz", 1.0),
     "delay": ("delay", "ms", 1e3),
@@ -25,15 +26,18 @@ ENVELOPE_QUANTITIES = {
 
 @matplotlib.style.context("default")
 def summary_png(document: Mapping[str, Any]) -> bytes:
-    """Draw the restitution error before and after tuning, and the ranges that the gains were tuned over."""
+    """Draw the restitution errors before and after tuning, and the ranges of the tuning, as a PNG file.
+
+    `document` is the content of a gain file.
+    """
     figure = Figure(figsize=(9.3, 3.1))
     FigureCanvasAgg(figure)
     left = figure.add_axes((0.075, 0.2, 0.48, 0.6))
     _draw_errors(left, document)
     spans = [(key, span) for key, span in document["envelope"].items() if _is_range(span)][:4]
-    figure.text(0.61, 0.93, "Tuned over (the gains hold there)", fontsize=10, va="center")
+    figure.text(0.61, 0.93, "Ranges of the tuning (the gains are valid there)", fontsize=10, va="center")
     if not spans:
-        figure.text(0.61, 0.5, "the gain file does not say", fontsize=9)
+        figure.text(0.61, 0.5, "not stated in the gain file", fontsize=9)
     for number, (key, span) in enumerate(spans):
         _draw_range(figure.add_axes((0.63, 0.72 - 0.2 * number, 0.34, 0.06)), key, span)
     file = io.BytesIO()
@@ -42,7 +46,7 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Draw groups of bars: errors of the nominal run and of fresh scenarios, by gains."""
+    """Draw bars of the errors of the nominal run and of fresh scenarios, one bar for each set of gains."""
     groups = _error_groups(document["figures"])
     series = [name for name in COLOURS if any(name in values for _, values in groups)]
     width = 0.8 / max(1, len(series))
@@ -68,14 +72,14 @@ def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
         axes.legend(ncols=3, fontsize=8, frameon=False, **place)
 
 
-def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Return the label of each group of bars, and the error by gains."""
+def _error_groups(metrics: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
+    """Return groups of bars: the label of each group, and the error [1] by name of the gains."""
     groups = []
     for kind, key, label in (
         ("nominal", "rms", "nominal run,\nrms"),
         *(("robust", key, f"scenarios,\n{text}") for key, text in ERROR_STATISTICS.items()),
     ):
-        errors = figures.get(kind, {})
+        errors = metrics.get(kind, {})
         values = {
             name: statistics[key]
             for name, statistics in (errors.items() if isinstance(errors, Mapping) else ())
@@ -89,13 +93,13 @@ def _error_groups(figures: Mapping[str, Any]) -> list[tuple[str, dict[str, float
 
 
 def _draw_range(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
-    """Draw the range of one quantity on its own axis."""
+    """Draw the range of one quantity, in its displayed unit, on its own axis."""
     name, unit, factor = ENVELOPE_QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
     low, high = sorted((factor * span["low"], factor * span["high"]))
-    room = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
+    margin = 0.25 * (high - low) or 0.25 * abs(high) or 1.0
     axes.barh(0, high - low, left=low, height=1, color=BLUE)
     axes.plot([low, high], [0, 0], linestyle="none", marker="|", color=BLACK, markersize=9)
-    axes.set(xlim=(low - room, high + room), ylim=(-0.9, 0.9), yticks=[])
+    axes.set(xlim=(low - margin, high + margin), ylim=(-0.9, 0.9), yticks=[])
     axes.tick_params(axis="x", labelsize=7, pad=1.5)
     axes.set_title(
         f"{to_one_line(name, 30)}: {low:.3g} to {high:.3g} {to_one_line(unit, 10)}",
@@ -108,7 +112,7 @@ def _draw_range(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
 
 
 def _is_range(value: Any) -> bool:
-    """Return whether a value is a range with numbers `low` and `high`."""
+    """Return whether a value is a mapping with the numbers "low" and "high"."""
     return isinstance(value, Mapping) and all(
         isinstance(value.get(key), (int, float)) for key in ("low", "high")
     )

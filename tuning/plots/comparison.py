@@ -1,4 +1,4 @@
-"""Plots of a comparison: errors with their intervals, and transparency of the compensators."""
+"""Plots of a comparison of compensators: errors with confidence intervals, and transparency."""
 
 from collections.abc import Mapping, Sequence
 
@@ -30,23 +30,26 @@ TRANSPARENCY_TITLES = {
 
 
 @matplotlib.style.context("default")
-def plot_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]], limit: float) -> Figure:
-    """Plot the rms error of every law with its interval, one panel per mechanism."""
-    keys = _list_gain_names(names, found)
-    laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
-    across = min(MAX_PANEL_COLUMNS, len(names))
-    down = -(-len(names) // across)
+def plot_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]], limit: float) -> Figure:
+    """Plot the rms error of each compensator with its 95 % interval, in one panel per mechanism.
+
+    `names` are the mechanisms, and `results` the metrics of all compensators by mechanism.
+    """
+    keys = _list_gain_names(names, results)
+    laws = list(dict.fromkeys(result.law for name in names for result in results[name]))
+    columns = min(MAX_PANEL_COLUMNS, len(names))
+    rows = -(-len(names) // columns)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
-    size = (2.2 + 2.6 * across, 1.2 + height * down)
+    size = (2.2 + 2.6 * columns, 1.2 + height * rows)
     figure = create_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
-    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
-        by_law = {result.law: result for result in found[name]}
+        by_law = {result.law: result for result in results[name]}
         for key, offset in zip(keys, _compute_offsets(len(keys)), strict=True):
-            rows = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
-            errors = [by_law[laws[i]].figures[key]["rms"] for i in rows]
+            indices = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
+            errors = [by_law[laws[i]].figures[key]["rms"] for i in indices]
             colour = CURVE_STYLES[key][0] if key in CURVE_STYLES else GREEN
-            heights = np.array(rows) + offset
+            heights = np.array(indices) + offset
             for y, error in zip(heights, errors, strict=True):
                 panel.plot([100 * error.low, 100 * error.high], [y, y], color=colour, linewidth=1.5)
             values = [100 * error.value for error in errors]
@@ -67,7 +70,7 @@ def plot_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]],
     for panel in panels[:, 0]:
         name_rows(panel, laws)
     figure.subplots_adjust(left=1.6 / size[0], hspace=0.42 / height, wspace=0.08)
-    for panel in list(panels.flat)[max(0, len(names) - across) : len(names)]:
+    for panel in list(panels.flat)[max(0, len(names) - columns) : len(names)]:
         panel.set_xlabel("rms of |e - e*| [%]")
         panel.tick_params(labelbottom=True)
     legend_below(figure, panels[0, 0], 4)
@@ -75,12 +78,15 @@ def plot_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]],
 
 
 @matplotlib.style.context("default")
-def plot_transparency(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> Figure:
-    """Plot transparency, slope and peak force of every law with its best gains, one point per mechanism."""
-    laws = list(dict.fromkeys(result.law for name in names for result in found[name]))
+def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> Figure:
+    """Plot transparency, slope and peak command of each compensator with its best gains.
+
+    Each mechanism in `names` is a point; `results` are the metrics of all compensators by mechanism.
+    """
+    laws = list(dict.fromkeys(result.law for name in names for result in results[name]))
     size = (12.0, 1.75 + 0.34 * len(laws))
-    gains = "Tuned gains" if TUNED_GAINS in _list_gain_names(names, found) else "The literature's gains"
-    figure = create_figure(size, f"Is it still a test of the hardware? {gains}", above=0.6, below=0.95)
+    gains = "Tuned gains" if TUNED_GAINS in _list_gain_names(names, results) else "The literature's gains"
+    figure = create_figure(size, f"Does the run still test the hardware? {gains}", above=0.6, below=0.95)
     panels = figure.subplots(1, len(TRANSPARENCY_TITLES), sharey=True)
     figure.subplots_adjust(left=1.6 / size[0], wspace=0.08)
     for panel, (key, title) in zip(panels, TRANSPARENCY_TITLES.items(), strict=True):
@@ -89,16 +95,16 @@ def plot_transparency(names: Sequence[str], found: Mapping[str, Sequence[LawMetr
             values = [
                 choose_best_metrics(result)[key].value
                 for name in names
-                for result in found[name]
+                for result in results[name]
                 if result.law == law
             ]
-            spread = row + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
-            # Values beyond the axis are drawn at its end.
+            heights = row + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
+            # A value beyond the range of the axis is drawn at the end of the axis.
             values = np.clip(values, low, high)
-            label = None if row else "a mechanism each, from above in the order given"
+            label = None if row else "one mechanism, from top to bottom in the order of the command"
             style = {"color": CURVE_STYLES[TUNED_GAINS][0], "markersize": 4, "alpha": 0.6, "clip_on": False}
-            panel.plot(values, spread, "o", label=label, **style)
-        panel.axvline(1, color=BLACK, linewidth=1.2, linestyle="--", label="1: as in space")
+            panel.plot(values, heights, "o", label=label, **style)
+        panel.axvline(1, color=BLACK, linewidth=1.2, linestyle="--", label="1: as in the ideal contact")
         panel.set_xlim(low, high)
         if key == "peak":
             panel.set_xscale("log")
@@ -109,9 +115,9 @@ def plot_transparency(names: Sequence[str], found: Mapping[str, Sequence[LawMetr
     return figure
 
 
-def _list_gain_names(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> list[str]:
-    """Return the names of all evaluated gains: the literature's, settings, tuned ones."""
-    keys = {key: None for name in names for result in found[name] for key in result.figures}
+def _list_gain_names(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> list[str]:
+    """Return the names of all evaluated sets of gains, in the order literature, settings, tuned."""
+    keys = {key: None for name in names for result in results[name] for key in result.figures}
     rank = {LITERATURE_GAINS: 0, TUNED_GAINS: 2}
     return sorted(keys, key=lambda key: rank.get(key, 1))
 

@@ -1,4 +1,4 @@
-"""Plots of an identification: fit of the model to the logs, and changes relative to the prior."""
+"""Plots of an identification: fit of the model to the logs, and estimates compared with the prior."""
 
 from __future__ import annotations
 
@@ -26,36 +26,34 @@ from tuning.identification.result import Identification
 from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
 
 DOT_STYLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
-PLOTTED_CONTACTS = 3  # contacts that are plotted over time
+PLOTTED_CONTACTS = 3  # number of contacts that are plotted over time
 RUN_COLOURS = (BLUE, ORANGE, GREEN)
-MAX_AUTOCORRELATION_LAG, MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG = (
-    25,
-    -20,
-    100,
-)  # rows, ranges of the residuals' correlations
-MIN_ESTIMATE_SIGMAS = 3.0  # standard deviations from 0, above which a relative change is meaningful
+# Rows of the log: ranges of the lags at which the residuals' correlations are plotted.
+MAX_AUTOCORRELATION_LAG, MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG = 25, -20, 100
+# Standard deviations: if an estimate is closer to 0, its relative deviation from the prior has no meaning.
+MIN_ESTIMATE_SIGMAS = 3.0
 
 
-def draw_identification(found: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """Return the plots by the names of their files; plots without data are omitted.
+def draw_identification(result: Identification, entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Draw the plots of an identification, and return them by file name; plots without data are omitted.
 
     `entries` are the estimates with their priors, as in `identification.json`.
     """
     figures = {}
-    if found.motion is not None:
-        figures["bode.png"] = plot_bode(found.motion)
-    if found.contact is not None:
+    if result.motion is not None:
+        figures["bode.png"] = plot_bode(result.motion)
+    if result.contact is not None:
         prior = next((entry["prior"] for entry in entries if entry["key"] == "rig.force_sensor.delay"), None)
-        figures["delay.png"] = plot_force_delay(found.contact, prior)
-        figures["contacts.png"] = plot_contacts(found.contact)
-        figures["residuals.png"] = plot_residuals(found.contact)
+        figures["delay.png"] = plot_force_delay(result.contact, prior)
+        figures["contacts.png"] = plot_contacts(result.contact)
+        figures["residuals.png"] = plot_residuals(result.contact)
     figures["compare.png"] = plot_estimates(entries)
     return figures
 
 
 @matplotlib.style.context("default")
 def plot_bode(motion: FreeMotion) -> Figure:
-    """Plot the measured and the modelled response, noise, distortion and coherence over the frequency."""
+    """Plot the motion simulator's measured and modelled frequency response, noise, distortion, coherence."""
     lines, fit = motion.lines, motion.fit
     order = np.argsort(lines.frequency)
     frequency = lines.frequency[order]
@@ -73,9 +71,9 @@ def plot_bode(motion: FreeMotion) -> Figure:
         linewidth=1.2,
         label=f"model: {_compute_program_digest(motion)}",
     )
-    size.plot(frequency, _to_decibel(noise), color="0.6", linewidth=1.2, label="noise of the lines")
+    size.plot(frequency, _to_decibel(noise), color="0.6", linewidth=1.2, label="noise of the measurement")
     size.plot(
-        frequency, _to_decibel(measured - modelled), color=ORANGE, label="measured less model", **DOT_STYLE
+        frequency, _to_decibel(measured - modelled), color=ORANGE, label="measured minus model", **DOT_STYLE
     )
     for level, name, line in zip(_find_distortion_levels(motion), ("odd", "even"), ("--", ":"), strict=True):
         if level:
@@ -89,8 +87,8 @@ def plot_bode(motion: FreeMotion) -> Figure:
     phase.set(ylabel="phase [degrees]")
     finish_axes(phase, "lower left")
     share, chance = 100.0 * np.abs(measured / modelled - 1.0), 100.0 * noise / np.abs(modelled)
-    error.plot(frequency, share, color=BLUE, label="measured off the model", **DOT_STYLE)
-    # The magnitude of complex normal noise is below 1.73 standard deviations at 95 % of the lines.
+    error.plot(frequency, share, color=BLUE, label="|measured / model - 1|", **DOT_STYLE)
+    # With a probability of 95 %, the magnitude of complex normal noise is below 1.73 standard deviations.
     error.plot(frequency, np.sqrt(-np.log(0.05)) * chance, color="0.6", linewidth=1.2, label="95 % of noise")
     error.plot(
         frequency, 100.0 * INTERVAL_SIGMAS * band, color=BLACK, linewidth=1.2, label="95 % of the model"
@@ -107,20 +105,24 @@ def plot_bode(motion: FreeMotion) -> Figure:
 
 
 @matplotlib.style.context("default")
-def plot_force_delay(contact: ContactFit, told: float | None) -> Figure:
-    """Plot the profile likelihood of the force delay, and its correlation with the damping or the surface."""
+def plot_force_delay(contact: ContactFit, prior: float | None) -> Figure:
+    """Plot the profile likelihood of the force delay, and the delay's correlation with another parameter.
+
+    The other parameter is the damping or, if the model has none, the surface position. `prior` is the prior's
+    force delay [s].
+    """
     posterior = contact.posterior
     draws = contact.draws()
-    figure = create_figure((11, 4.6), "Force delay: what the touches say of it")
+    figure = create_figure((11, 4.6), "Force delay: likelihood from the contacts")
     left, right = figure.subplots(1, 2)
     low, high = np.quantile(draws[:, 0], (0.025, 0.975))
     density = np.exp(posterior.log_posterior)
     left.axvspan(1e3 * low, 1e3 * high, color=SKY_BLUE, alpha=0.3, linewidth=0, label="95 %")
     left.plot(1e3 * posterior.delays, density, color=BLUE, linewidth=1.5, label="profile of the likelihood")
-    reach = 1e3 * (high - low)
-    if told is not None and abs(1e3 * told - 500.0 * (low + high)) < 4.0 * reach:
-        left.axvline(1e3 * told, color=VERMILION, linestyle="--", linewidth=1.2, label="prior")
-    left.set(xlabel="force delay [ms]", ylabel="likelihood over its greatest [1]")
+    width = 1e3 * (high - low)
+    if prior is not None and abs(1e3 * prior - 500.0 * (low + high)) < 4.0 * width:
+        left.axvline(1e3 * prior, color=VERMILION, linestyle="--", linewidth=1.2, label="prior")
+    left.set(xlabel="force delay [ms]", ylabel="likelihood / its maximum [1]")
     finish_axes(left, "best")
     name = next((name for name in posterior.names if name.startswith("damping")), "plane")
     second = draws[:, posterior.names.index(name)]
@@ -135,29 +137,29 @@ def plot_force_delay(contact: ContactFit, told: float | None) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_contacts(contact: ContactFit) -> Figure:
-    """Plot the measured and the modelled force over time and over depth, for three contacts."""
+    """Plot the measured and the modelled force over time and over penetration, for up to three contacts."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _compute_depth_and_force(contact)
     inside = readings.counts & (depth > 0.0)
     lanes = _select_plotted_contacts(contact, inside)
-    title = f"Touches: force over time and depth, law {contact.law.name}"
+    title = f"Contacts: force over time and penetration, contact law {contact.law.name}"
     figure = create_figure((11, 6.6), title, above=0.75)
     figure.subplots_adjust(hspace=0.3)
     grid: Any = figure.subplots(2, max(len(lanes), 1), squeeze=False)
     for column, lane in enumerate(lanes):
         counts = readings.counts[:, lane]
-        touched = np.flatnonzero(inside[:, lane])
-        around = slice(max(0, touched[0] - 20), touched[-1] + 20)
-        rows = np.arange(readings.force.shape[0])[around]
-        time = 1e3 * problem.motion.period * (rows - touched[0])
-        force = np.where(counts, readings.force[:, lane], np.nan)[around]
-        for axes, abscissa in ((grid[0, column], time), (grid[1, column], 1e3 * depth[around, lane])):
+        contact_rows = np.flatnonzero(inside[:, lane])
+        shown = slice(max(0, contact_rows[0] - 20), contact_rows[-1] + 20)
+        rows = np.arange(readings.force.shape[0])[shown]
+        time = 1e3 * problem.motion.period * (rows - contact_rows[0])
+        force = np.where(counts, readings.force[:, lane], np.nan)[shown]
+        for axes, abscissa in ((grid[0, column], time), (grid[1, column], 1e3 * depth[shown, lane])):
             axes.plot(abscissa, force, color=BLUE, label="measured", **DOT_STYLE)
-            axes.plot(abscissa, predicted[around, lane], color=BLACK, linewidth=1.2, label="model")
+            axes.plot(abscissa, predicted[shown, lane], color=BLACK, linewidth=1.2, label="model")
             finish_axes(axes, None)
-        grid[0, column].set_xlabel("time since the touch [ms]")
-        grid[0, column].set_title(f"touch {lane}", fontsize=10)
-        grid[1, column].set_xlabel("depth when the force was [mm]")
+        grid[0, column].set_xlabel("time since the onset [ms]")
+        grid[0, column].set_title(f"contact {lane}", fontsize=10)
+        grid[1, column].set_xlabel("penetration at the time of the force [mm]")
     for axes in grid[:, 0]:
         axes.set_ylabel("force [N]")
     if lanes:
@@ -167,74 +169,82 @@ def plot_contacts(contact: ContactFit) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_residuals(contact: ContactFit) -> Figure:
-    """Plot the whitened residuals of the force over time and depth, and their correlations."""
+    """Plot the whitened residuals of the force over time and penetration, and their correlations."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _compute_depth_and_force(contact)
-    left = problem.whiten(readings.force - predicted) / readings.std
-    left = np.where(readings.counts, left, np.nan)
-    figure = create_figure((11, 6.6), "Force less the model's, over the noise")
+    residuals = problem.whiten(readings.force - predicted) / readings.std
+    residuals = np.where(readings.counts, residuals, np.nan)
+    figure = create_figure((11, 6.6), "Residuals: measured minus modelled force, divided by the noise")
     figure.subplots_adjust(hspace=0.3)
     (over_time, by_depth), (autocorrelation, cross) = figure.subplots(2, 2)
     inside = (depth > 0.0) & readings.counts
-    time = problem.motion.period * (np.arange(len(left))[:, None] - np.argmax(inside, axis=0))
+    time = problem.motion.period * (np.arange(len(residuals))[:, None] - np.argmax(inside, axis=0))
     shown = readings.counts & (time > -0.02)
     shown &= time < 0.02 + problem.motion.period * inside.sum(axis=0).max()
-    over_time.plot(1e3 * time[shown], left[shown], color=BLUE, alpha=0.5, label="all touches", **DOT_STYLE)
-    over_time.set(xlabel="time since the touch [ms]", ylabel="left over noise [1]")
-    by_depth.plot(1e3 * depth[inside], left[inside], color=BLUE, alpha=0.5, label="all touches", **DOT_STYLE)
-    by_depth.set(xlabel="depth when the force was [mm]", ylabel="left over noise [1]")
+    style: dict[str, Any] = {"color": BLUE, "alpha": 0.5, "label": "all contacts", **DOT_STYLE}
+    over_time.plot(1e3 * time[shown], residuals[shown], **style)
+    over_time.set(xlabel="time since the onset [ms]", ylabel="residual / noise [1]")
+    by_depth.plot(1e3 * depth[inside], residuals[inside], **style)
+    by_depth.set(xlabel="penetration at the time of the force [mm]", ylabel="residual / noise [1]")
     for axes in (over_time, by_depth):
         for side in (-INTERVAL_SIGMAS, INTERVAL_SIGMAS):
             axes.axhline(side, color=ORANGE, linestyle="--", linewidth=1, label="95 %" * (side > 0))
         axes.set_ylim(*(1.3 * np.array(axes.get_ylim())))
         finish_axes(axes, "upper right")
     _plot_correlation(
-        autocorrelation, left, left, range(1, MAX_AUTOCORRELATION_LAG + 1), "with itself, later by [rows]"
+        autocorrelation,
+        residuals,
+        residuals,
+        range(1, MAX_AUTOCORRELATION_LAG + 1),
+        "lag of the autocorrelation [rows]",
     )
-    command = np.where(inside, np.gradient(depth, axis=0), np.nan)
+    rate = np.where(inside, np.gradient(depth, axis=0), np.nan)
     _plot_correlation(
         cross,
-        command,
-        left,
+        rate,
+        residuals,
         range(MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG + 1),
-        "with the speed before, by [rows]",
+        "lag of the residuals behind the speed [rows]",
     )
     return figure
 
 
 @matplotlib.style.context("default")
 def plot_estimates(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Plot every estimate's 95 % interval and the prior's value, relative to the estimate."""
-    plain = [
+    """Plot the 95 % interval of each estimate, and the prior's value, as deviations from the estimate [%].
+
+    `entries` are the estimates, as in `identification.json`. Estimates that hardly differ from 0 are omitted.
+    """
+    plotted = [
         entry
         for entry in entries
         if entry["std"] and abs(entry["value"]) > MIN_ESTIMATE_SIGMAS * entry["std"]
     ]
     figure = create_figure(
-        (9, 1.7 + 0.3 * max(len(plain), 1)), "Estimates, and what the prior said", above=0.9
+        (9, 1.7 + 0.3 * max(len(plotted), 1)), "Estimates, compared with the prior", above=0.9
     )
     figure.subplots_adjust(left=0.34)
     axes = figure.subplots()
-    for row, estimate in enumerate(plain):
+    for row, estimate in enumerate(plotted):
         share = [100.0 * (estimate[name] / estimate["value"] - 1.0) for name in ("low", "high")]
         axes.plot(share, [row, row], color=BLUE, linewidth=3, label="estimate, 95 %" if row == 0 else None)
         axes.plot([0.0], [row], color=BLUE, marker="o", markersize=5)
-    with_prior = [(row, entry) for row, entry in enumerate(plain) if entry["prior"] is not None]
+    with_prior = [(row, entry) for row, entry in enumerate(plotted) if entry["prior"] is not None]
     if with_prior:
         shares = [100.0 * (entry["prior"] / entry["value"] - 1.0) for _, entry in with_prior]
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}
         axes.plot(shares, [row for row, _ in with_prior], label="prior", **style)
-    names = [f"{entry['key']}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1") for entry in plain]
+    names = [f"{entry['key']}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1") for entry in plotted]
     # Matplotlib would read text between dollar signs as a formula.
-    axes.set_yticks(range(len(plain)), [name.replace("$", r"\$") for name in names])
+    axes.set_yticks(range(len(plotted)), [name.replace("$", r"\$") for name in names])
     axes.tick_params(axis="y", labelsize=7)
-    axes.set(xlabel="distance from the estimate [%]", ylim=(len(plain) - 0.5, -0.5))
+    axes.set(xlabel="deviation from the estimate [%]", ylim=(len(plotted) - 0.5, -0.5))
     axes.set_xscale("symlog", linthresh=0.1)
     most = 2.0 * max(map(abs, axes.get_xlim()))
     axes.set_xlim(-most, most)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     finish_axes(axes, None)
-    if plain:
+    if plotted:
         legend_above(axes, 2)
     return figure
 
@@ -252,7 +262,7 @@ def _compute_program_digest(motion: FreeMotion) -> str:
 
 
 def _find_distortion_levels(motion: FreeMotion) -> list[float]:
-    """Return the levels of odd and even distortion, the largest of the runs; 0 if none was measured."""
+    """Return the largest levels of odd and of even distortion among the runs; 0 if none was measured."""
     return [
         max(
             (level for run in motion.spectra if (level := getattr(run, parity)) is not None),
@@ -263,23 +273,26 @@ def _find_distortion_levels(motion: FreeMotion) -> list[float]:
 
 
 def _compute_depth_and_force(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth [m] at the time of each force and the force of the best fit [N], (rows, lanes)."""
-    at, plane, inner = contact.posterior.best
+    """Return penetration [m] and modelled force [N] of the best fit, both (rows, lanes).
+
+    The penetration is that at the time when the force acted, before the delay of the force sensor.
+    """
+    delay, plane, inner = contact.posterior.best
     problem = contact.problem
-    return problem.motion.at(at)[0] - plane, problem.force(at, plane, inner.coefficients)
+    return problem.motion.at(delay)[0] - plane, problem.force(delay, plane, inner.coefficients)
 
 
 def _select_plotted_contacts(contact: ContactFit, inside: np.ndarray) -> list[int]:
-    """Return the contacts with the least, the median and the greatest peak force."""
+    """Return the indices of the contacts with the smallest, the median and the largest peak force."""
     lanes = np.flatnonzero(inside.any(axis=0))
     peak = np.max(np.where(inside, contact.readings.force, 0.0), axis=0)[lanes]
     order = lanes[np.argsort(peak, kind="stable")]
-    places = np.linspace(0, len(order) - 1, PLOTTED_CONTACTS).round().astype(int)
-    return list(dict.fromkeys(order[places].tolist())) if len(order) else []
+    ranks = np.linspace(0, len(order) - 1, PLOTTED_CONTACTS).round().astype(int)
+    return list(dict.fromkeys(order[ranks].tolist())) if len(order) else []
 
 
-def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, words: str) -> None:
-    """Plot the correlation of `x` with `y` at each lag [rows], with its 95 % band for white noise."""
+def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, label: str) -> None:
+    """Plot the correlation of `x` with the later `y` over the lag [rows], and white noise's 95 % band."""
     values, chance = [], []
     for lag in lags:
         early, late = slice(max(0, -lag), len(x) - max(0, lag)), slice(max(0, lag), len(x) - max(0, -lag))
@@ -292,7 +305,7 @@ def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, wor
         list(lags), -np.array(chance), chance, color=SKY_BLUE, alpha=0.4, linewidth=0, label="95 %"
     )
     axes.plot(list(lags), values, color=BLUE, linewidth=1, marker="o", markersize=2.5, label="correlation")
-    most = 1.6 * max(*chance, *np.abs(values))  # leaves space for the legend
+    most = 1.6 * max(*chance, *np.abs(values))  # the factor leaves space for the legend
     axes.set_ylim(-most, most)
-    axes.set(xlabel=words, ylabel="correlation of what is left [1]")
+    axes.set(xlabel=label, ylabel="correlation of residuals [1]")
     finish_axes(axes, "upper right")

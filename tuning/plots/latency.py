@@ -1,4 +1,4 @@
-"""Histograms of a session's latencies: the controller's computing time and the round trip."""
+"""Histograms of the latencies of a real-time session: controller's computing time and round-trip time."""
 
 import matplotlib.style
 import numpy as np
@@ -10,14 +10,15 @@ from tuning.rig.loop import ANSWER_SHARE
 from tuning.rig.session import SessionReport
 
 STYLES = {"empty loop": (ORANGE, "--"), "controller": (BLUE, "-")}
-BINS_PER_DECADE = 20
+BINS_PER_DECADE = 20  # bins of the histogram for each factor of 10
 
 
 @matplotlib.style.context("default")
 def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
-    """Plot the shares of ticks over the controller's time per tick and over the round trip.
+    """Plot histograms of the controller's computing time per tick and of the round-trip time.
 
-    Both axes are logarithmic. `period` [s] is the control period, which is drawn with the answer's deadline.
+    All axes are logarithmic. Vertical lines show the control period `period` [s] and the deadline of the
+    controller's answer.
     """
     figure = create_figure((10, 4.6), title)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -28,10 +29,10 @@ def latency_plot(session: SessionReport, title: str, period: float) -> Figure:
                 _plot_histogram(axes, getattr(loop.times, name), label)
         axes.axvline(1e6 * period, color=BLACK, linewidth=0.8, linestyle=":", label="control period")
         axes.set(xscale="log", yscale="log")
-    share = 1e6 * ANSWER_SHARE * period
-    right.axvline(share, color=BLACK, linewidth=0.8, linestyle="-.", label="answer due")
+    deadline = 1e6 * ANSWER_SHARE * period
+    right.axvline(deadline, color=BLACK, linewidth=0.8, linestyle="-.", label="deadline of the answer")
     left.set(xlabel="controller's time per tick [µs]", ylabel="share of ticks per bin [1]")
-    right.set(xlabel="round trip, as the rig sees it [µs]")
+    right.set(xlabel="round-trip time, measured by the rig [µs]")
     finish_axes(left, "best")
     finish_axes(right, "best")
     return figure

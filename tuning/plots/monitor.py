@@ -1,4 +1,4 @@
-"""Plot of monitored contacts: each metric with the range that the mechanism file predicts."""
+"""Plot of the metrics of monitored contacts, with the ranges that the mechanism file predicts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,17 +18,21 @@ from tuning.plots.parts import INTERVAL_SIGMAS
 def monitor_plot(
     mechanism: str, contacts: Sequence[int], metrics: Mapping[str, np.ndarray], since: float | None
 ) -> Figure:
-    """Plot the metrics over the number of the contact, one panel each.
+    """Plot each metric over the number of the contact, with its predicted 95 % range, in a separate panel.
 
-    Rows of a metric are its values, their predicted standard deviations, and their deviations in these. A
-    change is likely since contact `since`.
+    Args:
+        mechanism: name or path of the mechanism file, for the title.
+        contacts: numbers of the contacts.
+        metrics: arrays (3, contacts) by name of the metric: values, predicted standard deviations, and z, the
+            deviations from the predicted values divided by these standard deviations.
+        since: number of the contact at which the rig probably changed; None if it did not change.
     """
     name = to_one_line(mechanism, 60)
-    figure = create_figure((9.6, 8.4), f"Contacts held against {name}", below=0.95)
+    figure = create_figure((9.6, 8.4), f"Contacts compared with {name}", below=0.95)
     figure.subplots_adjust(hspace=0.3, wspace=0.28)
     grid: Any = figure.subplots(4, 2, sharex=True)
-    for axes, (figure_name, unit, scale) in zip(grid.flat, METRICS, strict=False):
-        value, std, z = metrics[figure_name]
+    for axes, (metric_name, unit, scale) in zip(grid.flat, METRICS, strict=False):
+        value, std, z = metrics[metric_name]
         middle = scale * (value - z * std)
         axes.fill_between(
             contacts, middle - INTERVAL_SIGMAS * scale * std, middle + INTERVAL_SIGMAS * scale * std,
@@ -39,8 +43,8 @@ def monitor_plot(
         )
         if since is not None:
             style: dict[str, Any] = {"color": VERMILION, "linestyle": "--", "linewidth": 1.3}
-            axes.axvline(since - 0.5, label="a change is likely since", **style)
-        axes.set_ylabel(f"{figure_name} [{unit}]", fontsize=9)
+            axes.axvline(since - 0.5, label="probable change of the rig", **style)
+        axes.set_ylabel(f"{metric_name} [{unit}]", fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         finish_axes(axes, None)
     grid[3, 1].set_axis_off()

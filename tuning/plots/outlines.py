@@ -1,4 +1,4 @@
-"""Outlines of the shapes that may touch, as lines in space, for the plots of a six-axis mechanism."""
+"""Outlines, as lines in space, of the contact shapes of a six-axis mechanism, for its plots."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,15 +14,15 @@ from jaxhil.sixdof.vectors import Vector
 
 Polyline = np.ndarray  # (points, 3) [m]
 
-CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # angles of the points of a circle
-MERIDIAN_COUNT = 24  # number of meridians of a surface of revolution
-POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, relative to the mechanism
+CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # rad; angles of the points of a circle
+MERIDIAN_COUNT = 24  # number of meridians drawn on a surface of revolution
+POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, divided by the size of the mechanism
 
 
 def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Polyline], list[Polyline]]:
-    """Return the outlines of the target, in T axes, and of the chaser, in C axes, without duplicate lines.
+    """Return the outlines of target (in T axes) and chaser (in C axes) as lines, each (points, 3) [m].
 
-    They are those of the first batch element.
+    The shapes are those of the first batch element. Lines that several shapes share are contained once.
     """
     pairs = [pair for group in groups for pair in _shape_pairs(group.candidates)]
     corners = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])
@@ -35,7 +35,7 @@ def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Polyline], list[Polyl
 
 
 def _shape_pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
-    """Return the pairs (chaser's, target's shape) of the first batch element."""
+    """Return the pairs of shapes (chaser, target) that may touch, for the first batch element."""
 
     def unstack(shape: Any) -> list[Any]:
         leaves, structure = jax.tree.flatten(shape)
@@ -51,7 +51,7 @@ def _shape_pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
 
 
 def _corners(shape: Any) -> np.ndarray:
-    """Return points (n, 3) that span a shape; none for a plane or an infinite cone."""
+    """Return points (n, 3) [m] that span a shape; no points (0, 3) for a plane or an infinite cone."""
     if isinstance(shape, (Ball, Cavity)):
         reach = 0.0 if isinstance(shape, Cavity) else float(shape.radius)
         return _as_point(shape.centre)[None] + reach * np.eye(3)
@@ -65,7 +65,7 @@ def _corners(shape: Any) -> np.ndarray:
 
 
 def _shape_outline(shape: Any, size: float) -> list[Polyline]:
-    """Return the outline of a shape of a mechanism of this `size` [m]."""
+    """Return the outline of a shape as lines; infinite shapes end near the mechanism's `size` [m]."""
     if isinstance(shape, (Ball, Cavity)):
         radius = float(shape.radius)
         circles = [radius * np.roll(_circle(), turn, axis=1) for turn in range(3)] if radius else _cross(size)
@@ -100,7 +100,7 @@ def _plane(plane: Plane, size: float) -> list[Polyline]:
 
 
 def _drogue(drogue: Drogue, size: float) -> list[Polyline]:
-    """Return meridians and parallels of the bottom and of the cone up to the mouth."""
+    """Return meridians and parallels of a drogue: spherical bottom, and cone up to the mouth."""
     angle, bottom = float(drogue.half_angle), float(drogue.bottom_radius)
     mouth = float(drogue.mouth_radius) if isinstance(drogue, Shell) else 1.2 * size
     below = np.linspace(0, np.pi / 2 - angle, 9)

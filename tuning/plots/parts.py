@@ -1,4 +1,4 @@
-"""Parts that several plots share: limits, legends, logarithmic axes, and SVG elements for a page."""
+"""Functions that several plots use: lines for limits, legends, logarithmic axes, conversion to SVG."""
 
 import html
 import io
@@ -24,25 +24,28 @@ LINK_PATTERN = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
 
 def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2, **style: Any) -> None:
-    """Draw the limit with `Axes.axvline` or `Axes.axhline`; 0 and infinity have no place on a log axis."""
+    """Draw a line at the limit, unless it is None, 0 or infinite, which a logarithmic axis cannot show.
+
+    `line` is `Axes.axvline` or `Axes.axhline`.
+    """
     if limit is not None and 0 < limit < np.inf:
         line(limit, color=BLACK, linewidth=width, linestyle="--", label=f"limit {limit:g}", **style)
 
 
 def legend_above(axes: Axes, columns: int, **style: Any) -> Any:
-    """Draw the legend above the axes, which have no space for it inside."""
+    """Draw the legend above the axes instead of inside them, where data would hide it."""
     place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
     return axes.legend(ncols=columns, fontsize=8, frameon=False, **place, **style)
 
 
 def name_rows(axes: Axes, names: list[str]) -> None:
-    """Label the rows of a plot, from above, with the names of compensators."""
+    """Label the rows of a plot, from top to bottom, with the names of compensators."""
     axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     axes.set_ylim(len(names) - 0.5, -0.5)
 
 
 def set_scale(axis: Axis, low: float, high: float, logarithmic: bool) -> None:
-    """Set the scale of an input's axis and its ticks, for values from `low` to `high`."""
+    """Set an axis to a logarithmic or linear scale, with suitable ticks for values from `low` to `high`."""
     if logarithmic:
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
         set_plain_ticks(axis, low, high)
@@ -51,7 +54,7 @@ def set_scale(axis: Axis, low: float, high: float, logarithmic: bool) -> None:
 
 
 def set_plain_ticks(axis: Axis, low: float, high: float) -> None:
-    """Set enough ticks on a logarithmic axis to read off values, with plain numbers as labels."""
+    """Set the ticks of a logarithmic axis from `low` to `high`, with labels like 0.02 instead of powers."""
     decades = np.log10(high / low)
     factors = (1.0,) if decades > 5 else (1.0, 3.0) if decades > 2.2 else (1.0, 2.0, 5.0)
     if decades < 0.9:
@@ -64,10 +67,10 @@ def set_plain_ticks(axis: Axis, low: float, high: float) -> None:
 
 @matplotlib.style.context("default")
 def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
-    """Return a figure as an SVG element; the link to a scenario has its text in `points`."""
+    """Return a figure as an SVG element; links to scenarios get the texts in `points`, by scenario index."""
     content = io.StringIO()
     FigureCanvasSVG(figure)
-    # A fixed salt makes equal figures give equal elements, with names that depend on their content.
+    # With a fixed salt, the names of the elements depend only on the content of the figure.
     with rc_context({"svg.hashsalt": "jaxhil", "svg.fonttype": "none"}):
         figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     svg = content.getvalue()

@@ -1,4 +1,4 @@
-"""Plots of a sweep's scenarios: failed and worst ones over the inputs, and the motion of one."""
+"""Plots of a sweep's scenarios: failures and worst errors over the inputs, and the run of one scenario."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,11 +24,12 @@ from tuning.sweeps.manifest import Manifest
 from tuning.sweeps.plot_statistics import PlotInput, PlotPlan, PlotPoints, PlotStatistics
 from tuning.sweeps.replay import compute_motion, record_six_axes
 
-FAILED, UNENDED = "failed", "failed, a contact did not end: drawn at the top"
+# Labels of the points; the count of points is added to them.
+FAILED, UNENDED = "failed", "failed, a contact did not end (drawn at the upper edge)"
 
 
 def scenario_plot(sweep: Sweep, index: int, title: str) -> Figure:
-    """Plot the scenario's motion at every tick, for one axis or six."""
+    """Plot the run of one scenario of a sweep, with one or six axes, over time."""
     if sweep.model.axes == 1:
         return plot_contacts(compute_motion(sweep, index), title, sensors="rig")
     from tuning.plots.six_axes import six_axes_plot
@@ -38,7 +39,7 @@ def scenario_plot(sweep: Sweep, index: int, title: str) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
-    """Plot scenarios as points, failed or not, over both inputs, and the worst error over each input."""
+    """Plot the scenarios of a sweep as points: failures over two inputs, and worst error over each input."""
     number = len(plan.per_scenario)
     points, limit = regions.points, manifest.limit or None
     size = (13, 4.9) if number == 2 else (7, 5.3)
@@ -53,7 +54,7 @@ def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manif
     finite = points.size[np.isfinite(points.size) & (points.size > 0)]
     values = [*finite, *([limit] if limit else [])] or [1.0]
     low, high = min(values) / 1.5, max(values) * 1.5
-    # Very small errors would take most of the axis without being informative.
+    # Without this bound, very small errors, which are not informative, would take up most of the axis.
     low = max(low, 1e-4 * high)
     for index, quantity in enumerate(plan.per_scenario):
         axes = panels[index - number]
@@ -77,7 +78,15 @@ def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manif
 def linked_scenarios(
     name: str, inputs: Sequence[Any], points: PlotPoints, limit: float | None, linked: Sequence[int]
 ) -> Figure:
-    """Draw the worst error of scenarios over each input, with rings around the linked scenarios."""
+    """Plot the worst error of scenarios over each input, with links to the plots of some scenarios.
+
+    Args:
+        name: name of the mechanism, for the title.
+        inputs: inputs of the horizontal axes; if empty, the axis is the index of the scenario.
+        points: scenarios.
+        limit: limit of the error; None for no limit.
+        linked: indices of the scenarios that get a ring with a link.
+    """
     number = max(1, len(inputs))
     figure = create_figure((5.4 * number + 0.6, 4.6), f"{name}: worst error of scenarios", below=0.95)
     panels: Any = figure.subplots(1, number, squeeze=False)[0]
@@ -95,7 +104,7 @@ def linked_scenarios(
                 axes.plot(across[mask], errors[mask], linestyle="none", marker=marker, markersize=3,
                           color=colour, label=label, rasterized=True)  # fmt: skip
         rings = axes.scatter(across[rings_at], errors[rings_at], s=55, facecolors=(1, 1, 1, 0.6),
-                             edgecolors=BLACK, linewidths=1.3, label="with a trace", zorder=4)  # fmt: skip
+                             edgecolors=BLACK, linewidths=1.3, label="plotted below", zorder=4)  # fmt: skip
         rings.set_urls([f"#scenario-{int(points.index[position])}" for position in rings_at])
         draw_limit(axes.axhline, limit, 1.5)
         label = inputs[column].label if inputs else "scenario [1]"
@@ -112,28 +121,28 @@ def linked_scenarios(
 def _draw_points(
     axes: Axes, across: np.ndarray, up: np.ndarray, failed: np.ndarray, size: np.ndarray
 ) -> None:
-    """Draw scenarios as points whose marker shows whether they failed and whether all contacts ended."""
+    """Draw scenarios as points at (across, up); the markers show failures and contacts that did not end."""
     ended = np.isfinite(size)
-    for which, label, colour, marker, width in (
+    for mask, label, colour, marker, width in (
         (~failed, "not failed", SKY_BLUE, "o", 2.0),
         (failed & ended, FAILED, VERMILION, "x", 3.5),
         (failed & ~ended, UNENDED, BLACK, "^", 3.5),
     ):
-        if np.any(which):
+        if np.any(mask):
             style: dict[str, Any] = {"linestyle": "none", "marker": marker, "markersize": width}
             style |= {"markeredgewidth": 0.8 if marker == "x" else 0, "rasterized": True}
-            axes.plot(across[which], up[which], color=colour, label=label, **style)
+            axes.plot(across[mask], up[mask], color=colour, label=label, **style)
 
 
 def _label_with_count(label: str, points: PlotPoints, regions: PlotStatistics) -> str:
-    """Return a label of points with their number and, if only some are drawn, the total."""
+    """Return a legend label with the number of its points and, if not all are drawn, the total number."""
     shown, total = int(np.sum(points.failed)), regions.failed
     unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
     if label in (FAILED, UNENDED) and unended:
-        part = "" if shown == total else f" of the first {shown} of {total}"
+        total_text = "" if shown == total else f" of the first {shown} of {total}"
         if label == FAILED:
-            return f"failed, every contact ended ({shown - unended}{part})"
-        return f"{label} ({unended}{part})"
+            return f"failed, every contact ended ({shown - unended}{total_text})"
+        return f"{label} ({unended}{total_text})"
     if label == "not failed":
         shown, total = len(points.failed) - shown, regions.scenarios - total
     elif label != FAILED:
@@ -142,7 +151,7 @@ def _label_with_count(label: str, points: PlotPoints, regions: PlotStatistics) -
 
 
 def name_axis(axis: Axis, quantity: PlotInput, values: Sequence[float] | np.ndarray = ()) -> None:
-    """Set label, scale and limits of an input's axis, which also covers `values` and their markers."""
+    """Set label, scale and limits of the axis of an input, with a margin for the markers of `values`."""
     axis.set_label_text(quantity.label)
     low, high = float(np.min(values, initial=quantity.low)), float(np.max(values, initial=quantity.high))
     axes, across = axis.axes, axis is axis.axes.xaxis

@@ -1,4 +1,4 @@
-"""Plots of a six-axis run: poses and forces over time, and views of the mechanism in contact."""
+"""Plot of a six-axis run: pose, forces and moments over time, and views of the mechanism in contact."""
 
 from typing import Any
 
@@ -23,25 +23,20 @@ from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 
 AXIS_NAMES = ("x", "y", "z")
 AXIS_COLOURS = (BLUE, VERMILION, GREEN)
-CANDIDATE_COLOURS = (
-    BLUE,
-    VERMILION,
-    GREEN,
-    ORANGE,
-    SKY_BLUE,
-    "0.35",
-)  # colours of candidates; repeated with dashed lines
+# Colours of the contact candidates; further candidates repeat the colours with dashed lines.
+CANDIDATE_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY_BLUE, "0.35")
 TIME_MARGIN = 0.05  # s; time shown before the first and after the last contact
-MIN_VIEW_RATIO = 0.3  # least ratio of a view's height to its width
-MAX_LEGEND_ENTRIES = 12  # limit on the number of candidates in a legend
-VIEWS = ((0, 2), (1, 2))  # horizontal and vertical axis of each view
+MIN_VIEW_RATIO = 0.3  # smallest ratio of a view's height to its width, so that force arrows have space
+MAX_LEGEND_ENTRIES = 12  # largest number of candidates in a legend
+VIEWS = ((0, 2), (1, 2))  # indices of the horizontal and the vertical axis of each view
 
 
 @matplotlib.style.context("default")
 def six_axes_plot(recorded: Recorded, title: str) -> Figure:
-    """Plot pose, normal forces and moments over time, and the mechanism at first touch and deepest contact.
+    """Plot a six-axis run: pose, normal forces and moments over time, and views of the mechanism in contact.
 
-    Grey lines show the ideal contact.
+    The views show the mechanism at the first touch and at the largest penetration. Grey lines show the ideal
+    contact.
     """
     figure = create_figure((12, 8.8), title, above=0.6, below=0.75)
     rows = figure.add_gridspec(3, 4, height_ratios=(1, 1, 0.75), hspace=0.38, wspace=0.36)
@@ -56,7 +51,7 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
             axes.plot(time, in_space, color="0.7", linewidth=3)
             axes.plot(time, desired, color=colour, label=AXIS_NAMES[axis])
             axes.plot(time, actual, color=colour, linestyle=":")
-        axes.set(ylabel=f"{name}, less that\n{since.replace('since', 'at')}")
+        axes.set(ylabel=f"{name}, minus that\n{since.replace('since', 'at')}")
         finish_axes(axes, "best")
     left, right = figure.add_subplot(rows[1, :2]), figure.add_subplot(rows[1, 2:])
     _plot_forces(left, recorded, shown, time)
@@ -70,14 +65,18 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
             axes = figure.add_subplot(rows[2, 2 * column + view])
             draw_view(axes, recorded, tick, target, chaser, across, up)
             axes.set_title(f"{name} on the rig, {after:.3g} ms", fontsize=10)
-    lines = "Solid: numerical model; dotted: hardware, when the sensor samples it; grey: in space."
-    lines += " Below: target grey, chaser blue, forces on the chaser black."
-    figure.text(0.5, 0.015, lines, ha="center", fontsize=9)
+    legend = "Solid: numerical model; dotted: hardware at the sampling instants; grey: ideal contact."
+    legend += " Below: target grey, chaser blue, forces on the chaser black."
+    figure.text(0.5, 0.015, legend, ha="center", fontsize=9)
     return figure
 
 
 def find_time_origin(recorded: Recorded) -> tuple[int, str]:
-    """Return the tick of time 0 and its description: the first touch, of the ideal contact if it touches."""
+    """Return the tick at which the plots' time is 0, and a text that describes this tick.
+
+    The tick is that of the first touch in the ideal contact, or else on the rig, or else the start of the
+    run.
+    """
     in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
     if len(in_space):
         return int(in_space[0]), "since first touch in space"
@@ -86,7 +85,7 @@ def find_time_origin(recorded: Recorded) -> tuple[int, str]:
 
 
 def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
-    """Return descriptions and ticks of the two moments at which the mechanism is drawn."""
+    """Return description and tick of the two instants for which the mechanism is drawn."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
         return ("start", 0), ("end", len(recorded.time) - 1)
@@ -94,7 +93,10 @@ def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
 
 
 def find_shown_ticks(recorded: Recorded) -> slice:
-    """Return the ticks from first to last contact, on the rig or ideal, with a margin; else all ticks."""
+    """Return the ticks to be shown: from the first to the last contact, on the rig or ideal, with a margin.
+
+    Without contact, return all ticks.
+    """
     touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_in_space != 0, axis=1)
     ticks = np.flatnonzero(touching)
     if not len(ticks):
@@ -112,7 +114,10 @@ def draw_view(
     across: int,
     up: int,
 ) -> None:
-    """Draw both mechanisms at a tick, seen along the third axis, in mm."""
+    """Draw target, chaser and contact forces at a tick, projected onto the axes `across` and `up` [mm].
+
+    `target` and `chaser` are outlines, as returned by `outlines`.
+    """
     pose = recorded.actual[tick]
     rotation = rotation_matrix(quaternion_of(pose[3:]))
     moved = [line @ rotation.T + pose[:3] for line in chaser]
@@ -122,7 +127,7 @@ def draw_view(
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="box")
     width, height = (float(np.ptp(limits)) for limits in (axes.dataLim.intervalx, axes.dataLim.intervaly))
-    # A flat mechanism needs additional height for its forces.
+    # The view of a flat mechanism needs additional height for the arrows of the forces.
     missing = max(MIN_VIEW_RATIO * width - height, 0.0)
     axes.set_ylim(axes.get_ylim()[0] - missing / 2, axes.get_ylim()[1] + missing / 2)
     largest = max(float(np.max(recorded.force)), 1e-12)
@@ -137,7 +142,7 @@ def draw_view(
 
 
 def quaternion_of(theta: np.ndarray) -> Any:
-    """Return the quaternion of a rotation vector [rad]."""
+    """Convert a rotation vector (3,) [rad] to a unit quaternion."""
     import jax.numpy as jnp
 
     from jaxhil.sixdof.rotations import exponential
@@ -147,9 +152,9 @@ def quaternion_of(theta: np.ndarray) -> Any:
 
 
 def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Plot the normal force of every candidate in contact, and the total force of the ideal contact."""
+    """Plot the normal force of each candidate that touches, and the total force of the ideal contact."""
     total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
-    axes.plot(time, total, color="0.7", linewidth=3, label="in space, whole")
+    axes.plot(time, total, color="0.7", linewidth=3, label="total force in space")
     for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
         colour, line = (
             CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)],
@@ -162,7 +167,7 @@ def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray)
 
 
 def _plot_moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Plot the moment about T of the real contact, of the command to the numerical model, and ideal."""
+    """Plot the moments about T of the real contact, of the command, and of the ideal contact."""
     for axis, colour in enumerate(AXIS_COLOURS):
         axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
         axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXIS_NAMES[axis])

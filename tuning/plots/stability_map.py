@@ -1,4 +1,4 @@
-"""Plot of a stability map, in the colours and units of the other plots."""
+"""Plot of a stability map: error in colours, contours, theory, and margins of the nominal point."""
 
 from typing import Any
 
@@ -20,16 +20,17 @@ from tuning.sweeps.plot_statistics import DISPLAY_UNITS, INPUT_LABELS
 
 CONTOUR_ERRORS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
 MAX_COLOUR_ERROR = 10.0  # largest error on the colour scale
-MAX_CONTOURS, MAX_COLOUR_TICKS = (
-    4,
-    20,
-)  # largest number of contours, and of ticks of the colour bar, for either sign
-PALE_ORANGE = "#F7CF85"  # orange on which black lines are visible
+# Largest numbers of contours, and of ticks of the colour bar, for errors of the same sign.
+MAX_CONTOURS, MAX_COLOUR_TICKS = 4, 20
+PALE_ORANGE = "#F7CF85"  # orange, light enough for black lines to be visible
 
 
 @matplotlib.style.context("default")
 def map_plot(stability_map: MapResults, title: str, limit: float) -> Figure:
-    """Draw the signed error in colours with contours, those of theory, and the nominal point with margins."""
+    """Plot a stability map: signed error in colours, contours of error and theory, nominal point.
+
+    The margins of the nominal point are those for the error `limit` [1].
+    """
     figure = create_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
     axes = figure.subplots()
@@ -43,7 +44,7 @@ def map_plot(stability_map: MapResults, title: str, limit: float) -> Figure:
     handles += _draw_nominal(axes, stability_map)
     for axis, plot_axis in zip(stability_map.axes, (axes.xaxis, axes.yaxis), strict=True):
         low, high = _in_plot_unit(axis, np.array([axis.low, axis.high]))
-        # A key is text, not a formula.
+        # Matplotlib would read text between dollar signs as a formula.
         label = (
             f"{INPUT_LABELS.get(axis.key, to_one_line(axis.key, 60))} [{to_one_line(_plot_unit(axis), 20)}]"
         )
@@ -60,7 +61,7 @@ def map_plot(stability_map: MapResults, title: str, limit: float) -> Figure:
 def _draw_error(
     figure: Figure, axes: Axes, stability_map: MapResults, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
-    """Draw the error in colours with contours, and return the handles for the legend."""
+    """Draw the error in colours with contours, and return the entries for the legend."""
     error = stability_map.error
     anchors = [BLUE, SKY_BLUE, "white", PALE_ORANGE, VERMILION]
     colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
@@ -83,7 +84,7 @@ def _draw_error(
     if levels:
         lines = axes.contour(x, y, error, levels=levels, colors=BLACK, linewidths=0.8, linestyles="-")
         axes.clabel(lines, fmt=lambda value: f"{value:+.2g}", fontsize=8)
-        handles.append(Line2D([], [], color=BLACK, linewidth=0.8, label="error as labelled"))
+        handles.append(Line2D([], [], color=BLACK, linewidth=0.8, label="contours of the error"))
     if np.any(finite <= drawn) and np.any(finite > drawn):
         axes.contour(x, y, np.abs(error), levels=[drawn], colors=BLACK, linewidths=2.2)
         handles.append(Line2D([], [], color=BLACK, linewidth=2.2, label=f"error of {drawn:g}, the limit"))
@@ -95,7 +96,7 @@ def _draw_error(
 def _draw_theory(
     axes: Axes, stability_map: MapResults, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
-    """Draw the contours of the closed forms, and return the handles for the legend."""
+    """Draw the contours of the closed-form errors, and return the entries for the legend."""
     handles: list[Any] = []
     drawn = limit if 0 < limit < np.inf else 0.01
     for values, colour, line, label in (
@@ -120,7 +121,7 @@ def _draw_theory(
 
 
 def _draw_growth(axes: Axes, stability_map: MapResults) -> list[Any]:
-    """Draw the contour at which the spectral radius of a lasting contact is 1; return its handle."""
+    """Draw the contour at which the loop in contact has the spectral radius 1; return its legend entry."""
     radii = stability_map.radii
     if radii is None or not np.min(radii.values) < 1 < np.max(radii.values):
         return []
@@ -129,12 +130,12 @@ def _draw_growth(axes: Axes, stability_map: MapResults) -> list[Any]:
         for axis, values in zip(stability_map.axes, (radii.x, radii.y), strict=True)
     )
     axes.contour(x, y, radii.values, levels=[1.0], colors=GREEN, linewidths=2.2)
-    label = "spectral radius 1: beyond, a contact that lasts grows"
+    label = "spectral radius 1: above 1, the oscillation in contact grows"
     return [Line2D([], [], color=GREEN, linewidth=2.2, label=label)]
 
 
 def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
-    """Draw the nominal point and its margins, and return its handle."""
+    """Draw the nominal point and its margins, and return its entry for the legend."""
     point = [float(_in_plot_unit(axis, np.array(axis.nominal))) for axis in stability_map.axes]
     style: dict[str, Any] = {
         "marker": "o",
@@ -145,7 +146,7 @@ def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
     axes.plot(*point, label="nominal", linestyle="none", markeredgewidth=1.6, zorder=5, **style)
     label = "nominal"
     if stability_map.nominal.error_margins is not None:
-        label = "nominal, and how far either key may go within the limit"
+        label = "nominal, and range of each key within the limit"
         for index, (axis, margin) in enumerate(
             zip(stability_map.axes, stability_map.nominal.error_margins, strict=True)
         ):
@@ -159,19 +160,22 @@ def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
 
 
 def _contour_levels(error: np.ndarray, limit: float, most: int = MAX_CONTOURS) -> list[float]:
-    """Return the errors with contours: 1 and 3 in each decade, and the limit, within the range of errors."""
-    sizes = sorted({limit, *(size for size in CONTOUR_ERRORS if size > 1.5 * limit)})
+    """Return the levels of the contours of both signs: the limit, and 1 and 3 in each larger decade.
+
+    Only levels within the range of `error` are returned, at most `most` of each sign.
+    """
+    levels = sorted({limit, *(level for level in CONTOUR_ERRORS if level > 1.5 * limit)})
     low, high = np.nanmin(error, initial=0.0), np.nanmax(error, initial=0.0)
-    above = [size for size in sizes if size < high][-most:]
-    below = [-size for size in sizes if -size > low][-most:]
+    above = [level for level in levels if level < high][-most:]
+    below = [-level for level in levels if -level > low][-most:]
     return sorted([*below, *above])
 
 
 def _plot_unit(axis: MapAxis) -> str:
-    """Return the unit of an axis in the plot."""
+    """Return the unit in which the plot shows the values of an axis."""
     return DISPLAY_UNITS.get(axis.unit, (1.0, axis.unit))[1]
 
 
 def _in_plot_unit(axis: MapAxis, values: np.ndarray) -> np.ndarray:
-    """Return values in the unit of the plot."""
+    """Convert values of an axis from its SI unit to the unit of the plot."""
     return DISPLAY_UNITS.get(axis.unit, (1.0, axis.unit))[0] * values

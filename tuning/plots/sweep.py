@@ -1,6 +1,6 @@
-"""Plots of a sweep: restitution error over its inputs, failure region, convergence of the estimate.
+"""Plots of a sweep: restitution error over the inputs, failure region, convergence of the probability.
 
-They are made from the rows and written into the store's folder after its parts.
+The plots are computed from the stored rows, and are written to the folder of the store.
 """
 
 from pathlib import Path
@@ -41,15 +41,15 @@ from tuning.sweeps.plot_statistics import (
 )
 from tuning.sweeps.store import PLOTS, SweepStore
 
-MIN_CONTACTS_PER_CELL = 20  # least number of contacts of a cell with a 95th percentile
-# Terms for errors and contacts that replace those of one axis in six-axis plots.
+MIN_CONTACTS_PER_CELL = 20  # number of contacts in a cell below which its 95th percentile is not shown
+# Terms of one-axis plots, with the terms that replace them in six-axis plots.
 SIX_AXIS_TERMS = {
     "|e - e*|": "|error|",
     "restitution error": "errors",
     "a contact": "an episode",
     "contacts": "errors",
 }
-# Order, label, colour and line style of every quantile of the profile.
+# Order, label, colour and line style of each quantile that is plotted over the first input.
 PROFILE_QUANTILES = (
     (0.5, "half of the contacts", SKY_BLUE, "-"),
     (0.95, "95 %", BLUE, "-"),
@@ -58,9 +58,10 @@ PROFILE_QUANTILES = (
 
 
 def draw_plots(store: SweepStore, acceptable: float | None = None) -> dict[str, Figure]:
-    """Draw the plots of the parts before the first missing one; return them by file name.
+    """Draw the plots of a sweep, and return them by file name.
 
-    One part is read at a time. `acceptable` is a failure probability [1] that the convergence plot shows.
+    The plots show the rows of all chunks before the first missing chunk. The chunks are read one by one, to
+    limit the memory. `acceptable` is a failure probability [1], drawn in the plot of convergence.
     """
     manifest, mechanism = store.manifest, load_gains(store.manifest).mechanism
     plan, regions = read_regions(store, mechanism)
@@ -78,7 +79,7 @@ def draw_plots(store: SweepStore, acceptable: float | None = None) -> dict[str, 
 
 
 def _rename_for_six_axes(figure: Figure) -> None:
-    """Replace the terms of one axis by those of six axes, where an episode has two errors."""
+    """Replace the terms for one axis in all texts of a figure by the terms for six axes."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         label = text.get_text()
@@ -88,7 +89,11 @@ def _rename_for_six_axes(figure: Figure) -> None:
 
 
 def write_plots(store: SweepStore, acceptable: float | None = None) -> list[str]:
-    """Draw and write the plots; return their paths. Raise `InputError` if one cannot be written."""
+    """Draw the plots of a sweep, write them to its folder, and return their paths.
+
+    Raise `InputError` if a file cannot be written. `acceptable` is a failure probability [1], drawn in the
+    plot of convergence.
+    """
     paths = []
     for name, figure in draw_plots(store, acceptable).items():
         path = Path(store.folder) / name
@@ -100,20 +105,21 @@ def write_plots(store: SweepStore, acceptable: float | None = None) -> list[str]
 
 @matplotlib.style.context("default")
 def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
-    """Plot quantiles of |e - e*| over the first input and, as a map, over both inputs."""
+    """Plot quantiles of |e - e*| over the plan's first input and, as a map, over both inputs of the plan."""
     figure = create_figure(
         (8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85
     )
-    two = len(plan.per_contact) == 2
+    has_two_inputs = len(plan.per_contact) == 2
+    rows = 2 if has_two_inputs else 1
     figure.subplots_adjust(left=0.095, right=0.88, hspace=0.12, wspace=0.03)
-    grid: Any = figure.subplots(2 if two else 1, 2, squeeze=False, gridspec_kw={"width_ratios": (40, 1)})
+    grid: Any = figure.subplots(rows, 2, squeeze=False, gridspec_kw={"width_ratios": (40, 1)})
     grid[0, 1].axis("off")
     if not plan.per_contact:
         finish_axes(grid[0, 0], None)
         return figure
     first, limit = plan.per_contact[0], manifest.limit or None
     _draw_profile(grid[0, 0], first, plan.cells, regions.sizes, limit)
-    if two:
+    if has_two_inputs:
         _draw_map(figure, grid[1, 0], grid[1, 1], plan, regions.sizes, limit)
         grid[0, 0].set_xlim(grid[1, 0].get_xlim())
         grid[0, 0].tick_params(labelbottom=False)
@@ -125,7 +131,11 @@ def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, 
 def plot_convergence(
     plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str, acceptable: float | None = None
 ) -> Figure:
-    """Plot the failure probability and its interval over the number of scenarios, in order of the index."""
+    """Plot the estimated failure probability and its 95 % interval over the number of scenarios.
+
+    Scenarios are added in the order of their index. `acceptable` is a failure probability [1], drawn as a
+    line.
+    """
     figure = create_figure((7.6, 5.2), f"{name}: failure probability as scenarios are added", below=1.05)
     figure.subplots_adjust(right=0.93)  # The last tick label is long.
     axes = figure.subplots()
@@ -152,7 +162,7 @@ def plot_convergence(
     text += f", last {low[-1]:.3g} to {high[-1]:.3g}"
     axes.fill_between(looks, low, high, color=SKY_BLUE, alpha=0.4, linewidth=0, label=text)
     if wide_low is not None and wide_high is not None:
-        label = "95 % at all numbers at once: stop wherever you like"
+        label = "95 % for all numbers together: valid for any stopping rule"
         style: dict[str, Any] = {"color": ORANGE, "linestyle": "--", "linewidth": 1.3}
         axes.plot(looks, wide_low, label=label, **style)
         axes.plot(looks, wide_high, **style)
@@ -175,7 +185,7 @@ def plot_convergence(
 def _draw_profile(
     axes: Axes, quantity: PlotInput, cells: int, sizes: np.ndarray, limit: float | None
 ) -> None:
-    """Draw quantiles of |e - e*| over one input."""
+    """Draw the quantiles `PROFILE_QUANTILES` of |e - e*| over one input."""
     counts = sizes.reshape(cells, -1, sizes.shape[-1]).sum(axis=1)
     edges = quantity.edges(cells)
     middles = np.sqrt(edges[1:] * edges[:-1]) if quantity.logarithmic else (edges[1:] + edges[:-1]) / 2
@@ -198,7 +208,10 @@ def _draw_profile(
 def _draw_map(
     figure: Figure, axes: Axes, bar: Axes, plan: PlotPlan, sizes: np.ndarray, limit: float | None
 ) -> None:
-    """Draw the 95th percentile per cell; with a limit, blue within it and red beyond."""
+    """Draw the 95th percentile of |e - e*| per cell of two inputs, with colours that depend on the limit.
+
+    Values below the limit are blue, and values above the limit are orange to red.
+    """
     first, second = plan.per_contact
     values = compute_error_quantile(sizes, 0.95, MIN_CONTACTS_PER_CELL)
     finite = values[np.isfinite(values)]
@@ -238,12 +251,12 @@ def _draw_map(
     if unended:
         handles.append(Patch(color=BLACK, label="more than 5 % did not end"))
     if handles:
-        # The legend is below the axes, whose whole area is covered with cells.
+        # The legend is below the axes, because the cells cover their whole area.
         figure.legend(handles=handles, loc="lower center", fontsize=8, frameon=False, ncols=2)
 
 
 def _set_bar_ticks(axis: Axis, low: float, high: float) -> None:
-    """Set ticks of a colour bar at both ends, and between them where they do not overlap the ends."""
+    """Set ticks of a logarithmic colour bar at both ends, and between them where labels do not overlap."""
     values = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
     gap = (high / low) ** 0.06
     inner = [float(value) for value in values if low * gap < value < high / gap]
@@ -254,7 +267,10 @@ def _set_bar_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def _set_probability_limits(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
-    """Set the limits of the probability axis by the last 99 % of the scenarios, with narrow intervals."""
+    """Set the limits of the probability axis so that the estimates after 1 % of the scenarios fit.
+
+    Earlier estimates have wide intervals, which would dominate the axis.
+    """
     late = looks >= looks[-1] / 100
     ends = [*low[late], *high[late], *share[late], acceptable or 0.0]
     top, least = max(ends), min(value for value in ends if value > 0)

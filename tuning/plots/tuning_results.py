@@ -1,4 +1,4 @@
-"""Plots of tuning results: errors before and after, the solver's starts, Pareto fronts."""
+"""Plots of tuning results: errors before and after tuning, objective over solver steps, Pareto fronts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,7 +29,7 @@ from tuning.plots.parts import MARKERS, draw_limit, legend_above
 
 @matplotlib.style.context("default")
 def errors_plot(result: TuneResult, limit: float) -> Figure:
-    """Plot distribution and contact frequency of the restitution errors, before and after tuning."""
+    """Plot the restitution errors before and after tuning: their distribution, and over contact frequency."""
     figure = create_figure(
         (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
     )
@@ -48,14 +48,14 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
         right.plot(*points, color=CURVE_STYLES[name][0], label=CURVE_LABELS[name], **style)
     if has_limit:
         right.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=f"within {limit:g}")
-    left.set(xlabel="size of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
+    left.set(xlabel="magnitude of the error |e - e*| [1]", ylabel="share of contacts with a larger error [1]")
     right.axhline(0, color=BLACK, linewidth=0.6)
     right.set_yscale("symlog", linthresh=limit if has_limit else 0.01)
     right.set(xlabel="contact frequency [Hz]", ylabel="error e - e* [1]  (above 0: divergence)")
     finish_axes(left, "lower left")
     finish_axes(right, None)
     if right.get_legend_handles_labels()[0]:
-        # There are points everywhere inside the axes.
+        # Inside the axes, the legend would hide points.
         legend = legend_above(right, 4, markerscale=2.5, columnspacing=1.2)
         for handle in legend.legend_handles:
             if handle is not None:
@@ -65,39 +65,40 @@ def errors_plot(result: TuneResult, limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def six_axis_errors_plot(result: TuneResult, limit: float) -> Figure:
-    """Plot the distributions of the energy and twist errors of six axes, before and after tuning."""
+    """Plot the distributions of a six-axis mechanism's energy and twist errors, before and after tuning."""
     figure = create_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
-    shown = {"energy_error": "size of the energy error [1]", "twist_error": "twist error [1]"}
+    labels = {"energy_error": "magnitude of the energy error [1]", "twist_error": "twist error [1]"}
     by_error = choose_rig_model(result.mechanism).by_error
-    for axes, (error, label) in zip(figure.subplots(1, 2), shown.items(), strict=True):
-        _draw_shares(axes, {name: by_error(each)[error] for name, each in result.outcomes.items()}, limit)
+    for axes, (error, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        outcomes = {name: by_error(outcome)[error] for name, outcome in result.outcomes.items()}
+        _draw_shares(axes, outcomes, limit)
         axes.set(xlabel=label, ylabel="share of episodes with a larger error [1]")
         finish_axes(axes, "lower left")
     return figure
 
 
 def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
-    """Plot the share of contacts with an error larger than each size, by gains, and the limit."""
-    sizes: list[float] = [limit] if 0 < limit < np.inf else []
+    """Plot the share of contacts whose error exceeds a value over this value, for each set of gains."""
+    shown_errors: list[float] = [limit] if 0 < limit < np.inf else []
     for name, outcome in outcomes.items():
-        size = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
-        if not len(size):
+        errors = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
+        if not len(errors):
             continue
         colour, line, width = CURVE_STYLES[name]
         total = int(np.sum(outcome.wanted))
-        # Contacts that did not end count as larger than any error and raise the whole curve.
-        share = (np.arange(1, len(size) + 1) + total - len(size)) / total
+        # A contact that did not end counts as an infinite error, which raises the whole curve.
+        share = (np.arange(1, len(errors) + 1) + total - len(errors)) / total
         style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
-        axes.step(size, share, where="post", label=CURVE_LABELS[name], **style)
-        sizes += [float(size[0]), float(np.percentile(size, 2))]
+        axes.step(errors, share, where="post", label=CURVE_LABELS[name], **style)
+        shown_errors += [float(errors[0]), float(np.percentile(errors, 2))]
     draw_limit(axes.axvline, limit)
-    positive = [value for value in sizes if value > 0] or [1.0]
+    positive = [value for value in shown_errors if value > 0] or [1.0]
     axes.set(xscale="log", yscale="log", xlim=(min(positive) / 1.5, 1.5 * max(positive)))
 
 
 @matplotlib.style.context("default")
 def loss_plot(result: TuneResult) -> Figure:
-    """Plot the objective of each start against the steps of the solver."""
+    """Plot the objective over the solver's steps, one curve for each start."""
     figure = create_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
@@ -127,7 +128,7 @@ def loss_plot(result: TuneResult) -> Figure:
 
 @matplotlib.style.context("default")
 def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
-    """Plot the rms error of every mechanism before tuning, with the literature's gains, and after tuning."""
+    """Plot the rms error of each mechanism: uncompensated, with the literature's gains, and tuned."""
     height = 1.6 + 0.2 * len(results)
     figure = create_figure(
         (8, height), f"Restitution error of {len(results)} mechanisms on fresh scenarios", 0.9
@@ -157,7 +158,10 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
-    """Plot restitution error against cost: the front, all numbered points, literature's and tuned gains."""
+    """Plot a Pareto front of restitution error and cost, with numbered points.
+
+    The literature's gains and the gains tuned for the least error are also shown.
+    """
     figure = create_figure(
         (7, 5), f"{result.mechanism.name}: restitution error against {front.axis.name}, fresh scenarios"
     )
@@ -166,9 +170,9 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
     axes.step([p.cost for p in best], [p.error for p in best], where="post", color=BLUE)
     for points, label, marker, size, edge, face in (
         (best, "front", "o", 7, BLUE, BLUE),
-        ([p for p in front.points if not p.on_front], "beaten by another", "o", 7, BLUE, "white"),
+        ([p for p in front.points if not p.on_front], "dominated by another point", "o", 7, BLUE, "white"),
         ([front.literature], CURVE_LABELS["literature"], "s", 7, ORANGE, ORANGE),
-        # The marker is open, because the tuned gains may also be a point of the front.
+        # The marker is open, so that a point of the front with the same gains remains visible.
         ([front.tuned], CURVE_LABELS["tuned"], "D", 10, BLACK, "none"),
     ):
         if points:
@@ -193,7 +197,7 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
 
 
 def _set_log_scale(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """Make an axis logarithmic with plain tick labels if its values differ by more than a factor of 3."""
+    """Make axis "x" or "y" logarithmic, with plain tick labels, if its values span a factor above 3."""
     low, high = min(values), max(values)
     if not 0 < 3 * low < high:
         return

@@ -1,1 +1,1 @@
-"""Report page for a review board."""
+"""Report for a review board: an HTML page with the results of all commands."""

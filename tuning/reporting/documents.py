@@ -1,4 +1,7 @@
-"""Structs for the documents of commands, with the fields that a report shows; wrong files do not fit them."""
+"""Structs for the JSON documents of commands, with the fields that a report shows.
+
+A file that lacks a field, or whose field has another type, cannot be converted to these structs.
+"""
 
 from msgspec import Struct
 
@@ -13,28 +16,28 @@ class ProbabilityEntry(Struct):
 
 
 class QuantileEntry(Struct):
-    """Quantile of the worst |e - e*| of a scenario; None if it is infinite."""
+    """Quantile, over the scenarios of a sweep, of the worst |e - e*| of a scenario."""
 
-    order: float
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
+    order: float  # order of the quantile, 0 to 1
+    value: float | None = None  # quantile [1]; None if it is infinite
+    low: float | None = None  # lower end of the 95 % interval [1]
+    high: float | None = None  # upper end of the 95 % interval [1]
 
 
 class WorstScenario(Struct):
-    """One of the worst scenarios of a sweep."""
+    """Outcome and inputs of a scenario with one of the largest errors in a sweep."""
 
     index: int
     outcome: str
-    worst_error: float | None = None
-    worst_contact: int | None = None
-    inputs: dict[str, float | None] = {}
+    worst_error: float | None = None  # e - e* of largest magnitude [1]; None if a contact did not end
+    worst_contact: int | None = None  # number of the contact with this error
+    inputs: dict[str, float | None] = {}  # drawn values by key of the mechanism file [SI units]
 
 
 class InputIndicesEntry(Struct):
-    """Sobol indices of an input, with their confidence intervals."""
+    """First-order and total Sobol index of an input, with 95 % confidence intervals [1]."""
 
-    input: str
+    input: str  # key of the mechanism file, or several keys that vary together
     first_order: float | None = None
     first_order_low: float | None = None
     first_order_high: float | None = None
@@ -44,28 +47,28 @@ class InputIndicesEntry(Struct):
 
 
 class SobolIndicesEntry(Struct):
-    """Sobol indices of the error."""
+    """Sobol indices of the worst error of a scenario, for all inputs."""
 
     inputs: list[InputIndicesEntry]
-    cap: float
-    evaluations: int
-    capped: int
+    cap: float  # value at which larger errors are clipped [1]
+    evaluations: int  # number of simulated scenarios
+    capped: int  # number of scenarios whose error was clipped
 
 
 class SubsetSimulationEntry(Struct):
-    """Result of a subset simulation."""
+    """Probability of a rare error, from subset simulation."""
 
-    limit: float
-    probability: float
-    low: float
-    high: float
-    evaluations: int
-    coefficient_of_variation: float | None = None
-    spread_beyond_formula: bool = False
+    limit: float  # error above which a scenario fails [1]
+    probability: float  # failure probability [1]
+    low: float  # lower end of the 95 % interval [1]
+    high: float  # upper end of the 95 % interval [1]
+    evaluations: int  # number of simulated scenarios
+    coefficient_of_variation: float | None = None  # of the estimate, from the spread of the replicates [1]
+    spread_beyond_formula: bool = False  # whether the replicates differ more than the theory predicts
 
 
 class SweepVerdict(Struct):
-    """Document verdict.json of a sweep's store."""
+    """JSON document verdict.json in the folder of a sweep: failure probability, errors and verdict."""
 
     sweep_sha256: str
     gains_sha256: str
@@ -89,66 +92,69 @@ class SweepVerdict(Struct):
 
 
 class EstimateEntry(Struct):
-    """Parameter that was identified, or known beforehand."""
+    """Parameter of a mechanism that was estimated from logs or fixed by the user, in SI units."""
 
-    key: str
+    key: str  # key of the mechanism file
     value: float
     unit: str
-    known: bool
-    std: float | None = None
-    low: float | None = None
-    high: float | None = None
-    prior: float | None = None
+    known: bool  # whether the user fixed the value
+    std: float | None = None  # standard deviation of the estimate
+    low: float | None = None  # lower end of the 95 % interval
+    high: float | None = None  # upper end of the 95 % interval
+    prior: float | None = None  # value in the prior mechanism file
 
 
 class CheckEntry(Struct):
-    """Effect that an identification looked for."""
+    """Result of the search for one effect that an identified model may not explain."""
 
     name: str
     finding: str
-    there: bool
-    effect: float | None = None
-    where: str = ""
-    counts: bool = True
+    there: bool  # whether the effect was detected
+    effect: float | None = None  # change of e by the effect [1]
+    where: str = ""  # log and time of the effect
+    counts: bool = True  # whether the effect counts in the verdict
 
 
 class IdentificationDocument(Struct):
-    """Document identification.json."""
+    """JSON document identification.json: estimates, checks of the model, and verdict."""
 
     estimates: list[EstimateEntry]
     checks: list[CheckEntry]
-    effect: float | None
-    limit: float | None
+    effect: float | None  # possible change of e by unexplained effects and uncertainty [1]
+    limit: float | None  # smallest effect for which the verdict is bad [1]
     verdict: str
     reason: str
     notes: list[str]
-    sources: dict[str, str]
+    sources: dict[str, str]  # SHA-256 digests by name of the log file
     seed: int
-    versions: dict[str, str]
-    effect_on_error: float | None = None
+    versions: dict[str, str]  # versions of the software by package
+    effect_on_error: float | None = None  # possible change of e - e* [1]
 
 
 class MonitoredMetric(Struct):
-    """Metric of a contact, 0 if the mechanism file is right; None if the log does not show it."""
+    """Metric of a monitored contact, which is 0 on average if the mechanism file is correct.
+
+    A field is None if the log does not contain enough data for the metric.
+    """
 
     value: float | None
-    predicted_std: float | None
+    predicted_std: float | None  # predicted standard deviation of the value
     z: float | None  # (value - predicted value) / predicted_std
 
 
 class MonitoredContact(Struct):
-    """Contact of later logs."""
+    """Contact in a log that was recorded after the identification, with its metrics and state."""
 
-    contact: int
+    contact: int  # number of the contact, from 1
     log: str
     state: str
-    figures: dict[str, MonitoredMetric]
+    figures: dict[str, MonitoredMetric]  # metrics by name
 
 
 class MonitoringDocument(Struct):
-    """Document of `jaxhil monitor --json`."""
+    """JSON document that `jaxhil monitor --json` prints: contacts with metrics, and state of the rig."""
 
-    mechanism: str  # path of a file, or name of a built-in one
+    mechanism: str  # path of a mechanism file, or name of a built-in mechanism
     mechanism_sha256: str | None
     state: str
     reason: str
@@ -156,11 +162,11 @@ class MonitoringDocument(Struct):
     notes: list[str]
     sources: dict[str, str]
     versions: dict[str, str]
-    since: int | None = None  # number of the contact at which a change likely began, from 1
+    since: int | None = None  # number, from 1, of the contact at which the rig probably changed
 
 
 class MetricEntry(Struct):
-    """Metric of a compensator, with its interval if it has one."""
+    """Value of one metric of a compensator, with its 95 % confidence interval, if any."""
 
     value: float | None = None
     low: float | None = None
@@ -168,95 +174,101 @@ class MetricEntry(Struct):
 
 
 class ComparedCompensator(Struct):
-    """Metrics of a compensator by the name of its gains, then by the metric's name."""
+    """Metrics of one compensator in a comparison."""
 
-    law: str
-    figures: dict[str, dict[str, MetricEntry]]
+    law: str  # name of the compensator
+    figures: dict[str, dict[str, MetricEntry]]  # metrics by name of the gains, then by name of the metric
 
 
 class ComparedMechanism(Struct):
-    """Metrics of all compensators for one mechanism."""
+    """Metrics of all compared compensators for one mechanism."""
 
     mechanism: str
     laws: list[ComparedCompensator]
 
 
 class ComparisonDocument(Struct):
-    """Document compare.json."""
+    """JSON document compare.json: a comparison of compensators on one or several mechanisms."""
 
-    limit: float | None
+    limit: float | None  # restitution error above which a scenario fails [1]
     seed: int
-    scenarios: int
-    judged: int
-    tuned: bool
+    scenarios: int  # number of scenarios for the tuning
+    judged: int  # number of fresh scenarios for the evaluation
+    tuned: bool  # whether compensators without settings were tuned
     mechanisms: list[ComparedMechanism]
 
 
 class AxisOfMap(Struct):
-    """Axis of map.json."""
+    """Axis of a stability map in map.json."""
 
-    key: str
+    key: str  # key of the mechanism file, or gains.NAME
     unit: str
-    nominal: float
-    values: list[float]
+    nominal: float  # value in the mechanism file
+    values: list[float]  # values along the axis, increasing
 
 
 class Theory(Struct):
-    """Closed forms at every point of a map."""
+    """Values of the closed forms at every point of a stability map, as rows along y.
 
-    series: list[list[float | None]] | None = None
-    characteristic_root: list[list[float | None]] | None = None
-    delay_over_critical: list[list[float | None]] | None = None
-    none_because: str | None = None
+    A field is None if its closed form does not apply.
+    """
+
+    series: list[list[float | None]] | None = None  # restitution from the series [1]
+    characteristic_root: list[list[float | None]] | None = None  # restitution from the dominant root [1]
+    delay_over_critical: list[list[float | None]] | None = None  # delay divided by the critical delay [1]
+    none_because: str | None = None  # reason if no closed form applies
 
 
 class RadiusOfMap(Struct):
-    """Spectral radius over its own grid."""
+    """Spectral radius of the loop in contact, on a grid that may be coarser than that of the map."""
 
-    x: list[float] | None = None
-    y: list[float] | None = None
-    values: list[list[float]] | None = None
-    none_because: str | None = None
+    x: list[float] | None = None  # values along x
+    y: list[float] | None = None  # values along y
+    values: list[list[float]] | None = None  # spectral radii [1], rows along y
+    none_because: str | None = None  # reason if there is no spectral radius
 
 
 class GrowthOfMap(Struct):
-    """Growth of a lasting contact at the nominal point."""
+    """Growth of the oscillation in a contact that does not end, at the nominal point of a stability map."""
 
-    spectral_radius: float
-    per_second: float
-    frequency: float
-    by_gain: dict[str, float]
-    per_half_oscillation: float | None = None
+    spectral_radius: float  # factor per control period [1]
+    per_second: float  # growth rate [1/s]
+    frequency: float  # frequency of the oscillation [Hz]
+    by_gain: dict[str, float]  # derivative of the spectral radius with respect to each gain
+    per_half_oscillation: float | None = None  # factor per half oscillation [1]
 
 
 class MarginOfMap(Struct):
-    """Ends of a range; None if the map ends first."""
+    """Range of one key around its nominal value within which a condition holds."""
 
-    low: float | None = None
-    high: float | None = None
+    low: float | None = None  # lower end; None if the condition holds down to the end of the map
+    high: float | None = None  # upper end; None if the condition holds up to the end of the map
 
 
 class MarginsOfMap(Struct):
-    """Margins by axis, "x" and "y"; None if the nominal point itself exceeds the limit."""
+    """Margins of the nominal point for three conditions, each by axis, "x" and "y".
 
-    error: dict[str, MarginOfMap] | None = None
-    contact: dict[str, MarginOfMap] | None = None
-    spectral_radius: dict[str, MarginOfMap] | None = None
+    A field is None if the nominal point itself violates the condition.
+    """
+
+    error: dict[str, MarginOfMap] | None = None  # error within the limit
+    contact: dict[str, MarginOfMap] | None = None  # real peak force and duration within their bounds
+    spectral_radius: dict[str, MarginOfMap] | None = None  # spectral radius at most 1
 
 
 class NominalOfMap(Struct):
-    """Results at the nominal point."""
+    """Results at the nominal point of a stability map, which the mechanism file describes."""
 
     margins: MarginsOfMap
-    restitution: float | None = None
-    error: float | None = None
-    peak_force_ratio: float | None = None
-    duration_ratio: float | None = None
+    restitution: float | None = None  # e of the contact with the largest error [1]
+    error: float | None = None  # largest error e - e* [1]; None if a contact did not end
+    peak_force_ratio: float | None = None  # largest peak force divided by the ideal contact's [1]
+    duration_ratio: float | None = None  # duration divided by the ideal contact's, farthest from 1 [1]
     growth: GrowthOfMap | None = None
 
 
 class MapDocument(Struct):
-    """Document map.json."""
+    """JSON document map.json: a stability map with theory and margins."""
 
     mechanism: str
     compensator: str

@@ -1,7 +1,7 @@
 """Plots of a report as SVG elements in the page.
 
-No script draws them, so they are visible without JavaScript and on paper; a plotting library would add more
-than 3 MB. The point of a scenario is a link to its plot.
+SVG elements are visible without JavaScript and on paper; a plotting script would increase the page by more
+than 3 MB. In the plot of a sweep, the point of a scenario is a link to the plot of the scenario's run.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,14 +38,14 @@ from tuning.sweeps.plot_statistics import PlotPoints, read_regions
 from tuning.sweeps.replay import compute_motion
 from tuning.sweeps.store import SweepStore
 
-TYPICAL_SCENARIOS = (
-    6  # number of scenarios with plots besides the worst, at equal distances in the order of errors
-)
-ESTIMATE_FIELDS = ("key", "value", "unit", "std", "low", "high", "prior")  # fields of an estimate in its plot
+# Number of scenarios that are plotted in addition to the worst; their ranks in the order of errors are evenly
+# spaced.
+TYPICAL_SCENARIOS = 6
+ESTIMATE_FIELDS = ("key", "value", "unit", "std", "low", "high", "prior")  # fields that the plot needs
 
 
 class SvgPlot(NamedTuple):
-    """Plot in a page."""
+    """Plot as an SVG element, with a caption and a description for screen readers."""
 
     svg: str
     says: str  # description for screen readers
@@ -53,15 +53,15 @@ class SvgPlot(NamedTuple):
 
 
 class ScenarioPlot(NamedTuple):
-    """Plot of a scenario's run."""
+    """Plot of the run of one scenario of a sweep."""
 
-    index: int
-    text: str  # how it ended
+    index: int  # index of the scenario
+    text: str  # description of the scenario's outcome
     drawing: SvgPlot
 
 
 def draw_nominal_run(subject: LoadedGains) -> SvgPlot:
-    """Draw the nominal run uncompensated, with the literature's gains, and with those of the file."""
+    """Draw the nominal run with the gains `subject`, with the literature's gains, and uncompensated."""
     if isinstance(subject.mechanism, SixAxisMechanism):
         return _draw_six_axis_run(subject)
     law = subject.compensator
@@ -74,44 +74,44 @@ def draw_nominal_run(subject: LoadedGains) -> SvgPlot:
 
 
 def _draw_six_axis_run(subject: LoadedGains) -> SvgPlot:
-    """Draw the nominal run of a six-axis mechanism."""
+    """Draw the nominal run of a six-axis mechanism with the gains `subject`."""
     run = simulate_six_axes(subject.mechanism, subject.compensator, subject.gains)
     figure = six_axes_plot(run.ticks, f"{subject.mechanism.name}, nominal run: {subject.compensator}")
-    says = "Pose, forces and moment over time, beside the same contact in space"
+    says = "Pose, forces and moment over time, compared with the ideal contact"
     [episode, *_] = run.episodes
     errors = f"Energy error {episode.energy_error:+.4f}, twist error {episode.twist_error:.4f}"
     return SvgPlot(as_svg(figure), says, f"The nominal run. {errors}.")
 
 
 def draw_map(document: MapDocument) -> SvgPlot:
-    """Draw the stability map of a document."""
+    """Draw a stability map from its JSON document."""
     title = f"{document.mechanism}, compensation: {document.compensator}"
     figure = map_plot(
         _map_from_document(document), title, np.inf if document.limit is None else document.limit
     )
     says = f"Restitution error over {document.x.key} and {document.y.key}"
-    return SvgPlot(as_svg(figure), says, f"{says}, under gains that stay the same.")
+    return SvgPlot(as_svg(figure), says, f"{says}; the gains are the same at every point.")
 
 
 def draw_estimates(document: IdentificationDocument) -> SvgPlot:
     """Draw the identified parameters and their prior values."""
     estimates = [estimate for estimate in document.estimates if None not in (estimate.low, estimate.high)]
     entries = [{name: getattr(estimate, name) for name in ESTIMATE_FIELDS} for estimate in estimates]
-    says = "Every estimate's interval, and the prior's value, over the estimate"
+    says = "95 % interval of each estimate, and the prior's value, relative to the estimate"
     return SvgPlot(as_svg(plot_estimates(entries)), says, f"{says}.")
 
 
 def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
-    """Draw all metrics over the number of the contact."""
+    """Draw the metrics of monitored contacts over the number of the contact, from the JSON document."""
     numbers = [contact.contact for contact in document.contacts]
     metrics = {name: _columns(document, name) for name, *_ in METRICS}
     figure = monitor_plot(document.mechanism, numbers, metrics, document.since)
-    says = "Figures of every contact over its number, with their predicted range"
-    return SvgPlot(as_svg(figure), says, f"{says}, 95 % of contacts of the rig of the file.")
+    says = "Metrics of every contact over its number, with their predicted range"
+    return SvgPlot(as_svg(figure), says, f"{says}: 95 % of the contacts if the mechanism file is correct.")
 
 
 def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
-    """Return value, predicted standard deviation, and z of a metric, (3, contacts); NaN if unknown."""
+    """Return value, predicted standard deviation, and z of a metric, (3, contacts); NaN for None."""
     rows = []
     for contact in document.contacts:
         metric = contact.figures.get(name)
@@ -122,7 +122,10 @@ def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
 def draw_sweep(
     store: SweepStore, worst: Sequence[WorstScenario], say: Callable[[str], None]
 ) -> tuple[SvgPlot, list[ScenarioPlot]]:
-    """Draw the errors of scenarios as points, and the runs of the worst and of some others."""
+    """Draw the errors of a sweep's scenarios as points, and the runs of the worst and of some others.
+
+    `say` is called with the name of each run. Return the plot of the errors, and the plots of the runs.
+    """
     sweep = build_sweep(store.manifest)
     plan, regions = read_regions(store, sweep.mechanism)
     assert plan is not None and regions is not None
@@ -134,8 +137,8 @@ def draw_sweep(
         texts.setdefault(int(points.index[position]), f"|e - e*| at most {points.size[position]:.4g}")
     name = sweep.mechanism.name
     figure = linked_scenarios(name, plan.per_scenario, points, store.manifest.limit, list(texts))
-    caption = "Scenarios of the sweep. A ringed one leads to its trace below."
-    drawing = SvgPlot(as_svg(figure, texts), "Worst error of scenarios over the inputs drawn", caption)
+    caption = "Scenarios of the sweep. A point with a ring is a link to the plot of its run below."
+    drawing = SvgPlot(as_svg(figure, texts), "Worst error of scenarios over the drawn inputs", caption)
     traces = []
     for index, text in texts.items():
         say(f"scenario {index}")
@@ -148,7 +151,10 @@ def draw_sweep(
 
 
 def _select_typical(points: PlotPoints) -> list[int]:
-    """Return the indices into `points` of scenarios from the smallest to below the largest error."""
+    """Return indices into `points` of scenarios whose ranks in the order of errors are evenly spaced.
+
+    The scenario with the smallest error is included, that with the largest error is not.
+    """
     order = np.argsort(points.size, kind="stable")
     order = order[np.isfinite(points.size[order])]
     ranks = (
@@ -158,14 +164,14 @@ def _select_typical(points: PlotPoints) -> list[int]:
 
 
 def _describe_end(outcome: str, error: float | None, contact: int | None) -> str:
-    """Return a text on the end of a scenario."""
+    """Return a text with the outcome and the worst error of a scenario."""
     if error is None:
         return outcome
     return f"{outcome}, e - e* = {error:+.4f}" + ("" if contact is None else f" in contact {contact}")
 
 
 def _map_from_document(document: MapDocument) -> MapResults:
-    """Return the map of a document."""
+    """Convert the JSON document of a stability map to the results from which the map is drawn."""
 
     def table(values: Any) -> Any:
         return None if values is None else np.array(values, float)

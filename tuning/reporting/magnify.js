@@ -1,5 +1,5 @@
 "use strict";
-// Buttons that magnify a picture; magnified, it is moved by dragging.
+// Add buttons that magnify a picture; a magnified picture can be moved by dragging.
 for (const picture of document.querySelectorAll(".picture")) {
   const svg = picture.querySelector("svg");
   const whole = svg.viewBox.baseVal;

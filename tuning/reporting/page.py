@@ -1,7 +1,7 @@
 """Report page for a review board: one self-contained HTML file, readable without JavaScript and on paper.
 
-The template escapes every text from a file, and the page's content security policy allows only its own
-script, which magnifies plots.
+The template escapes all texts that come from files. The page's content security policy allows only the page's
+own script, which magnifies plots.
 """
 
 import base64
@@ -20,12 +20,12 @@ TEMPLATE, SCRIPT, STYLE = "page.html.jinja", "magnify.js", "page.css"
 HEADLINES = {
     verdict_sections.GOOD: "Good: every requirement is met.",
     verdict_sections.BAD: "Bad: not every requirement is met.",
-    verdict_sections.UNKNOWN: "Not decided: what was given does not show that every requirement is met.",
+    verdict_sections.UNKNOWN: "Not decided: the given results do not show whether every requirement is met.",
 }
 
 
 def build_page(results: Results, say: Callable[[str], None] = lambda _: None) -> bytes:
-    """Return the HTML page of the results; `say` is called with the name of each plot."""
+    """Build the HTML page of the results, encoded as UTF-8; `say` is called with the name of each plot."""
     requirements = verdict_sections.collect_requirements(results)
     verdict = verdict_sections.combine_verdicts(requirements)
     sections: list[Section | None] = [
@@ -60,5 +60,5 @@ def build_page(results: Results, say: Callable[[str], None] = lambda _: None) ->
 
 
 def _read_text(name: str) -> str:
-    """Return the text of a file of this package."""
+    """Return the text of a data file in this package."""
     return (resources.files("tuning.reporting") / name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Reading of the results of commands: recognition, check of digests, and consistency of all results."""
+"""Reading of commands' results for a report: recognition, check of digests, and check of consistency."""
 
 import hashlib
 import json
@@ -27,11 +27,11 @@ from tuning.reporting.documents import (
 from tuning.sweeps.manifest import load_gains
 from tuning.sweeps.store import VERDICT_FILE, SweepStore, read_store
 
-MAX_DOCUMENT_BYTES = 200_000_000  # bytes; largest size of a document
+MAX_DOCUMENT_BYTES = 200_000_000  # bytes; a larger file is not read, to protect the memory
 DOCUMENT_NAMES = ("manifest.json", "gains.json", "identification.json", "compare.json", "map.json")
 ALLOWED_RESULTS = (
-    "what jaxhil identify, tune, sweep, compare, map or export wrote, its folder or the JSON file in it, or "
-    "what monitor --json printed"
+    "a result of jaxhil identify, tune, sweep, compare, map or export (the folder, or the JSON file in it), "
+    "or the output of jaxhil monitor --json"
 )
 GAINS_SCHEMA, SWEEP_SCHEMA, BUNDLE_SCHEMA = "jaxhil/gains/", "jaxhil/sweep/", "jaxhil/bundle/"
 IDENTIFICATION_SCHEMA, MONITOR_SCHEMA, MAP_SCHEMA = "jaxhil/identification/", "jaxhil/monitor/", "jaxhil/map/"
@@ -39,20 +39,20 @@ Kind = TypeVar("Kind")
 
 
 class ResultSource(NamedTuple):
-    """Origin of a result in a report."""
+    """Origin of a result that a report shows."""
 
-    command: str  # command that wrote it
+    command: str  # command that wrote the result
     path: Path
-    sha256: str  # SHA-256 of its content
+    sha256: str  # SHA-256 digest of the content
 
 
 @dataclass
 class Results:
-    """All given results, at most one of each kind; None for the others."""
+    """All results for a report, at most one of each kind; None for kinds that are not given."""
 
     gains: LoadedGains | None = None  # a gain file
-    store: SweepStore | None = None  # store of a sweep
-    sweep: SweepVerdict | None = None
+    store: SweepStore | None = None  # rows of a sweep
+    sweep: SweepVerdict | None = None  # verdict of the same sweep
     bundle: LoadedGains | None = None  # gain file of a bundle, with its limits
     identification: IdentificationDocument | None = None
     identified: dict[str, Any] = field(default_factory=dict)  # content of the identified mechanism file
@@ -63,27 +63,27 @@ class Results:
 
     @property
     def subject(self) -> LoadedGains | None:
-        """Return the gains that the report is about, or None."""
+        """Return the gains that the report evaluates, or None if no result contains gains."""
         if self.bundle is not None or self.gains is not None:
             return self.bundle or self.gains
         return None if self.store is None else load_gains(self.store.manifest)
 
     @property
     def axes(self) -> int:
-        """Return the number of axes of the mechanism, 1 or 6."""
+        """Return the number of axes of the evaluated mechanism, 1 or 6."""
         return 6 if self.subject is not None and self.subject.document.get("axes") == 6 else 1
 
     @property
     def error(self) -> str:
-        """Return the symbol of the error: |e - e*| for one axis, |error| for six."""
+        """Return the symbol of the error for texts: |e - e*| for one axis, |error| for six axes."""
         return "|error|" if self.axes == 6 else "|e - e*|"
 
 
 def read_results(paths: list[Path]) -> Results:
-    """Read the results at these paths.
+    """Read and check the results at the given paths.
 
-    Raise `InputError` if one is no result, was changed after it was written, is there twice, or does not
-    belong to the others.
+    Raise `InputError` if a path contains no result, if a result was changed after it was written, if two
+    results have the same kind, or if results belong to different mechanisms or gains.
     """
     results = Results()
     for path in paths:
@@ -93,7 +93,7 @@ def read_results(paths: list[Path]) -> Results:
 
 
 def _add_result(results: Results, source: Path) -> None:
-    """Read the result at a path, and store it in `results`. Raise `InputError`."""
+    """Read and check the result at a path, and store it in `results`; raise `InputError` if it is wrong."""
     where, path = to_one_line(str(source)), _document_path(source)
     document = _read_json(path, where)
     schema = document.get("schema")
@@ -134,12 +134,12 @@ def _add_result(results: Results, source: Path) -> None:
         _store_result(results, "comparison", _convert_document(document, ComparisonDocument, where), where)
         results.sources.append(ResultSource("compare", path, document["sha256"]))
     else:
-        found = f"the schema {format_value(schema)}" if schema else "no schema of jaxhil"
-        raise InputError(f"{where}: found {found}, expected {ALLOWED_RESULTS}")
+        problem = f"the schema {format_value(schema)}" if schema else "no schema of jaxhil"
+        raise InputError(f"{where}: found {problem}, expected {ALLOWED_RESULTS}")
 
 
 def _document_path(source: Path) -> Path:
-    """Return the path of the document that a path, possibly a folder, stands for."""
+    """Return the path of the JSON document: `source` itself or, if it is a folder, the document in it."""
     try:
         if not source.is_dir():
             return source
@@ -154,7 +154,7 @@ def _document_path(source: Path) -> Path:
 
 
 def _read_json(path: Path, where: str) -> dict[str, Any]:
-    """Read a JSON object from a file. Raise `InputError`."""
+    """Read a JSON object from a file; raise `InputError` if the file cannot be read or contains none."""
     try:
         with open_regular(path) as file:
             content = file.read(MAX_DOCUMENT_BYTES + 1)
@@ -174,23 +174,24 @@ def _read_json(path: Path, where: str) -> dict[str, Any]:
 
 
 def _refuse_constant(name: str) -> None:
-    """Raise ValueError for NaN or infinity in JSON."""
+    """Raise ValueError; called for NaN and infinity in a file, which standard JSON does not allow."""
     raise ValueError(name)
 
 
 def _check_digest(document: dict[str, Any], where: str) -> None:
-    """Raise `InputError` if a document was changed after it was written."""
+    """Raise `InputError` unless a document contains the SHA-256 digest of its own content."""
     stated = document.get("sha256")
     if not isinstance(stated, str):
         raise InputError(f"{where}: sha256: found nothing, expected the digest that its command writes")
     if stated != digest(document):
         raise InputError(
-            f"{where}: sha256: found {format_value(stated)}, expected that of the content: it was changed"
+            f"{where}: sha256: found {format_value(stated)}, expected the digest of the content: the file "
+            "was changed"
         )
 
 
 def _convert_document(document: dict[str, Any], kind: type[Kind], where: str) -> Kind:
-    """Convert a document to a struct. Raise `InputError` if it does not fit."""
+    """Convert a JSON document to a struct; raise `InputError` if a field is missing or has another type."""
     try:
         return msgspec.convert(document, kind)
     except (msgspec.ValidationError, RecursionError) as error:
@@ -200,9 +201,11 @@ def _convert_document(document: dict[str, Any], kind: type[Kind], where: str) ->
 
 
 def _check_sweep(store: SweepStore, verdict: dict[str, Any], where: str) -> None:
-    """Raise `InputError` if the verdict does not belong to the store."""
+    """Raise `InputError` if a verdict belongs to another sweep, or names a scenario that does not exist."""
     if verdict["sweep_sha256"] != store.manifest.sha256:
-        raise InputError(f"{where}: {VERDICT_FILE}: found the verdict of another sweep, expected its own")
+        raise InputError(
+            f"{where}: {VERDICT_FILE}: found the verdict of another sweep, expected that of this sweep"
+        )
     for scenario in verdict["worst"]:
         if not 0 <= scenario["index"] < store.manifest.scenarios:
             allowed = f"0 to {store.manifest.scenarios - 1}"
@@ -212,7 +215,7 @@ def _check_sweep(store: SweepStore, verdict: dict[str, Any], where: str) -> None
 
 
 def _check_map(document: MapDocument, where: str) -> None:
-    """Raise `InputError` unless the axes increase and every table has the shape of its axes."""
+    """Raise `InputError` unless a map's axes increase and each of its tables has the shape of its axes."""
     radius = document.spectral_radius
     grids: list[tuple[list[float], list[float], Sequence[Sequence[Any]]]]
     grids = [
@@ -224,17 +227,19 @@ def _check_map(document: MapDocument, where: str) -> None:
     for x, y, table in grids:
         rising = all(a < b for axis in (x, y) for a, b in pairwise(axis))
         if min(len(x), len(y)) < 2 or not rising or [len(row) for row in table] != [len(x)] * len(y):
-            raise InputError(f"{where}: found tables that do not fit their axes, expected {ALLOWED_RESULTS}")
+            raise InputError(
+                f"{where}: found a table whose shape differs from its axes, expected {ALLOWED_RESULTS}"
+            )
 
 
 def _theory_tables(theory: Theory) -> list[list[list[float | None]]]:
-    """Return the tables of the closed forms that apply."""
+    """Return the tables of those closed forms that apply to a map."""
     tables = theory.series, theory.characteristic_root, theory.delay_over_critical
     return [table for table in tables if table is not None]
 
 
 def _read_bundle_gains(folder: Path, where: str) -> LoadedGains:
-    """Return the gain file of an unchanged bundle. Raise `InputError` for a changed one."""
+    """Return the gain file in a bundle; raise `InputError` if a file of the bundle was changed."""
     files, problems = selftest.find_differences(str(folder))
     for name, text in problems:
         raise InputError(f"{where}: {to_one_line(f'{name}: {text}', 200)}")
@@ -242,14 +247,14 @@ def _read_bundle_gains(folder: Path, where: str) -> LoadedGains:
 
 
 def _store_result(results: Results, name: str, value: Any, where: str) -> None:
-    """Store a result. Raise `InputError` if there is already one of the same kind."""
+    """Store a result in the field `name`; raise `InputError` if the field already contains a result."""
     if getattr(results, name) is not None:
-        raise InputError(f"{where}: found another result of the same kind, expected one of each kind")
+        raise InputError(f"{where}: found a second result of the same kind, expected one of each kind")
     setattr(results, name, value)
 
 
 def _check_consistency(results: Results) -> None:
-    """Raise `InputError` unless all results have the same gains and mechanism."""
+    """Raise `InputError` unless all results belong to the same gains and mechanism."""
     subject, store = results.subject, results.store
     if subject is None:
         return
@@ -261,15 +266,16 @@ def _check_consistency(results: Results) -> None:
     ):
         if gains is None:
             continue
-        parts = {part: getattr(gains, part) for part in ("compensator", "gains", "mechanism")}
-        for part, value in parts.items():
-            if value != getattr(subject, part):
-                raise InputError(f"{name}: found another {part} than that of the other results, expected one")
+        for key in ("compensator", "gains", "mechanism"):
+            if getattr(gains, key) != getattr(subject, key):
+                raise InputError(f"{name}: {key}: found a value, expected that of the other results")
     comparison, mechanism = results.comparison, subject.mechanism.name
     if comparison is not None and mechanism not in (entry.mechanism for entry in comparison.mechanisms):
         names = ", ".join(entry.mechanism for entry in comparison.mechanisms)
         allowed = to_one_line(mechanism, 60)
-        raise InputError(f"the comparison: found {to_one_line(names, 100)}, expected the mechanism {allowed}")
+        raise InputError(
+            f"the comparison: found the mechanisms {to_one_line(names, 100)}, expected {allowed} among them"
+        )
     if results.map is not None and results.map.mechanism != mechanism:
         raise InputError(
             f"the map: found the mechanism {to_one_line(results.map.mechanism, 60)}, "

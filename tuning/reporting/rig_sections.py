@@ -1,4 +1,4 @@
-"""Sections of a report from a rig's logs: the identification, and the monitoring of later contacts."""
+"""Sections of a report on a rig's logs: identification of the rig, and monitoring of later contacts."""
 
 import math
 
@@ -15,11 +15,11 @@ from tuning.reporting.verdict_sections import (
     is_other_file_monitored,
 )
 
-MAX_TABLE_ROWS = 60  # largest number of contacts in the table
+MAX_TABLE_ROWS = 60  # largest number of contacts in the table; earlier contacts are omitted
 
 
 def identification_section(results: Results) -> Section | None:
-    """Return the section on the identification of the rig."""
+    """Return the report's section on the identification of the rig, or None without an identification."""
     document = results.identification
     if document is None:
         return None
@@ -43,23 +43,24 @@ def identification_section(results: Results) -> Section | None:
         )
         for check in document.checks
     ]
-    tables = [ReportTable(("number", "value", "95 %", "unit", "from"), rows)] if rows else []
-    tables.append(ReportTable(("what the model may lack", "there", "effect on e", "finding"), checks, 9))
+    tables = [ReportTable(("parameter", "value", "95 %", "unit", "source"), rows)] if rows else []
+    tables.append(ReportTable(("unmodelled effect", "detected", "effect on e", "finding"), checks, 9))
     texts = [document.reason + ".", *(f"{note[:1].upper()}{note[1:]}." for note in document.notes)]
     if results.subject is not None and not is_identified(results):
         texts.append(
-            "The gains were tuned for other numbers than those identified: this says nothing of them."
+            "The gains were tuned for other parameters than the identified ones: this identification does "
+            "not support the gains."
         )
     drawings = [draw_estimates(document)] if rows else []
-    return Section("identification", "From the rig's logs", texts, tables, drawings)
+    return Section("identification", "Identification of the rig from its logs", texts, tables, drawings)
 
 
 def monitoring_section(results: Results) -> Section | None:
-    """Return the section on contacts of later logs, compared with the mechanism file."""
+    """Return the report's section on monitored contacts, or None without monitoring."""
     document = results.monitoring
     if document is None:
         return None
-    heads = [f"{name} [{unit}]" if unit != "1" else name for name, unit, _ in METRICS]
+    headings = [f"{name} [{unit}]" if unit != "1" else name for name, unit, _ in METRICS]
     rows = [
         (
             f"{contact.contact}, {to_one_line(contact.log, 60)}",
@@ -70,20 +71,20 @@ def monitoring_section(results: Results) -> Section | None:
     ]
     texts = [
         f"{to_one_line(document.reason, 400)}.",
-        f"Held against {to_one_line(document.mechanism, 200)}; a figure is 0 where the rig is that of the "
-        "file.",
+        f"The contacts are compared with {to_one_line(document.mechanism, 200)}; a metric is 0 on average if "
+        "the rig matches this file.",
         *(f"{note[:1].upper()}{note[1:]}." for note in document.notes),
     ]
     if len(document.contacts) > MAX_TABLE_ROWS:
-        texts.append(f"Of {len(document.contacts)} contacts the table has the last {MAX_TABLE_ROWS}.")
+        texts.append(f"The table shows the last {MAX_TABLE_ROWS} of {len(document.contacts)} contacts.")
     if is_other_file_monitored(results):
-        texts.append("The gains were tuned for another file: this says nothing of them.")
-    table = ReportTable(("contact, log", *heads, "state"), rows)
-    return Section("monitoring", "The rig since", texts, [table], [monitor_drawing(document)])
+        texts.append("The gains were tuned for another file: this monitoring does not support the gains.")
+    table = ReportTable(("contact, log", *headings, "state"), rows)
+    return Section("monitoring", "Monitoring of the rig", texts, [table], [monitor_drawing(document)])
 
 
 def _significant_digits(estimate: EstimateEntry) -> int:
-    """Return the number of digits that an estimate's uncertainty supports, plus one."""
+    """Return the number of digits for an estimate, one more than its standard deviation justifies."""
     if (
         not estimate.std
         or not estimate.value
@@ -94,5 +95,5 @@ def _significant_digits(estimate: EstimateEntry) -> int:
 
 
 def _format_metric(metric: MonitoredMetric | None, scale: float) -> str:
-    """Return a scaled metric as text, or a dash."""
+    """Return `scale` times the value of a metric as text with its sign, or a dash if there is no value."""
     return format_number(None) if metric is None or metric.value is None else f"{scale * metric.value:+.2g}"

@@ -1,4 +1,4 @@
-"""Sections of a report from studies: runs, errors, sensitivities, rare events, comparison, map, commands."""
+"""Sections of a report on simulations: runs, errors, sensitivities, comparison, stability map, commands."""
 
 import shlex
 from collections.abc import Callable, Iterator, Mapping
@@ -10,20 +10,20 @@ from tuning.reporting.drawings import TYPICAL_SCENARIOS, draw_map, draw_nominal_
 from tuning.reporting.result_files import Results
 from tuning.reporting.verdict_sections import ReportTable, Section, format_number
 
-METRIC_HEADINGS = {  # metrics of a comparison with their headings
+METRIC_HEADINGS = {  # headings of the comparison's table by name of the metric
     "rms": "rms |e - e*|", "p99": "99th percentile", "worst": "worst", "failures": "failures",
     "early": "early", "late": "late", "slope": "slope", "peak": "peak", "noise": "noise",
 }  # fmt: skip
 TRANSPARENCY_NOTE = (
-    "Early, late: by how much a push on the hardware at 25 and 75 % of the contact's duration in space "
-    "reaches the result (1: as in space, 0: not at all). Slope: of e against e* over damped twins of the "
-    "mechanism (1: as in space). Peak: largest command over the reference's peak force. Noise: of the "
-    "command over that of the readings."
+    "Early, late: transparency, that is, effect on e of a push on the hardware at 25 or 75 % of the ideal "
+    "contact's duration, divided by the effect on the ideal contact (1: perfect, 0: none). Slope: slope of e "
+    "against e* for damping perturbations (1: perfect). Peak: peak command divided by the ideal contact's "
+    "peak force. Noise: noise of the command divided by the noise of the readings."
 )
 
 
 def count_plots(results: Results) -> int:
-    """Return the largest number of plots that a report may have."""
+    """Return an upper bound of the number of plots in the report, for the progress display."""
     scenarios = (
         0 if results.sweep is None or results.axes == 6 else len(results.sweep.worst) + TYPICAL_SCENARIOS + 1
     )
@@ -31,7 +31,7 @@ def count_plots(results: Results) -> int:
 
 
 def run_section(results: Results, say: Callable[[str], None]) -> Section | None:
-    """Return the section with the nominal run and some scenarios of the sweep."""
+    """Return the report's section with plots of the nominal run and of some scenarios of the sweep."""
     if results.subject is None:
         return None
     say("the nominal run")
@@ -43,13 +43,13 @@ def run_section(results: Results, say: Callable[[str], None]) -> Section | None:
         points, traces = draw_sweep(results.store, results.sweep.worst, say)
         drawings.append(points)
         texts.append(
-            "Scenarios of the sweep: the worst, and some between the smallest error and the largest."
+            "Scenarios of the sweep: the worst ones, and some between the smallest and the largest error."
         )
-    return Section("runs", "The nominal run and the worst ones", texts, [], drawings, traces)
+    return Section("runs", "The nominal run and the worst scenarios", texts, [], drawings, traces)
 
 
 def error_section(results: Results) -> Section | None:
-    """Return the section on the distribution of errors and outcomes."""
+    """Return the report's section on the errors and outcomes of a sweep, or None without a sweep."""
     sweep = results.sweep
     if sweep is None:
         return None
@@ -70,11 +70,11 @@ def error_section(results: Results) -> Section | None:
     origin = f"{sweep.scenarios} scenarios, {sweep.sampling}, seed {sweep.seed}, {sweep.precision}"
     method = to_one_line(sweep.failure_probability.method, 200)
     texts = [f"{origin}. Interval of the failure probability: {method}."]
-    return Section("errors", "How large the error is, and how often", texts, tables)
+    return Section("errors", "Distribution of the error", texts, tables)
 
 
 def sensitivity_section(results: Results) -> Section | None:
-    """Return the section on Sobol indices and rare errors."""
+    """Return the report's section on Sobol indices and rare errors, or None if none were computed."""
     sweep = results.sweep
     if sweep is None or (sweep.drivers is None and sweep.rare is None):
         return None
@@ -92,7 +92,7 @@ def sensitivity_section(results: Results) -> Section | None:
         ]
         tables.append(ReportTable(("input", "first order", "95 %", "total", "95 %"), rows))
         texts.append(
-            f"Sobol indices: shares of the variance of the worst {results.error}, cut at {indices.cap:g} "
+            f"Sobol indices: shares of the variance of the worst {results.error}, clipped at {indices.cap:g} "
             f"({indices.capped} of {indices.evaluations} runs)."
         )
     if (rare := sweep.rare) is not None:
@@ -104,11 +104,11 @@ def sensitivity_section(results: Results) -> Section | None:
                 "The replicates of the subset simulation differ far more than its formula explains: some "
                 "have missed failures, and the interval may too."
             )
-    return Section("drivers", "What drives it, and rare errors", texts, tables)
+    return Section("drivers", "Sensitivity of the error, and rare errors", texts, tables)
 
 
 def comparison_section(results: Results) -> Section | None:
-    """Return the section on other compensators on the same scenarios, and on transparency."""
+    """Return the report's section on the comparison of compensators, or None without a comparison."""
     compared = results.comparison
     if compared is None:
         return None
@@ -122,12 +122,15 @@ def comparison_section(results: Results) -> Section | None:
             for gains_name, figures in law.figures.items()
         ]
         tables.append(ReportTable((entry.mechanism, *METRIC_HEADINGS.values()), rows))
-    texts.append(f"{compared.judged} fresh scenarios for all; brackets: 95 %.")
-    return Section("comparison", "Transparency, and other laws", texts, tables)
+    texts.append(
+        f"All compensators are evaluated on the same {compared.judged} fresh scenarios. Brackets contain "
+        "95 % intervals."
+    )
+    return Section("comparison", "Transparency, and other compensators", texts, tables)
 
 
 def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
-    """Return the section with the map and the margins of its nominal point."""
+    """Return the report's section with the stability map and the margins, or None without a map."""
     document = results.map
     if document is None:
         return None
@@ -137,9 +140,9 @@ def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
         texts.append(f"At the nominal point the largest error is {document.nominal.error:+.4f}.")
     if document.nominal.peak_force_ratio is not None:
         texts.append(
-            f"There the largest real force is {format_number(document.nominal.peak_force_ratio, 3)} times "
-            "the ideal "
-            f"contact's, and its duration {format_number(document.nominal.duration_ratio, 3)} times."
+            f"There, the largest real peak force is {format_number(document.nominal.peak_force_ratio, 3)} "
+            "times the ideal contact's, and the duration is "
+            f"{format_number(document.nominal.duration_ratio, 3)} times the ideal contact's."
         )
     if (growth := document.nominal.growth) is not None:
         verb = "grows" if growth.per_second > 0 else "decays"
@@ -163,7 +166,7 @@ def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
 
 
 def reproduction_section(results: Results) -> Section:
-    """Return the section on the origin of every number: files, digests, versions, commands."""
+    """Return the report's section on reproduction: files with digests, software versions, commands."""
     sources = [
         (f"jaxhil {source.command}", to_one_line(str(source.path), 200), source.sha256)
         for source in results.sources
@@ -175,16 +178,16 @@ def reproduction_section(results: Results) -> Section:
             tables.append(ReportTable(("log", "SHA-256"), logs, 9))
     if versions := _software_versions(results):
         tables.append(
-            ReportTable(("version of", "with which the results were made"), list(versions.items()), 9)
+            ReportTable(("package", "version that computed the results"), list(versions.items()), 9)
         )
-    texts = ["Each of these commands, on the files above, prints the figures again."]
+    texts = ["Each of these commands, applied to the files above, computes its results again."]
     return Section(
-        "reproduction", "How to reproduce every figure", texts, tables, lines=list(_repeat_commands(results))
+        "reproduction", "How to reproduce the results", texts, tables, lines=list(_repeat_commands(results))
     )
 
 
 def _repeat_commands(results: Results) -> Iterator[str]:
-    """Yield the commands that repeat the results."""
+    """Yield, as typed in a shell, the commands that compute the results again."""
     paths = {source.command: str(source.path) for source in results.sources}
     subject, sweep = results.subject, results.sweep
     gains = paths.get("tune", paths.get("export", "GAINS"))
@@ -229,19 +232,19 @@ def _repeat_commands(results: Results) -> Iterator[str]:
 
 
 def _format_command(*words: str) -> str:
-    """Return a command as typed in a shell."""
+    """Return a command of `jaxhil` as typed in a shell."""
     return to_one_line(" ".join(["jaxhil", *map(shlex.quote, words)]), 2000)
 
 
 def _option_words(values: Mapping[str, object]) -> Iterator[str]:
-    """Yield the words of the options that have a value."""
+    """Yield the command-line words `--name value` of all options whose value is not None."""
     for name, value in values.items():
         if value is not None:
             yield from (f"--{name}", str(value))
 
 
 def _software_versions(results: Results) -> dict[str, str]:
-    """Return the versions of the software that made the results."""
+    """Return the versions, by package, of the software that computed the results."""
     subject, versions = results.subject, {}
     if subject is not None and isinstance(stated := subject.document.get("versions"), Mapping):
         versions = {str(name): str(value) for name, value in stated.items()}
@@ -261,7 +264,7 @@ def _format_metric(metric: MetricEntry | None) -> str:
 
 
 def _format_margin(margin: MarginOfMap) -> str:
-    """Return the ends of a margin as text."""
+    """Return the range of a margin as text."""
     low = "below the map" if margin.low is None else format_number(margin.low)
-    high = "beyond the map" if margin.high is None else format_number(margin.high)
+    high = "above the map" if margin.high is None else format_number(margin.high)
     return f"from {low} to {high}"

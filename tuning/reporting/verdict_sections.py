@@ -1,4 +1,4 @@
-"""Content of a report: requirements, verdict, assumptions and gains, as sections with tables."""
+"""Requirements and verdict of a report, and its sections on assumptions, gains and watchdog."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,45 +25,45 @@ UNKNOWN_NAME = "(not known)"
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Table; the columns from index `numbers` on hold numbers."""
+    """Table of a report."""
 
-    heads: Sequence[str]
+    headings: Sequence[str]
     rows: Sequence[Sequence[str]]
-    numbers: int = 1
+    numbers: int = 1  # index of the first column with numbers; all later columns contain numbers too
 
 
 @dataclass(frozen=True)
 class Section:
-    """Section of the page."""
+    """Section of the report page: paragraphs, tables, plots and commands."""
 
     name: str  # anchor in the page
     title: str
-    texts: Sequence[str] = ()
+    texts: Sequence[str] = ()  # paragraphs
     tables: Sequence[ReportTable] = ()
     drawings: Sequence[SvgPlot] = ()
-    traces: Sequence[ScenarioPlot] = ()
+    traces: Sequence[ScenarioPlot] = ()  # runs of scenarios, of which one is shown at a time
     lines: Sequence[str] = field(default=())  # commands as typed in a shell
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """Requirement and its result."""
+    """Requirement on the results, with the value reached, the margin and the verdict, as texts."""
 
-    what: str
-    required: str
-    result: str
-    margin: str
+    what: str  # quantity that must meet the requirement
+    required: str  # allowed values
+    result: str  # value reached
+    margin: str  # distance between the result and the end of the allowed values
     verdict: str  # good, bad or unknown
 
 
 def collect_requirements(results: Results) -> list[Requirement]:
-    """Return the requirements by which the results were evaluated."""
-    of_rig = (*_identification_requirement(results), *_monitoring_requirement(results))
-    return [*_sweep_requirement(results), *_watchdog_requirements(results), *of_rig]
+    """Return the requirements for all given results, with the verdict on each requirement."""
+    rig_requirements = (*_identification_requirement(results), *_monitoring_requirement(results))
+    return [*_sweep_requirement(results), *_watchdog_requirements(results), *rig_requirements]
 
 
 def combine_verdicts(items: Sequence[Requirement]) -> str:
-    """Return bad if any requirement is bad, good if all are good, else unknown."""
+    """Return the report's verdict: bad if any requirement is bad, good if all are good, else unknown."""
     verdicts = {requirement.verdict for requirement in items}
     if BAD in verdicts:
         return BAD
@@ -71,7 +71,7 @@ def combine_verdicts(items: Sequence[Requirement]) -> str:
 
 
 def assumption_section(results: Results) -> Section | None:
-    """Return the section with every number of the mechanism, its uncertainty and its origin."""
+    """Return the report's section with each parameter of the mechanism, its uncertainty and its origin."""
     subject = results.subject
     if subject is None:
         return None
@@ -87,7 +87,7 @@ def assumption_section(results: Results) -> Section | None:
         uncertain = mechanism.uncertainty.get(path)
         varies = "fixed"
         if path == PHASE_KEY:
-            varies = "uniform, 0 to 1" + ("" if results.axes == 6 else ", each contact its own")
+            varies = "uniform, 0 to 1" + ("" if results.axes == 6 else ", drawn for each contact")
         varies = varies if uncertain is None else _describe_distribution(uncertain, unit)
         rows.append((path, _format_value(value), unit, varies, origins.get(path, "the file")))
     texts = [
@@ -96,23 +96,21 @@ def assumption_section(results: Results) -> Section | None:
         f"Source of the file: {to_one_line(mechanism.source, 1000) or UNKNOWN_NAME}",
     ]
     if mechanism.correlation is not None:
-        texts.append("Some of these numbers vary together, as the file's [correlation] says.")
-    heads = ("key", "value", "unit", "varies", "known from")
-    return Section(
-        "assumptions", "What is assumed, and how it is known", texts, [ReportTable(heads, rows, 9)]
-    )
+        texts.append("Some of these parameters are correlated, as [correlation] in the file states.")
+    headings = ("key", "value", "unit", "variation", "source")
+    return Section("assumptions", "Assumptions and their sources", texts, [ReportTable(headings, rows, 9)])
 
 
 def _describe_contact_laws(mechanism: AnyMechanism) -> str:
-    """Return a text with the contact laws of a mechanism."""
+    """Return a text with the contact law, or the contact laws, of a mechanism."""
     if isinstance(mechanism, Mechanism):
-        return f"Law of the contact: {mechanism.contact.law}"
+        return f"Contact law: {mechanism.contact.law}"
     laws = (f"{name} {contact.law}" for name, contact in mechanism.contact.items())
-    return f"Laws of the contacts: {', '.join(laws) or 'none'}"
+    return f"Contact laws: {', '.join(laws) or 'none'}"
 
 
 def gain_section(results: Results) -> Section | None:
-    """Return the section with the gains, their bounds, the rig's limits, and errors on fresh scenarios."""
+    """Return the report's section on the gains: values, bounds, limits on the rig, errors after tuning."""
     subject = results.subject
     if subject is None:
         return None
@@ -133,26 +131,27 @@ def gain_section(results: Results) -> Section | None:
         if is_user_limit(name)
     ]
     tables += [ReportTable(("limit on the rig", "value", "unit"), limits)] if limits else []
-    keys = ("rms", "99th percentile", "largest", "mean e - e*", "peak / reference")
+    headings = ("rms", "99th percentile", "largest", "mean e - e*", "peak command / ideal peak force")
     if results.axes == 6:
-        keys = (*keys[:3], "mean", keys[4])
+        headings = (*headings[:3], "mean", headings[4])
         errors = {"energy error": "energy_error", "twist error": "twist_error"}
     else:
         errors = {"error |e - e*|": "robust"}
     for name, key in errors.items():
         error_rows = list(_error_rows(document.get("figures"), key))
-        tables += [ReportTable((f"{name} on fresh scenarios", *keys), error_rows)] if error_rows else []
-    return Section("gains", f"Gains of {subject.compensator}", () if rows else ("It has none.",), tables)
+        tables += [ReportTable((f"{name} on fresh scenarios", *headings), error_rows)] if error_rows else []
+    texts = () if rows else (f"{subject.compensator} has no gains.",)
+    return Section("gains", f"Gains of {subject.compensator}", texts, tables)
 
 
 def format_number(value: Any, digits: int = 4) -> str:
-    """Return a number with `digits` significant digits; a dash for None or a non-finite number."""
+    """Return a number as text with `digits` significant digits; a dash for None or a non-finite number."""
     is_finite = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     return f"{value:.{digits}g}" if is_finite else "–"  # noqa: RUF001
 
 
 def _sweep_requirement(results: Results) -> Iterator[Requirement]:
-    """Yield the requirement on the failure probability of a sweep."""
+    """Yield the requirement on the failure probability of a sweep, if there is a sweep."""
     sweep = results.sweep
     if sweep is None:
         return
@@ -173,24 +172,24 @@ def _sweep_requirement(results: Results) -> Iterator[Requirement]:
 
 
 def _error_margin(limit: float | None, largest: float | None) -> str:
-    """Return a text with the difference of a sweep's limit and its largest error."""
+    """Return a text with the difference between a sweep's limit and its largest error."""
     if limit is None or largest is None:
         return "none"
     return f"{limit - abs(largest):+.2g} of the error"
 
 
 def _watchdog_requirements(results: Results) -> Iterator[Requirement]:
-    """Yield the requirements on the rates of false and missed alarms."""
+    """Yield the requirements on the watchdog's rates of false and missed alarms, if a bundle has them."""
     rates = watchdog_rates(results)
     faulty = [
         rate for rate in rates.get("fault_runs", ()) if isinstance(rate, Mapping) and rate.get("counted")
     ]
     kinds = [(rates.get("false_alarms"), "good runs that the watchdog stops")]
-    kinds += [(rate, f"bad runs that it misses, with {rate.get('meaning')}") for rate in faulty]
+    kinds += [(rate, f"bad runs that the watchdog misses, with {rate.get('meaning')}") for rate in faulty]
     drawn = rates.get("missed_alarms")
-    # With injected faults, the missed alarms of drawn runs count only if they are bad.
+    # If faults were injected, the missed alarms of drawn runs count only if their rate is certainly too high.
     if not faulty or (isinstance(drawn, Mapping) and drawn.get("low", 0) > drawn.get("allowed", 1)):
-        kinds.append((drawn, "bad runs that it misses"))
+        kinds.append((drawn, "bad runs that the watchdog misses"))
     for rate, what in kinds:
         if not isinstance(rate, Mapping) or not isinstance(rate.get("allowed"), (int, float)):
             continue
@@ -206,13 +205,13 @@ def _watchdog_requirements(results: Results) -> Iterator[Requirement]:
 
 
 def _identification_requirement(results: Results) -> Iterator[Requirement]:
-    """Yield the requirement on the effect of what an identification leaves uncertain."""
+    """Yield the requirement on the effect of an identification's uncertainty on e, if there is one."""
     document = results.identification
     if document is not None:
         effects = [value for value in (document.effect, document.effect_on_error) if value is not None]
         effect, limit = max(effects, default=None), document.limit
         margin = format_number(None if effect is None or limit is None else limit - effect, 3)
-        what = "change of e or e - e* by what the identified model leaves unexplained or uncertain"
+        what = "change of e or e - e* by unexplained effects and uncertainty of the identified model"
         # An identification cannot support gains that were tuned for another mechanism.
         is_other_mechanism = results.subject is not None and not is_identified(results)
         verdict = UNKNOWN if is_other_mechanism else _as_verdict(document.verdict)
@@ -220,19 +219,19 @@ def _identification_requirement(results: Results) -> Iterator[Requirement]:
 
 
 def _monitoring_requirement(results: Results) -> Iterator[Requirement]:
-    """Yield the requirement that the rig still matches the mechanism file."""
+    """Yield the requirement that the rig still matches the mechanism file, if the rig was monitored."""
     document = results.monitoring
     if document is not None:
         since = "in all" if document.since is None else f"since contact {document.since}"
         result = f"{to_one_line(document.state, 20)} {since} of {len(document.contacts)} contacts"
         verdict = BAD if document.state == "bad" else GOOD if document.state in (GOOD, "watch") else UNKNOWN
         verdict = UNKNOWN if is_other_file_monitored(results) else verdict
-        what = "whether the rig still is that of the mechanism file"
+        what = "change of the rig since its mechanism file was identified"
         yield Requirement(what, "within the file's uncertainty", result, format_number(None), verdict)
 
 
 def is_other_file_monitored(results: Results) -> bool:
-    """Return whether the monitored contacts were compared with another file than that of the gains."""
+    """Return whether the mechanism file of the monitoring differs from the file of the gains."""
     monitoring, subject = results.monitoring, results.subject
     if monitoring is None or subject is None:
         return False
@@ -240,29 +239,32 @@ def is_other_file_monitored(results: Results) -> bool:
 
 
 def watchdog_rates(results: Results) -> Mapping[str, Any]:
-    """Return the alarm rates of the watchdog in the bundle; an empty dictionary if there are none."""
-    figures = {} if results.bundle is None else results.bundle.document.get("figures")
-    rates = figures.get("watchdog") if isinstance(figures, Mapping) else None
+    """Return the watchdog's alarm rates in the bundle's gain file; an empty dictionary if there are none."""
+    metrics = {} if results.bundle is None else results.bundle.document.get("figures")
+    rates = metrics.get("watchdog") if isinstance(metrics, Mapping) else None
     return rates if isinstance(rates, Mapping) else {}
 
 
 def watchdog_section(results: Results) -> Section | None:
-    """Return the section on the rates of false and missed alarms."""
+    """Return the report's section on the watchdog's alarm rates, or None if there are none."""
     rates = watchdog_rates(results)
     texts = [f"{text[:1].upper()}{text[1:]}." for text in describe_alarm_rates(rates)]
     return Section("watchdog", "The watchdog", texts) if texts else None
 
 
 def _as_verdict(verdict: str) -> str:
-    """Return a verdict of a file as good, bad or unknown."""
+    """Return a file's verdict, or unknown if it is neither good nor bad."""
     return verdict if verdict in (GOOD, BAD) else UNKNOWN
 
 
-def _error_rows(figures: Any, key: str) -> Iterator[tuple[str, ...]]:
-    """Yield the table rows of errors on fresh scenarios, by gains."""
-    by_gains = figures.get(key) if isinstance(figures, Mapping) else None
-    # These intervals are for all errors together, not for the parts of six axes.
-    intervals = figures.get("tuned_intervals") if isinstance(figures, Mapping) and key == "robust" else None
+def _error_rows(metrics: Any, key: str) -> Iterator[tuple[str, ...]]:
+    """Yield a table row of errors on fresh scenarios for each set of gains: before, literature, tuned.
+
+    `metrics` is the entry "figures" of a gain file, and `key` the kind of error in it.
+    """
+    by_gains = metrics.get(key) if isinstance(metrics, Mapping) else None
+    # The intervals are for all errors together; six axes have no intervals for each kind of error.
+    intervals = metrics.get("tuned_intervals") if isinstance(metrics, Mapping) and key == "robust" else None
     for name, errors in by_gains.items() if isinstance(by_gains, Mapping) else ():
         if name not in CURVE_LABELS or not isinstance(errors, Mapping):
             continue
@@ -278,7 +280,7 @@ def _error_rows(figures: Any, key: str) -> Iterator[tuple[str, ...]]:
 
 
 def _identified_origins(results: Results) -> dict[str, str]:
-    """Return the origin of each key that was identified or fixed in an identification."""
+    """Return a text by key: the source of each value that the identification estimated or the user fixed."""
     document = results.identification
     if document is None or not is_identified(results):
         return {}
@@ -286,15 +288,15 @@ def _identified_origins(results: Results) -> dict[str, str]:
     for estimate in document.estimates:
         path, _, index = estimate.key.rpartition(".")
         key = path if index.isdigit() else estimate.key
-        text = "given to the identification"
+        text = "fixed in the identification"
         if not estimate.known:
-            text = f"the logs, 95 %: {format_interval(estimate.low, estimate.high)}"
+            text = f"logs, 95 %: {format_interval(estimate.low, estimate.high)}"
         origins[key] = text if key not in origins else f"{origins[key]}; {text}"
     return origins
 
 
 def is_identified(results: Results) -> bool:
-    """Return whether all numbers of the gains' mechanism equal the identified ones."""
+    """Return whether all parameters of the gains' mechanism equal those in the identified mechanism file."""
     subject, raw = results.subject, results.identified
     if subject is None:
         return False
@@ -313,7 +315,7 @@ def is_identified(results: Results) -> bool:
 
 
 def _describe_distribution(uncertain: Uncertainty, unit: str) -> str:
-    """Return a distribution in words."""
+    """Return a text that describes the distribution of a parameter."""
     if uncertain.std is not None:
         text = f"normal, standard deviation {uncertain.std:.4g} {unit}"
     elif uncertain.factor is not None:
@@ -322,11 +324,11 @@ def _describe_distribution(uncertain: Uncertainty, unit: str) -> str:
     else:
         low, high = format_number(uncertain.low), format_number(uncertain.high)
         text = f"{uncertain.distribution}, {low} to {high} {unit}"
-    return text + (", each entry its own" if uncertain.independent else "")
+    return text + (", drawn for each entry" if uncertain.independent else "")
 
 
 def _format_value(value: Any) -> str:
-    """Return a number, or up to eight entries of a list, as text."""
+    """Return the value of a parameter as text: a number, or up to eight entries of a list."""
     if isinstance(value, (list, tuple)):
         entries = [_format_value(entry) for entry in value[:8]]
         return ", ".join(entries) + (f", ... ({len(value)} in all)" if len(value) > len(entries) else "")
@@ -334,12 +336,12 @@ def _format_value(value: Any) -> str:
 
 
 def format_interval(low: Any, high: Any) -> str:
-    """Return the ends of an interval as text."""
+    """Return an interval as the text "LOW to HIGH"."""
     return f"{format_number(low)} to {format_number(high)}"
 
 
 def report_title(results: Results) -> str:
-    """Return the title of the report: the mechanism and, if known, the compensator."""
+    """Return the title of the report: the mechanism's name and, if known, the compensator's name."""
     subject = results.subject
     if subject is not None:
         return f"{to_one_line(subject.mechanism.name, 80)}: {subject.compensator}"
@@ -352,6 +354,6 @@ def report_title(results: Results) -> str:
 
 
 def _identified_name(raw: Mapping[str, Any]) -> str:
-    """Return the name in an identified mechanism file."""
+    """Return the mechanism's name from the content of an identified mechanism file."""
     name = raw.get("name")
     return to_one_line(name, 80) if isinstance(name, str) else "an identification"

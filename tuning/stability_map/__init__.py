@@ -1,1 +1,1 @@
-"""Stability maps: error over two keys, theory and growth, margins around the nominal point."""
+"""Stability maps: restitution error over two keys, theory, spectral radii, margins of the nominal point."""

@@ -1,7 +1,7 @@
 """Axes of a stability map: keys of the mechanism file, or gains, with a range of values.
 
-The entries of a list are scaled together, and the range is that of the first; `contact.stiffness[1]` is one
-entry.
+If the value of a key is a list, all entries are scaled by the same factor, and the axis shows the first
+entry. A key with an index, such as `contact.stiffness[1]`, varies only this entry.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,39 +21,39 @@ from jaxhil.simulation.plausibility import check_run
 from tuning.sweeps.columns import find_key_unit
 
 GAIN_PREFIX = "gains."
-DEFAULT_RANGE_FACTORS = 0.3, 3.0  # default range of an axis, over the nominal value
-NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # probabilities at which the axis of a normal distribution ends
-MIN_LOGARITHMIC_RATIO = 5.0  # ratio of its ends above which an axis is logarithmic
+DEFAULT_RANGE_FACTORS = 0.3, 3.0  # ends of an axis without uncertainty, divided by the nominal value
+NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # quantiles of a normal distribution that are the axis' ends
+MIN_LOGARITHMIC_RATIO = 5.0  # ratio of the axis' ends above which the scale is logarithmic
 AXIS_FORMAT = "PATH or PATH=LOW:HIGH, such as contact.stiffness=5e4:5e5"
 
 
 class MapAxis(NamedTuple):
-    """Axis of a map."""
+    """Axis of a stability map: a key of the mechanism file or a gain, with a range of values."""
 
-    key: str  # dotted path as given, with indices into lists, or gains.NAME
+    key: str  # dotted path as the user typed it, with indices into lists, or gains.NAME
     path: str  # path of the key without indices; "" for a gain
-    entry: tuple[int, ...]  # indices of an entry of a list; () for the whole value
-    unit: str  # SI
-    nominal: float  # nominal value; for a list that of its first entry
+    entry: tuple[int, ...]  # indices of one entry of a list; () if the whole value varies
+    unit: str  # SI unit of the values
+    nominal: float  # nominal value; for a list, that of the first entry
     low: float  # lower end of the range
     high: float  # upper end of the range
 
     @property
     def logarithmic(self) -> bool:
-        """Return whether the values have equal ratios instead of equal differences."""
+        """Return whether successive values on the axis have equal ratios instead of equal differences."""
         return self.low > 0 and self.high > MIN_LOGARITHMIC_RATIO * self.low
 
     def values(self, points: int) -> np.ndarray:
-        """Return `points` values from the lower to the upper end, (points,)."""
+        """Return `points` values from the lower to the upper end of the axis, (points,)."""
         return (np.geomspace if self.logarithmic else np.linspace)(self.low, self.high, points)
 
 
 def parse_axis(
     name: str, text: Any, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Return the axis for a text PATH or PATH=LOW:HIGH.
+    """Parse a text PATH or PATH=LOW:HIGH to an axis.
 
-    Raise `InputError`, with `name` as the name of the argument.
+    Raise `InputError` for a wrong text; the message begins with `name`, the name of the argument.
     """
     if not isinstance(text, str):
         raise InputError(f"{name}: found {format_value(text)}, expected {AXIS_FORMAT}")
@@ -63,31 +63,35 @@ def parse_axis(
     if separator:
         axis = axis._replace(**dict(zip(("low", "high"), _parse_range(name, key, ends), strict=True)))
     if not axis.low < axis.high:
-        found = f"{axis.nominal:g} as its value, and nothing that says how far it goes"
-        raise InputError(f"{name} {key}: found {found}, expected {key}=LOW:HIGH")
+        problem = f"the nominal value {axis.nominal:g}, from which no default range follows"
+        raise InputError(f"{name} {key}: found {problem}, expected {key}=LOW:HIGH")
     return axis
 
 
 def mechanism_draws(
     mechanism: Mechanism, axes: Sequence[MapAxis], values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the points `values` (lanes, axes) as draws of the mechanism's keys, without those of gains."""
+    """Convert points of a map, (lanes, axes), to values by key of the mechanism file, each (lanes, ...).
+
+    Axes of gains are ignored.
+    """
     drawn: dict[str, np.ndarray] = {}
     for index, axis in enumerate(axes):
         if not axis.path:
             continue
         nominal = np.asarray(value_at(mechanism, axis.path), float)
         table = drawn.setdefault(axis.path, np.repeat(nominal[None], len(values), axis=0))
-        part = (slice(None), *axis.entry)
-        column = values[:, index].reshape(-1, *[1] * (table[part].ndim - 1))
-        table[part] = table[part] * (column / axis.nominal) if nominal.ndim and axis.nominal else column
+        selected = (slice(None), *axis.entry)
+        column = values[:, index].reshape(-1, *[1] * (table[selected].ndim - 1))
+        is_scaled = nominal.ndim and axis.nominal
+        table[selected] = table[selected] * (column / axis.nominal) if is_scaled else column
     return drawn
 
 
 def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
-    """Raise `InputError` unless the keys differ and the mechanisms at all four corners can be simulated."""
+    """Raise `InputError` if both axes have the same key, or if a corner of the map cannot be simulated."""
     if axes[0].key == axes[1].key:
-        raise InputError(f"y: found {axes[1].key}, expected another key than that of x")
+        raise InputError(f"y: found {axes[1].key}, expected another key than for x")
     raw = to_plain_data(mechanism)
     for name in ("uncertainty", "correlation"):
         raw.pop(name, None)
@@ -102,7 +106,7 @@ def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
 def _gain_axis(
     name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Return the axis of a gain, with its bounds as the range."""
+    """Return the axis of a gain, whose default range are the gain's bounds; raise `InputError` if unknown."""
     gain_by_name = {gain.name: gain for gain in law.gains}
     gain = gain_by_name.get(key.removeprefix(GAIN_PREFIX))
     if gain is None:
@@ -116,7 +120,7 @@ def _gain_axis(
 def _key_axis(
     name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Return the axis of a key of the mechanism file, with its default range."""
+    """Return the axis of a key of the mechanism file with its default range; raise `InputError` if wrong."""
     try:
         parts = parse_key(key)
     except KeyProblem:
@@ -126,16 +130,14 @@ def _key_axis(
     paths = [name for name in numeric_keys() if not name.startswith("uncertainty")]
     if path not in paths:
         raise InputError(
-            f"{name}: found {format_value(key)}, expected a real number{suggest_names(path, paths)}"
+            f"{name}: found {format_value(key)}, expected a key of a number{suggest_names(path, paths)}"
         )
     value = value_at(mechanism, path)
     shape = np.shape(value)
     if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
-        raise InputError(f"{name} {key}: found a value of the shape {shape}, expected indices into it")
+        raise InputError(f"{name} {key}: found a value of the shape {shape}, expected indices within it")
     if value is None or value == []:
-        raise InputError(
-            f"{name} {key}: found no value of it in {mechanism.name}, expected a key that has one"
-        )
+        raise InputError(f"{name} {key}: found no value in {mechanism.name}, expected a key that has a value")
     nominal = float(np.asarray(value, float)[entry].flat[0])
     low, high = _default_range(mechanism, path, entry, nominal)
     return MapAxis(key, path, entry, find_key_unit(mechanism, path), nominal, low, high)
@@ -146,8 +148,8 @@ def _default_range(
 ) -> tuple[float, float]:
     """Return the default range of a key.
 
-    It is the range of the key's uncertainty, or shares of the nominal value within the allowed values; if
-    there is no such range, both ends are the nominal value.
+    The range is that of the key's uncertainty, or else `DEFAULT_RANGE_FACTORS` times the nominal value,
+    within the allowed values. If the nominal value is 0 or infinite, both ends equal the nominal value.
     """
     uncertain = mechanism.uncertainty.get(path)
     if uncertain is not None:
@@ -164,19 +166,19 @@ def _default_range(
         return low, high
     if not np.isfinite(nominal) or nominal == 0:
         return nominal, nominal
-    low, high = sorted(share * nominal for share in DEFAULT_RANGE_FACTORS)
+    low, high = sorted(factor * nominal for factor in DEFAULT_RANGE_FACTORS)
     allowed = numeric_keys()[path]
     return (low if allowed.allows(low) else nominal), (high if allowed.allows(high) else allowed.high)
 
 
 def _parse_range(name: str, key: str, text: str) -> tuple[float, float]:
-    """Return the two numbers of LOW:HIGH. Raise `InputError`."""
+    """Parse a text LOW:HIGH to two numbers; raise `InputError` unless they are finite and LOW < HIGH."""
     try:
         low, high = (float(end) for end in text.split(":"))
     except ValueError:
         low = high = 0.0
     if not (low < high and np.isfinite(low) and np.isfinite(high)):
         raise InputError(
-            f"{name} {key}: found {format_value(text)}, expected LOW:HIGH, two numbers, LOW < HIGH"
+            f"{name} {key}: found {format_value(text)}, expected two numbers LOW:HIGH with LOW < HIGH"
         )
     return low, high

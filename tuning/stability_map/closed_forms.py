@@ -1,7 +1,7 @@
 """Closed forms for an uncompensated contact with a pure delay (notebooks/guide/model.md, section 6).
 
-Items 1 and 2 hold for linear contact without damping, item 5 for Kelvin-Voigt contact; all hold in the limit
-of a small control period, of which only the mean delay remains (item 7).
+Items 1 and 2 of this section hold for linear contact without damping, and item 5 for Kelvin-Voigt contact.
+All items hold in the limit of a small control period, whose only effect is a mean delay (item 7).
 """
 
 import math
@@ -14,24 +14,24 @@ from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import Scenario
 
-SERIES_TERMS = 40  # terms of the series; 4.5^81/81! is far below the rounding error
-MAX_DELAY_PHASE = 1.0  # omega tau; up to this value the first zero of the series is before 4.5/omega
-TABLE_SIZE = 2049  # entries of a table of the series; linear interpolation has errors below 1e-6
+SERIES_TERMS = 40  # terms of the series; the first omitted term, 4.5^81/81!, is far below the rounding error
+MAX_DELAY_PHASE = 1.0  # omega tau [rad]; up to this value, the first zero of the series is before 4.5/omega
+TABLE_SIZE = 2049  # entries of the table of the series; linear interpolation has errors below 1e-6
 INTEGRATOR_DELAYS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # delay [control periods]
 
 
 class ClosedForms(NamedTuple):
-    """Closed forms for every lane of a batch; None if a form does not apply."""
+    """Values of the closed forms for each scenario of a batch; None for a form that does not apply."""
 
-    series: np.ndarray | None  # restitution e, item 1 [1]
-    characteristic_root: np.ndarray | None  # restitution e, item 2 [1]
-    # delay over the critical one, beyond which a lasting contact grows, item 5 [1]
+    series: np.ndarray | None  # restitution e from the series, item 1 [1]
+    characteristic_root: np.ndarray | None  # restitution e from the dominant root, item 2 [1]
+    # delay divided by the critical delay, above which the oscillation in contact grows, item 5 [1]
     delay_over_critical: np.ndarray | None
-    reason: str | None  # reason if no form applies
+    reason: str | None  # reason if no closed form applies
 
 
 def compute_closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ClosedForms:
-    """Return the closed forms that apply to a batch of scenarios, for the stiffest contact of each."""
+    """Compute the closed forms that apply to a batch of scenarios, for each scenario's stiffest contact."""
     reason = _reason_none_applies(mechanism, compensator, scenarios)
     if reason:
         return ClosedForms(None, None, None, reason)
@@ -46,10 +46,10 @@ def compute_closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scen
 
 
 def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """Return the total mean delay between force and motion with an ideal motion simulator [s], (lanes,).
+    """Return the total mean delay [s] from motion to force with an ideal motion simulator, (lanes,).
 
-    It is the sum of the delays of motion simulator and sensor, and of integrator, latency and hold, which are
-    shares of the control period (item 7).
+    The total is the sum of the delays of motion simulator and force sensor, and of the delays by integrator,
+    command latency and hold, which are proportional to the control period (item 7).
     """
     rig = mechanism.rig
     periods = INTEGRATOR_DELAYS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
@@ -58,10 +58,11 @@ def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
 
 
 def restitution_by_series(phase: np.ndarray) -> np.ndarray:
-    """Return the restitution of x'' = -omega^2 x(t - tau) at phase = omega tau; NaN unless 0 <= phase <= 1.
+    """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a series.
 
-    The motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!, with time in units of 1/omega. It continues
-    for tau after its first zero t_s, and the restitution is |S'(t_s + tau)| (item 1).
+    With time in units of 1/omega, the motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!. The delayed
+    force acts until the time tau after the first zero t_s of S, so that the restitution is |S'(t_s + tau)|
+    (item 1). The result is NaN unless 0 <= phase <= 1.
     """
     table = np.linspace(0.0, MAX_DELAY_PHASE, TABLE_SIZE)
     low, high = np.full_like(table, 2.0), np.full_like(table, 4.5)
@@ -75,10 +76,11 @@ def restitution_by_series(phase: np.ndarray) -> np.ndarray:
 
 
 def restitution_by_root(phase: np.ndarray) -> np.ndarray:
-    """Return the restitution exp(pi Re s/|Im s|) at phase = omega tau >= 0.
+    """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a root.
 
-    s = (2/tau) W_0(j omega tau/2), with the principal branch W_0 of the Lambert function, is a root of
-    s^2 = -omega^2 e^(-s tau) (item 2).
+    The dominant root s = (2/tau) W_0(j omega tau/2) of s^2 = -omega^2 e^(-s tau) gives the restitution
+    exp(pi Re s/|Im s|) (item 2). W_0 is the principal branch of the Lambert function. The result is NaN for a
+    negative phase.
     """
     phase = np.asarray(phase, float)
     root = lambertw(0.5j * np.where(phase > 0, phase, 1.0))
@@ -88,17 +90,20 @@ def restitution_by_root(phase: np.ndarray) -> np.ndarray:
 
 
 def critical_delay(mass: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the delay tau_c [s] beyond which M x'' + b x'(t - tau) + k x(t - tau) = 0 grows (item 5)."""
+    """Return the critical delay tau_c [s] of M x'' + b x'(t - tau) + k x(t - tau) = 0 (item 5).
+
+    For a delay tau > tau_c, the oscillation grows.
+    """
     square = (damping**2 + np.sqrt(damping**4 + 4 * mass**2 * stiffness**2)) / (2 * mass**2)
     frequency = np.sqrt(square)
     return np.arctan(damping * frequency / stiffness) / frequency
 
 
 def _reason_none_applies(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> str | None:
-    """Return the reason why no closed form applies, or None."""
+    """Return the reason why no closed form applies to the scenarios, or None if a closed form applies."""
     damping = np.asarray(scenarios.contact.damping)[: mechanism.approach.contacts]
     if compensator != "none":
-        return "there is a compensation"
+        return "the contact is compensated"
     if not find_contact_law(mechanism.contact.law).is_linear:
         return f"the contact law is {mechanism.contact.law}"
     if mechanism.rig.simulator.model != "ideal":
@@ -113,7 +118,7 @@ def _reason_none_applies(mechanism: Mechanism, compensator: str, scenarios: Scen
 
 
 def _series_motion(time: np.ndarray, delay: np.ndarray, derivative: int) -> np.ndarray:
-    """Return S(t), or its derivative, elementwise; `SERIES_TERMS` terms must be enough."""
+    """Return the motion S(t) of `restitution_by_series`, or a derivative of it, elementwise."""
     total = np.zeros_like(time)
     for n in range(SERIES_TERMS):
         power = 2 * n + 1 - derivative

@@ -1,14 +1,15 @@
-"""Growth of a lasting contact: eigenvalues of one control period of the sampled loop in contact.
+"""Growth of the oscillation in a contact that does not end, from the eigenvalues of the sampled loop.
 
-For a linear contact law and a linear compensator, the loop in contact is a linear map from tick to tick. Its
-state consists of the numerical model, the delayed commands, the motion simulator, the force sensor's lag, the
-delayed readings, and the compensator's filters. The plant between ticks is solved exactly; the matrix is the
-derivative of one period. The largest magnitude of its eigenvalues, the spectral radius, is the growth per
-control period: above 1, the contact gains energy for any initial state. For the eigenvalue z, the growth is
-ln|z|/T per second, and the factor over half an oscillation, the duration of a free contact, is exp(pi
-ln|z|/|arg z|).
+For a linear contact law and a linear compensator, the loop in contact is a linear map from tick to tick. The
+state of the map consists of the numerical model, the delayed commands, the motion simulator, the force
+sensor's lag, the delayed readings, and the compensator's filters. The motion between ticks is solved exactly,
+and the matrix of the map is the derivative of one control period with respect to the state.
 
-This code does not use the loop of `jaxhil.simulation`; tests compare the two.
+The spectral radius is the largest magnitude of the eigenvalues of this matrix. If it exceeds 1, the
+oscillation grows. For the eigenvalue z with this magnitude, the growth rate is ln|z|/T per second. Over half
+an oscillation, the duration of a free contact, the amplitude grows by the factor exp(pi ln|z|/|arg z|).
+
+This module does not use the loop of `jaxhil.simulation`; tests compare both.
 """
 
 from collections.abc import Mapping
@@ -32,47 +33,45 @@ LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
     "smith_hybrid",
 )  # fmt: skip
-MIN_LAG = 1e-3  # control periods; in a batch with lags, lanes without a lag get this one
-EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = (
-    12,
-    12,
-)  # of the matrix exponential: errors below 1e-12 for norms up to 1000
+MIN_LAG = 1e-3  # control periods; replaces a lag of 0 in a batch in which other lanes have a lag
+# Squarings and terms of the matrix exponential; its errors are below 1e-12 for norms up to 1000.
+EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 12, 12
 LINEARISATION_DEPTH = 1e-3  # m; penetration at which the loop is linearised
-MAX_CHUNK_ENTRIES = 4_000_000  # matrix entries computed at a time
+MAX_CHUNK_ENTRIES = 4_000_000  # matrix entries that are computed together, to limit the memory
 
 
 class ProgramParameters(NamedTuple):
-    """Static parameters of the compiled program."""
+    """Parameters that are constants of the compiled program, and equal for all lanes."""
 
     compensator: str
     integrator: str
-    hold: str  # kind of hold of the command
+    hold: str  # hold of the command, "zoh" or "linear"
     latency: int  # latency of the command [control periods]
     has_lag: bool  # whether the force sensor has a lag
-    delays: int  # largest number of delayed readings
+    delays: int  # number of past force readings in the state, enough for the longest delay
 
 
 class LoopParameters(NamedTuple):
-    """Parameters of one loop in contact, or arrays over lanes."""
+    """Physical parameters of a loop in contact: scalars, or arrays with one value per lane."""
 
     mass: Any  # M [kg]
     period: Any  # T [s]
     stiffness: Any  # k [N/m]
     damping: Any  # b [N s/m]
-    numerator: Any  # numerator of the motion simulator, descending powers of s, (order,)
-    denominator: Any  # its denominator, descending powers of s, (order + 1,)
+    numerator: Any  # motion simulator's numerator, coefficients of descending powers of s, (order,)
+    denominator: Any  # motion simulator's denominator, descending powers of s, (order + 1,)
     delay: Any  # delay of motion simulator plus force sensor [s]
     lag: Any  # time constant of the force sensor [s]
 
 
 class Growth(NamedTuple):
-    """Growth of a lasting contact."""
+    """Growth of the oscillation in a contact that does not end."""
 
-    spectral_radius: float  # spectral radius of one control period [1]
-    per_second: float  # ln(spectral radius)/T [1/s]
-    per_half_oscillation: float | None  # factor on the amplitude [1]; None without oscillation
-    frequency: float  # frequency of the eigenvalue [Hz]
-    by_gain: dict[str, float]  # derivative of the spectral radius [1 over the gain's unit]
+    spectral_radius: float  # factor of the amplitude per control period [1]
+    per_second: float  # growth rate ln(spectral radius)/T [1/s]
+    per_half_oscillation: float | None  # factor of the amplitude per half oscillation [1]; None without one
+    frequency: float  # frequency of the oscillation [Hz]
+    by_gain: dict[str, float]  # derivative of the spectral radius by each gain [1/unit of the gain]
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
@@ -87,9 +86,9 @@ def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
 def spectral_radii(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, Any], scenarios: Scenario
 ) -> np.ndarray:
-    """Return the spectral radius of every lane, (lanes,), the largest of all contacts of the schedule.
+    """Return the spectral radius of the loop in contact for each scenario of a batch, (lanes,).
 
-    `gains` are scalars or have one value per lane.
+    The radius of a scenario is the largest of its contacts. `gains` are scalars or have one value per lane.
     """
     number = len(np.asarray(scenarios.velocity))
     shape, lane_gains = _program_parameters(mechanism, compensator, scenarios), _per_lane(gains, number)
@@ -98,17 +97,17 @@ def spectral_radii(
         lanes = _lane_parameters(scenarios, slot)
         size = _matrix_size(shape, lanes)
         for start in range(0, number, step := max(1, MAX_CHUNK_ENTRIES // size**2)):
-            part = slice(start, start + step)
+            chunk = slice(start, start + step)
             matrices = _period_matrices(
-                shape, *jax.tree.map(lambda leaf, part=part: leaf[part], (lanes, lane_gains))
+                shape, *jax.tree.map(lambda leaf, chunk=chunk: leaf[chunk], (lanes, lane_gains))
             )
             radii = np.max(np.abs(np.linalg.eigvals(np.asarray(matrices))), axis=-1)
-            largest[part] = np.maximum(largest[part], radii)
+            largest[chunk] = np.maximum(largest[chunk], radii)
     return largest
 
 
 def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> float:
-    """Return the order of magnitude of the operations for one lane's eigenvalues."""
+    """Return the approximate number of operations for the eigenvalues of one scenario."""
     shape = _program_parameters(mechanism, compensator, scenarios)
     return (
         len(_distinct_contacts(mechanism)) * float(_matrix_size(shape, _lane_parameters(scenarios, 0))) ** 3
@@ -118,7 +117,7 @@ def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario)
 def compute_growth(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario
 ) -> Growth:
-    """Return the growth of the first lane in its fastest growing contact, with the slope by every gain."""
+    """Return the growth for the first scenario, in the contact with the largest spectral radius."""
     shape, values = (
         _program_parameters(mechanism, compensator, scenarios),
         {k: jnp.asarray(v) for k, v in gains.items()},
@@ -148,7 +147,7 @@ def compute_growth(
 
 
 def _distinct_contacts(mechanism: Mechanism) -> list[int]:
-    """Return the contacts of the schedule with distinct stiffness and damping."""
+    """Return the indices of the contacts of the schedule that differ in stiffness or damping."""
     contact, pairs = mechanism.contact, {}
     for slot in range(mechanism.approach.contacts):
         pair = (contact.stiffness[min(slot, len(contact.stiffness) - 1)],
@@ -158,7 +157,7 @@ def _distinct_contacts(mechanism: Mechanism) -> list[int]:
 
 
 def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ProgramParameters:
-    """Return the static parameters of the program for a batch."""
+    """Return the constants of the compiled program for a batch of scenarios."""
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
@@ -169,7 +168,7 @@ def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scena
 
 
 def _lane_parameters(scenarios: Scenario, slot: int) -> LoopParameters:
-    """Return the parameters of every lane in one contact of the schedule."""
+    """Return the physical parameters of every lane in contact `slot` of the schedule."""
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
     numbers = LoopParameters(
         mass=scenarios.equivalent_mass,
@@ -185,18 +184,18 @@ def _lane_parameters(scenarios: Scenario, slot: int) -> LoopParameters:
 
 
 def _per_lane(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
-    """Return the gains with one value per lane, (number,)."""
+    """Return the gains as arrays with one value per lane, (number,); scalars are repeated."""
     return {name: np.broadcast_to(np.asarray(value, float), (number,)) for name, value in gains.items()}
 
 
 def _matrix_size(shape: ProgramParameters, lanes: LoopParameters) -> int:
-    """Return the approximate number of rows of a matrix."""
+    """Return the approximate number of rows of the matrix of one control period."""
     return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.has_lag + shape.delays + 4
 
 
 @partial(jax.jit, static_argnums=0)
 def _period_matrices(shape: ProgramParameters, lanes: LoopParameters, gains: Gains) -> jax.Array:
-    """Return the matrices of all lanes, (lanes, size, size)."""
+    """Return the matrix of one control period for every lane, (lanes, size, size)."""
     return jax.vmap(partial(_period_matrix, shape))(lanes, gains)
 
 
@@ -204,13 +203,13 @@ def _period_matrices(shape: ProgramParameters, lanes: LoopParameters, gains: Gai
 def _matrix_derivatives(
     shape: ProgramParameters, lane: LoopParameters, gains: Gains
 ) -> tuple[jax.Array, Gains]:
-    """Return the matrix, and its derivative by every gain."""
+    """Return the matrix of one control period, and its derivative with respect to each gain."""
     matrix = partial(_period_matrix, shape, lane)
     return matrix(gains), jax.jacfwd(matrix)(gains) if gains else {}
 
 
 def _period_matrix(shape: ProgramParameters, lane: LoopParameters, gains: Gains) -> jax.Array:
-    """Return the matrix of one control period, (size, size)."""
+    """Return the matrix that maps the state of the loop from one tick to the next, (size, size)."""
     law = COMPENSATORS[shape.compensator]
     constants = KnownConstants(lane.period, jnp.full_like(lane.period, jnp.inf))
     plant = jnp.zeros(lane.numerator.shape[0] + shape.has_lag)
@@ -242,16 +241,16 @@ def _advance_period(
     reading: jax.Array,
     before: Any,
 ) -> Any:
-    """Return the state of the loop in contact after one control period, from tick to tick."""
+    """Return the state of the loop in contact at the next tick, from its state at a tick."""
     position, velocity, commands, plant, readings, state = before
-    # The reading at a tick was sampled a whole number of periods before the newest sample.
+    # The reading at a tick is older than the newest reading by a whole number of periods.
     force = readings[jnp.floor(lane.delay / lane.period + 1e-9).astype(int)]
     signals = Signals(force, position, velocity, position, jnp.asarray(1))
     command, state = law.step(law.prepare(gains, constants), state, signals, jnp.asarray(1))
     acceleration = -command / lane.mass
     position, velocity = INTEGRATORS[shape.integrator](position, velocity, acceleration, lane.period)
-    led, state = law.position_command(gains, state, position, velocity, acceleration)
-    sent = jnp.concatenate([led[None], commands])
+    position_command, state = law.position_command(gains, state, position, velocity, acceleration)
+    sent = jnp.concatenate([position_command[None], commands])
     end = sent[shape.latency]
     driven = jnp.concatenate(
         [plant, jnp.stack([sent[shape.latency + 1] if shape.hold == "linear" else end, end])]
@@ -261,11 +260,12 @@ def _advance_period(
 
 
 def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[jax.Array, jax.Array]:
-    """Return the transition of motion simulator, contact and sensor lag over a control period.
+    """Return the transition of motion simulator and sensor lag over a control period, and the reading's row.
 
-    The rows of the next state, and the row of the new reading, multiply (state, command at the period's
-    start, command at its end). They come from the exponential of the system augmented by its input and the
-    input's slope (Van Loan 1978), with time in control periods and a linear command within the period.
+    The transition is a matrix. Matrix and row multiply the vector (state, command at the start of the period,
+    command at the end). The matrix gives the state at the end, and the row gives the new force reading. Both
+    follow from the exponential of the system augmented by its input and the slope of the input (Van Loan
+    1978). Time is in control periods, and the command is linear within a period.
     """
     order, period = lane.numerator.shape[0], lane.period
     size = order + shape.has_lag
@@ -275,7 +275,7 @@ def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[j
     if order == 0:
         position = position.at[command].set(1.0)
     for power in range(order):
-        # Powers of s ascend, in units in which the weight of the command is 1.
+        # The powers of s ascend; the state is scaled such that the coefficient of the command is 1.
         scale = period ** (order - power) / lane.denominator[0]
         position = position.at[power].set(lane.numerator[order - 1 - power] * scale)
         generator = generator.at[order - 1, power].set(-lane.denominator[order - power] * scale)
@@ -288,16 +288,16 @@ def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[j
         ratio = 1.0 / jnp.maximum(lane.lag / period, MIN_LAG)
         generator = generator.at[order].set(ratio * force).at[order, order].add(-ratio)
         force = jnp.zeros(size + 2).at[order].set(1.0)
-    # A reading at a tick has the value just before the tick, so its time lies in (0, 1].
+    # A reading has the value just before a tick, so that its time within the period is in (0, 1].
     time = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
-    whole, part = (_matrix_exponential(generator * share) for share in (jnp.ones_like(time), time))
-    rows = jnp.concatenate([whole[:size], (force @ part)[None]])
+    to_end, to_reading = (_matrix_exponential(generator * t) for t in (jnp.ones_like(time), time))
+    rows = jnp.concatenate([to_end[:size], (force @ to_reading)[None]])
     rows = rows.at[:, command].add(-rows[:, slope])
     return rows[:size], rows[size]
 
 
 def _matrix_exponential(matrix: jax.Array) -> jax.Array:
-    """Return a matrix exponential by scaling and squaring; `expm` compiles much more slowly."""
+    """Return the exponential of a matrix by scaling and squaring; jax's `expm` compiles much more slowly."""
     identity, scaled = jnp.eye(len(matrix)), matrix / 2**EXPONENTIAL_SQUARINGS
 
     def horner(step: Any, total: jax.Array) -> jax.Array:

@@ -1,7 +1,8 @@
-"""Stability map: restitution error over two keys, closed-form theory, and the margins of the nominal point.
+"""Computation of a stability map: restitution error on a grid of two keys, theory, margins.
 
 The gains are the same at every point, so that the map shows the effect of changes that the controller does
-not know. All points, and two lines through the nominal one, are batch elements of one program.
+not know. The margins of the nominal point follow from runs along two lines through this point, one for each
+key. All runs are batch elements of one program.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -37,22 +38,22 @@ MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser
 
 
 class NominalMargin(NamedTuple):
-    """Nearest values of one key at which a limit is exceeded; None if the map ends first."""
+    """Range of one key around its nominal value within which a limit is not exceeded."""
 
-    low: float | None  # nearest value below the nominal one [unit of the key]
-    high: float | None  # nearest value above the nominal one
+    low: float | None  # lower end [unit of the key]; None if the limit is not exceeded down to the map's end
+    high: float | None  # upper end [unit of the key]; None if the limit is not exceeded up to the map's end
 
 
 class SpectralRadii(NamedTuple):
-    """Spectral radius of the loop in contact, over its own grid."""
+    """Spectral radius of the loop in contact, on a grid that may be coarser than that of the map."""
 
-    x: np.ndarray  # (columns,)
-    y: np.ndarray  # (rows,)
-    values: np.ndarray  # (rows, columns) [1]
+    x: np.ndarray  # values along x, (columns,)
+    y: np.ndarray  # values along y, (rows,)
+    values: np.ndarray  # spectral radii, (rows, columns) [1]
 
 
 class NominalPoint(NamedTuple):
-    """Results at the nominal point, which the mechanism file describes."""
+    """Results at the nominal point of a stability map, which the mechanism file describes."""
 
     restitution: float | None  # e of the contact with the largest error [1]
     error: float | None  # e - e* of that contact [1]; None if a contact did not end
@@ -60,28 +61,27 @@ class NominalPoint(NamedTuple):
     peak_force_ratio: float | None
     duration_ratio: float | None  # ratio of durations farthest from 1 [1]; None if a contact did not end
     growth: Growth | None  # growth of a lasting contact; None if the loop in contact is not linear
-    error_margins: (
-        tuple[NominalMargin, NominalMargin] | None
-    )  # along x and y, to the limit; None if the error exceeds it
-    # along x and y, to the bounds on real peak force and duration; None if they are exceeded
+    # ranges of x and y with an error within the limit; None if the nominal error exceeds the limit
+    error_margins: tuple[NominalMargin, NominalMargin] | None
+    # ranges of x and y with peak force and duration within their bounds; None if the nominal ones are not
     contact_margins: tuple[NominalMargin, NominalMargin] | None
-    # along x and y, to a spectral radius of 1; None if it is exceeded
+    # ranges of x and y with a spectral radius of at most 1; None if the nominal one exceeds 1
     radius_margins: tuple[NominalMargin, NominalMargin] | None
 
 
 class MapResults(NamedTuple):
-    """All results of a map."""
+    """Results of a stability map at all points and at the nominal point."""
 
     axes: tuple[MapAxis, MapAxis]  # axes x and y
     x: np.ndarray  # values along x, (columns,), in the unit of its key
     y: np.ndarray  # values along y, (rows,), in the unit of its key
-    restitution: np.ndarray  # e of the contact with the largest error (rows, columns) [1]
-    error: np.ndarray  # e - e* of that contact (rows, columns) [1]; NaN if a contact did not end
+    restitution: np.ndarray  # e of the contact with the largest error, (rows, columns) [1]
+    error: np.ndarray  # e - e* of that contact, (rows, columns) [1]; NaN if a contact did not end
     peak_force_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     duration_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     closed: ClosedForms  # closed forms, each (rows, columns)
-    radii: SpectralRadii | None  # spectral radius of a lasting contact; None if there is none
-    no_growth: str | None  # reason why `radii` is None
+    radii: SpectralRadii | None  # spectral radii of the loop in contact; None if the loop is not linear
+    no_growth: str | None  # reason if `radii` is None
     nominal: NominalPoint
 
 
@@ -97,11 +97,23 @@ def compute_map(
     scheduler: str | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> MapResults:
-    """Compute the map with `points` values along each axis.
+    """Compute a stability map.
 
-    `tell` is called with the current step and the number of finished runs, of `runs(points)`. With a
-    `scheduler`, the workers of a cluster run the contacts. Finished tiles of runs are stored in the
-    `checkpoints`.
+    Args:
+        mechanism: nominal mechanism.
+        compensator: name of the compensator.
+        gains: gains at every point [SI units].
+        axes: axes x and y.
+        points: number of values along each axis.
+        limit: error [1] for the margins of the nominal point.
+        seed: seed of the sensor noise.
+        tell: called with the current activity, and the number of finished runs out of `count_runs(points)`.
+        scheduler: address of a cluster's scheduler, whose workers simulate the contacts; None for this
+            process.
+        checkpoints: store of finished tiles of runs, which are not repeated.
+
+    Returns:
+        The results at all points and at the nominal point.
     """
 
     def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
@@ -160,9 +172,10 @@ def _nominal_point(
     lines: list[np.ndarray],
     limit: float,
 ) -> NominalPoint:
-    """Return the nominal point, which is the last run, and its margins along the lines.
+    """Return the results at the nominal point, with its margins along both lines.
 
-    The first `size` runs are those of the map.
+    `worst` contains, run by run, the results of `_worst_contact`: first `size` runs of the map, then the runs
+    along both lines, then the nominal run.
     """
     restitution, error, force, duration, unlike = worst
     if not np.isfinite(error[-1]):
@@ -191,12 +204,12 @@ def _nominal_point(
 
 
 def count_runs(points: int) -> int:
-    """Return the number of runs of a map with `points` values along each axis."""
+    """Return the number of simulated runs of a map with `points` values along each axis."""
     return points**2 + 2 * LINE_POINTS + 1
 
 
 def run_tile(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
-    """Run a tile of scenarios, and return the result of `_worst_contact` for each of them, (5, lanes)."""
+    """Simulate a tile of scenarios, and return the results of `_worst_contact`, (5, lanes)."""
     return np.stack(_worst_contact(evaluate(loop, gains, scenarios, at_least=at_least)))
 
 
@@ -209,56 +222,56 @@ def _run_tiles(
     scheduler: str | None,
     checkpoints: Checkpoints,
 ) -> np.ndarray:
-    """Return the result of `_worst_contact` for each run, (5, lanes), computed tile by tile.
+    """Simulate all runs tile by tile, and return the results of `_worst_contact`, (5, lanes).
 
-    Every tile has a mix of long and short runs, so that all tiles take a similar time.
+    Each tile contains both long and short runs, so that all tiles take a similar time.
     """
     loop = build_loop(mechanism, compensator, scenarios)
     order = np.argsort(ONE_AXIS.expected_duration(scenarios))
     worst = np.empty((5, len(order)))
-    parts = -(-len(order) // MAX_TILE_RUNS)
-    lanes = [order[number::parts] for number in range(parts)]
+    tiles = -(-len(order) // MAX_TILE_RUNS)
+    lanes = [order[number::tiles] for number in range(tiles)]
     inputs = compute_digest((to_plain_data(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
     finished = 0
     tell("running the contacts", finished)
 
-    def take(number: int, values: np.ndarray) -> None:
+    def store(number: int, values: np.ndarray) -> None:
         nonlocal finished
         worst[:, lanes[number]] = values
         finished += len(lanes[number])
         tell("running the contacts", finished)
 
-    def tile_pieces(numbers: Iterable[int]) -> Iterator[WorkUnit]:
+    def work_units(numbers: Iterable[int]) -> Iterator[WorkUnit]:
         for number in numbers:
-            part = lanes[number]
-            tile_gains = {name: value[part] if np.ndim(value) else value for name, value in gains.items()}
-            tile_scenarios = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[..., part], scenarios)
+            tile = lanes[number]
+            tile_gains = {name: value[tile] if np.ndim(value) else value for name, value in gains.items()}
+            tile_scenarios = jax.tree.map(lambda leaf, tile=tile: np.asarray(leaf)[..., tile], scenarios)
             yield WorkUnit(number, (loop, tile_gains, tile_scenarios, len(lanes[0])))
 
     missing = []
-    for number in range(parts):
+    for number in range(tiles):
         stored = checkpoints.read(f"part {number}", (inputs, number), np.ndarray)
-        missing.append(number) if stored is None else take(number, stored)
+        missing.append(number) if stored is None else store(number, stored)
     if scheduler is None:
-        computed = ((number, run_tile(*arguments)) for number, arguments in tile_pieces(missing))
+        computed = ((number, run_tile(*arguments)) for number, arguments in work_units(missing))
     else:
         computed = run_on_workers(
-            scheduler, run_tile, tile_pieces(missing), get_process_setting(), f"map-{inputs[:16]}"
+            scheduler, run_tile, work_units(missing), get_process_setting(), f"map-{inputs[:16]}"
         )
     for number, values in computed:
         checkpoints.write(f"part {number}", (inputs, number), values)
-        take(number, values)
+        store(number, values)
     return worst
 
 
 def _grid_points(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the points of a grid row by row, (rows x columns, 2)."""
+    """Return the points (x, y) of a grid, row by row, (rows x columns, 2)."""
     across, up = np.meshgrid(x, y)
     return np.stack([across.ravel(), up.ravel()], axis=1)
 
 
 def _reshape_forms(closed: ClosedForms, points: int) -> ClosedForms:
-    """Return the closed forms with rows and columns instead of lanes."""
+    """Reshape the closed forms from lanes to rows and columns of the map, (points, points)."""
     series, root, critical = (
         None if values is None else values.reshape(points, points) for values in closed[:3]
     )
@@ -268,17 +281,20 @@ def _reshape_forms(closed: ClosedForms, points: int) -> ClosedForms:
 def _build_scenarios(
     mechanism: Mechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
 ) -> Scenario:
-    """Build the scenarios of the points `values` (lanes, 2), all with the same sensor noise."""
+    """Build the scenarios for points `values`, (lanes, 2), all with the same sensor noise."""
     phase = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
     scenarios = build_scenarios(mechanism, phase | mechanism_draws(mechanism, axes, values), seed)
-    # Every lane gets the noise of the first, so that points differ only by the keys.
+    # All lanes get the noise of the first lane, so that points differ only in the keys of the axes.
     return scenarios._replace(key=np.broadcast_to(scenarios.key[:, :1], scenarios.key.shape))  # pyright: ignore[reportArgumentType]
 
 
 def _point_gains(
     gains: Mapping[str, float], axes: tuple[MapAxis, MapAxis], values: np.ndarray
 ) -> dict[str, Any]:
-    """Return the gains of the points `values` (lanes, 2): arrays over lanes if an axis is a gain."""
+    """Return the gains for points `values`, (lanes, 2).
+
+    If an axis is a gain, all gains are arrays (lanes,); otherwise they are scalars.
+    """
     varied = {
         axis.key.partition(".")[2]: values[:, index] for index, axis in enumerate(axes) if not axis.path
     }
@@ -288,11 +304,11 @@ def _point_gains(
 
 
 def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
-    """Return the worst values of each lane, five arrays (lanes,).
+    """Return five arrays (lanes,) with the worst values among the contacts of each lane.
 
-    These are e and e - e* of the contact with the largest error, the largest peak force ratio, the duration
-    ratio farthest from 1, and whether a contact is unlike the ideal one. All are NaN if a contact did not
-    end.
+    The values are e and e - e* of the contact with the largest |e - e*|, the largest peak force ratio, the
+    duration ratio farthest from 1, and 1 if a real contact is out of the bounds of the ideal contact, else 0.
+    All values are NaN if a contact did not end.
     """
     used = outcome.wanted & outcome.good
     ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)
@@ -316,21 +332,24 @@ def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
 def _line_margins(
     axes: tuple[MapAxis, MapAxis], lines: list[np.ndarray], values: np.ndarray, most: float
 ) -> tuple[NominalMargin, NominalMargin]:
-    """Return where `values` (axes, points) along lines through the nominal point first exceed `most`."""
+    """Return the range of each key, around its nominal value, in which `values` do not exceed `most`.
+
+    `lines` are the values of the keys, (points,) each, and `values` has the shape (axes, points).
+    """
     margins = []
-    for axis, line, along in zip(axes, lines, values, strict=True):
+    for axis, line, line_values in zip(axes, lines, values, strict=True):
         below, above = line < axis.nominal, line > axis.nominal
         margins.append(
             NominalMargin(
-                _first_crossing(line[below][::-1], along[below][::-1], most),
-                _first_crossing(line[above], along[above], most),
+                _first_crossing(line[below][::-1], line_values[below][::-1], most),
+                _first_crossing(line[above], line_values[above], most),
             )
         )
     return margins[0], margins[1]
 
 
 def _first_crossing(line: np.ndarray, values: np.ndarray, most: float) -> float | None:
-    """Return the first value on a line at which `values`, linearly interpolated, exceed `most`, or None."""
+    """Return the first point of `line` at which the interpolated `values` exceed `most`, or None."""
     beyond = np.flatnonzero(values > most)
     if not len(beyond):
         return None

@@ -1,1 +1,1 @@
-"""Commands, one per module with `run(options)`, which returns the exit code; imported on use."""
+"""Commands of `jaxhil`: each module has a function `run(options)`, which returns the exit code."""

@@ -1,4 +1,4 @@
-"""Checkpoints of finished work (`tuning.caches.checkpoints`): creation for a command, and warnings."""
+"""Creation of a command's checkpoints (`tuning.caches.checkpoints`), and warnings about unusable ones."""
 
 from pathlib import Path
 
@@ -7,15 +7,18 @@ from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
 
 
 def open_checkpoints(output: str, resume: bool) -> Checkpoints:
-    """Return the checkpoints of a command that writes into the folder `output`."""
+    """Return the checkpoints of a command whose results are written to the folder `output`.
+
+    With `resume`, checkpoints of an earlier run are used.
+    """
     return Checkpoints(Path(output) / CHECKPOINT_FOLDER, resume)
 
 
-def warn_about_checkpoints(pieces: Checkpoints) -> None:
-    """Warn of checkpoints that could not be used or written."""
-    if number := len(pieces.other):
-        subject = "piece was" if number == 1 else "pieces were"
-        reason = "kept by other files, options or code, or damaged"
-        terminal.note(f"warning: --resume: {number} {subject} {reason}: computed anew")
-    if pieces.unwritten:
-        terminal.note(f"warning: {pieces.unwritten[0]}: with --resume it would be computed again")
+def warn_about_checkpoints(checkpoints: Checkpoints) -> None:
+    """Print a warning if checkpoints could not be used or could not be written."""
+    if number := len(checkpoints.other):
+        subject = "checkpoint is" if number == 1 else "checkpoints are"
+        reason = "from other files, options or code, or damaged"
+        terminal.note(f"warning: --resume: {number} {subject} {reason}: this work was done again")
+    if checkpoints.unwritten:
+        terminal.note(f"warning: {checkpoints.unwritten[0]}: --resume would repeat this work")

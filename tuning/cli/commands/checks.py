@@ -16,10 +16,10 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_regular, remove_stale, report_write_errors, resolve_output_path
 from tuning.cli.options import PLOT_SUFFIXES
 
-# Names that Windows reserves for devices, with any ending; results may be copied to such a system.
+# Names that Windows reserves for devices, with any suffix; results may be copied to a Windows system.
 RESERVED_NAME = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)
-MAX_FOLDER_NAME_BYTES = 120  # bytes of a folder's name; file systems allow 255, some tools less
-MAX_NAMES_IN_MESSAGE = 3  # largest number of names in a message
+MAX_FOLDER_NAME_BYTES = 120  # bytes; file systems allow 255, but some tools allow less
+MAX_NAMES_IN_MESSAGE = 3  # largest number of mechanism names listed in a message
 
 
 def check_plot(path: str) -> None:
@@ -32,7 +32,7 @@ def check_plot(path: str) -> None:
 
 
 def check_file_path(path: str) -> None:
-    """Check that a file can be written to `path`; create its parent folders, delete stale temporary files."""
+    """Check that a file can be written to `path`; create parent folders, and delete stale temporary files."""
     target = Path(path)
     with report_write_errors(target):
         target = resolve_output_path(target)
@@ -48,10 +48,10 @@ def prepare_output_folder(folder: Path) -> None:
 
 
 def make_folder_name(name: str) -> str:
-    """Return a folder name made from a mechanism's name: letters and digits of any script, in NFC.
+    """Convert a mechanism's name to a valid folder name, with letters and digits of any script (Unicode NFC).
 
-    Different mechanisms may get the same folder name; `check_earlier_results` then raises an error for the
-    second one.
+    Two mechanisms may get the same folder name; `check_earlier_results` then raises an error for the second
+    mechanism.
     """
     composed = unicodedata.normalize("NFC", name)
     spaced = "".join(character if _is_permitted(character) else " " for character in composed)
@@ -65,26 +65,26 @@ def make_folder_name(name: str) -> str:
 
 
 def _is_permitted(character: str) -> bool:
-    """Return whether a folder's name may contain a character: letter, mark, digit, dot, dash, underscore."""
+    """Return whether a character is a letter, mark, digit, dot, dash or underscore."""
     return character.isalnum() or character in "._-" or unicodedata.category(character)[0] == "M"
 
 
 def check_earlier_results(
     document: Path, mark: str, plots: Sequence[str], mechanisms: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Check that the files to be replaced come from an earlier run, and return the earlier document.
+    """Check that a command would overwrite only results of an earlier run; return the earlier document.
 
     Args:
-        document: path of the document, a JSON object.
-        mark: key that an earlier document has.
-        plots: file names of the plots beside the document.
-        mechanisms: names of the mechanisms that the document may be about; empty for any.
+        document: path of the JSON document that the command writes.
+        mark: key by which an earlier document of this command is recognised.
+        plots: file names of the plots that the command writes to the same folder.
+        mechanisms: names of the mechanisms whose earlier results may be overwritten; empty for all.
 
     Returns:
         The earlier document; an empty dictionary if there is none.
 
     Raises:
-        InputError: If other files, or results for other mechanisms, would be lost.
+        InputError: If other files, or results for other mechanisms, would be overwritten.
     """
     with report_write_errors(document):
         os.fsencode(document)  # raises an error if the locale cannot encode the path
@@ -93,25 +93,23 @@ def check_earlier_results(
     if names and mark not in earlier:
         where = to_one_line(str(document.parent / names[0]))
         raise InputError(
-            f"{where}: found a file of something else, expected a folder without one, or --output"
+            f"{where}: found a file that jaxhil did not write, expected none: choose another folder by "
+            "--output"
         )
     lost = sorted(mechanism_names(earlier) - {*mechanisms})
     if mechanisms and lost:
-        where, allowed = (
-            to_one_line(str(document)),
-            " or ".join(map(format_value, sorted(mechanisms)[:MAX_NAMES_IN_MESSAGE])),
-        )
+        where = to_one_line(str(document))
+        allowed = " or ".join(map(format_value, sorted(mechanisms)[:MAX_NAMES_IN_MESSAGE]))
         others = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         raise InputError(
-            f"{where}: found results of mechanism {format_value(lost[0])}{others}, expected those of "
-            f"{allowed}, or "
-            "none: name another folder by --output, or the mechanism otherwise"
+            f"{where}: found results of mechanism {format_value(lost[0])}{others}, expected results of "
+            f"{allowed} or none: choose another folder by --output, or rename the mechanism"
         )
     return earlier
 
 
 def mechanism_names(document: Mapping[str, Any]) -> set[str]:
-    """Return the names of the mechanisms that a document of results is about."""
+    """Return the names of the mechanisms whose results a command's JSON document contains."""
     entries = [document, *(document.get("mechanisms") or ())]
     labels = [entry.get("mechanism") for entry in entries if isinstance(entry, Mapping)]
     names = [label.get("name") if isinstance(label, Mapping) else label for label in labels]
@@ -119,7 +117,7 @@ def mechanism_names(document: Mapping[str, Any]) -> set[str]:
 
 
 def _read_document(document: Path) -> dict[str, Any]:
-    """Return the JSON object in a file, or an empty one if there is none."""
+    """Return the JSON object in a file, or an empty dictionary if the file has none or is unreadable."""
     try:
         with open_regular(document) as opened:
             content = json.loads(opened.read())

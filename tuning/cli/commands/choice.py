@@ -19,9 +19,10 @@ from tuning.cli.options_report import Map
 
 
 def load_named_mechanism(options: SimulateOptions | Map) -> Mechanism | None:
-    """Return the mechanism of FILE, or None if the mechanism of the gain file is used.
+    """Load the one-axis mechanism of FILE; return None if the gain file's mechanism is used instead.
 
-    Raise `InputError`, also for an unknown compensator or a six-axis mechanism. This does not import jax.
+    Raise `InputError` if FILE is unusable or has six axes, or if the compensator is unknown. This function
+    does not import jax.
     """
     return (
         load(options.file, options.overrides, options.unset).mechanism if _check_uses_file(options) else None
@@ -29,7 +30,10 @@ def load_named_mechanism(options: SimulateOptions | Map) -> Mechanism | None:
 
 
 def load_any_named_mechanism(options: SimulateOptions) -> AnyMechanism | None:
-    """Return the mechanism of FILE like `load_named_mechanism`, with one axis or with six."""
+    """Load the one-axis or six-axis mechanism of FILE; return None if the gain file's is used instead.
+
+    Raise `InputError` if FILE is unusable or the compensator does not support its axes.
+    """
     if options.compensator is not None:
         arguments.check_supports_mechanism(options.compensator, None)
     if options.gains is not None and options.file is None:
@@ -40,9 +44,9 @@ def load_any_named_mechanism(options: SimulateOptions) -> AnyMechanism | None:
 
 
 def load_six_axis_mechanism(options: SimulateOptions) -> SixAxisMechanism | None:
-    """Return the mechanism of a six-axis gain file, or None if the gain file has one axis.
+    """Return the mechanism in a six-axis gain file, or None if the gain file is for one axis.
 
-    Raise `InputError`. This imports jax.
+    Raise `InputError` if the gain file or an override is unusable. This function imports jax.
     """
     from jaxhil.simulation.gain_file import load_gain_file
 
@@ -58,7 +62,7 @@ def load_six_axis_mechanism(options: SimulateOptions) -> SixAxisMechanism | None
 
 
 def _check_uses_file(options: SimulateOptions | Map) -> bool:
-    """Check the compensator's name, and return whether the mechanism comes from FILE."""
+    """Check the compensator's name; return whether the mechanism comes from FILE or from the gain file."""
     if options.compensator is not None:
         arguments.check_compensators([options.compensator])
     return options.gains is None or options.file is not None
@@ -67,9 +71,11 @@ def _check_uses_file(options: SimulateOptions | Map) -> bool:
 def select_compensator(
     options: SimulateOptions | Map, mechanism: Mechanism | None
 ) -> tuple[Mechanism, str, str | Path | None]:
-    """Return the mechanism, the compensator, and its setting or gain file, if any.
+    """Return the mechanism, the compensator's name, and the source of the gains.
 
-    `mechanism` is the result of `load_named_mechanism`. Raise `InputError`. This imports jax.
+    The source is the name of a setting, the path of a gain file, or None for the literature's gains.
+    `mechanism` is the result of `load_named_mechanism`. Raise `InputError` if an option is unusable. This
+    function imports jax.
     """
     if options.gains is None:
         assert mechanism is not None
@@ -84,7 +90,7 @@ def select_compensator(
     label = to_one_line(options.gains)
     if options.compensator not in (None, loaded.compensator):
         raise InputError(
-            f"--compensator: found {options.compensator}, expected {loaded.compensator}, which {label} is for"
+            f"--compensator: found {options.compensator}, expected {loaded.compensator}, as in {label}"
         )
     if mechanism is None:
         raw = to_plain_data(loaded.mechanism)
@@ -93,8 +99,8 @@ def select_compensator(
 
 
 def _check_setting(options: SimulateOptions | Map) -> None:
-    """Raise `InputError` if a setting is given together with a gain file."""
+    """Raise `InputError` if `--setting` is used together with a gain file."""
     if options.setting is not None:
         raise InputError(
-            f"--setting: found {format_value(options.setting)}, expected none beside a gain file"
+            f"--setting: found {format_value(options.setting)}, expected none together with --gains"
         )

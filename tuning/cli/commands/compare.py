@@ -1,4 +1,4 @@
-"""Command `jaxhil compare`: compares compensators, each tuned, on the same scenarios."""
+"""Command `jaxhil compare`: tunes compensators, and compares them on the same scenarios."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,10 +18,10 @@ PLOTS = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
-    """Compare the compensators; write and print the results that are finished, also if interrupted.
+    """Compare the compensators, and write and print the results, after an interruption the finished ones.
 
-    With `--resume`, finished work is not repeated. Return 0, 1 if a compensator failed, or 130 if
-    interrupted.
+    With `--resume`, finished work is not repeated. Return the exit code: 0, 1 if the evaluation of a
+    compensator failed, or 130 after an interruption.
     """
     options.check()
     loaded = _load(options)
@@ -36,10 +36,10 @@ def run(options: Compare) -> int:
     laws = options.laws
     results: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
-    pieces = open_checkpoints(options.output, options.resume)
+    checkpoints = open_checkpoints(options.output, options.resume)
     with terminal.show_progress(len(names) * len(laws), "results") as bar:
         try:
-            for result in compare_each(loaded, options, count_usable_cores(), bar, pieces):
+            for result in compare_each(loaded, options, count_usable_cores(), bar, checkpoints):
                 if isinstance(result, LawFailure):
                     problems.append(f"{result.law}: {result.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
@@ -71,11 +71,11 @@ def run(options: Compare) -> int:
         terminal.emit_json(document)
     else:
         _print(options, finished_names, ordered, document)
-    warn_about_checkpoints(pieces)
+    warn_about_checkpoints(checkpoints)
     if interrupted:
         finished = sum(len(finished_laws) for finished_laws in ordered.values())
-        progress = f"{finished} of {len(names) * len(laws)} results finished and kept"
-        terminal.note(f"jaxhil: interrupted, {progress}; the same with --resume goes on")
+        progress = f"{finished} of {len(names) * len(laws)} results finished and saved"
+        terminal.note(f"jaxhil: interrupted, {progress}; to continue, repeat the command with --resume")
         return 130
     return 1 if problems else 0
 
@@ -89,7 +89,7 @@ def _load(options: Compare) -> list[LoadedMechanism]:
 
 
 def _measure_tick_times(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
-    """Return the time per tick [us] of every compensator with the first mechanism's gains."""
+    """Return the computing time per tick [us] of every compensator, for the first mechanism."""
     from tuning.benchmark.comparison import LITERATURE_GAINS
     from tuning.benchmark.computing_time import measure_tick_time
 
@@ -131,19 +131,18 @@ def _print(
     rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
     terminal.emit(
         terminal.build_table(
-            "What a law must know beforehand, and what it costs",
-            ["law", "known beforehand", "Python [us per tick]"],
+            "Prior knowledge and computing time of each compensator",
+            ["compensator", "known beforehand", "Python [us per tick]"],
             rows,
             texts=(0, 1),
         ),
-        f"rms, p99, worst: |e - e*|. fail: scenarios beyond {100 * options.limit:g} %, that do not end, or",
-        f"whose real contact is beyond {MAX_PEAK_FORCE_RATIO:g} times the ideal peak force or "
-        f"{MIN_DURATION_RATIO:g} to "
-        f"{MAX_DURATION_RATIO:g} times the ideal duration.",
-        f"early, late: transparency to {document['transparency']} (1: perfect, 0: blind).",
-        "slope: of e against e* over damped twins. peak: command over the reference, 99th percentile.",
-        "path: x_d off the reference. noise: amplification. *: better than every other law, tuned, by more",
-        "than the 95 % intervals.",
+        f"rms, p99, worst: |e - e*|. fail: scenarios with an error above {100 * options.limit:g} %, with a",
+        f"contact that does not end, or with a real contact above {MAX_PEAK_FORCE_RATIO:g} times the ideal "
+        f"peak force or outside {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal duration.",
+        f"early, late: transparency to {document['transparency']} (1: perfect, 0: none).",
+        "slope: of e against e* for damping perturbations. peak: peak command divided by the ideal peak",
+        "force, 99th percentile. path: trajectory error of x_d. noise: amplification of the sensor noise.",
+        "*: better than every other tuned compensator by more than the 95 % intervals.",
         f"wrote {options.output}/compare.json" + (" and plots" if names else ""),
         "",
     )

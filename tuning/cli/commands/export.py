@@ -13,9 +13,9 @@ from tuning.cli.options_rig import Export
 
 
 def run(options: Export) -> int:
-    """Export the bundle and print the result; return 1 if the verdict is bad, else 0.
+    """Export the bundle, and print the result; return exit code 1 if the verdict is bad, else 0.
 
-    Nothing is written if the runtime's forces differ from the simulated ones.
+    If the force commands of the rig's runtime differ from the simulated ones, nothing is written.
     """
     formats = [name.strip() for names in options.formats for name in names.split(",")]
     result = export(
@@ -35,7 +35,7 @@ def run(options: Export) -> int:
 
 
 def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
-    """Return the limits that the user sets, None for no limit. Raise `InputError` for wrong ones."""
+    """Parse texts LIMIT=VALUE to limits by name, None for no limit; raise `InputError` for wrong texts."""
     replaced: dict[str, float | None] = {}
     for words in settings:
         name, _, text = words.partition("=")
@@ -68,7 +68,7 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             terminal.build_table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2))
         )
     lines = [
-        f"{'draw ' + str(number) if number else 'The nominal run'}, {end}: not compared from there on."
+        f"{'draw ' + str(number) if number else 'The nominal run'}, {end}: later ticks are not compared."
         for number, end in enumerate(document["ended"])
         if end
     ]
@@ -77,7 +77,11 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
     if document["bundle"]:
         lines += [
             f"wrote {len(sizes)} files, {sum(sizes.values()) / 1e6:.2g} MB, to {document['bundle']}",
-            *(["Signed: `jaxhil verify --key` with the public key proves it."] if document["signed"] else []),
+            *(
+                ["Signed; to check the signature: `jaxhil verify --key` with the public key."]
+                if document["signed"]
+                else []
+            ),
             f"On the rig: python {Path(document['bundle']).name}/selftest.py",
         ]
     lines += [f"Bad: {reason}" for reason in document["reasons"]]

@@ -27,9 +27,10 @@ PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png"
 
 
 def run(options: IdentifyOptions) -> int:
-    """Identify, write and report; or only draft a mapping, design commands or check a mechanism.
+    """Identify the mechanism from logs, and write and print the result.
 
-    Return 1 if the model does not explain the rig, else 0.
+    With `--guess`, `--design` or `--check`, only draft a mapping, design rig commands or check a mechanism.
+    Return the exit code: 1 if the model does not explain the logs, else 0.
     """
     logs = [Path(log) for log in options.logs]
     if options.guess:
@@ -50,7 +51,7 @@ def run(options: IdentifyOptions) -> int:
     from tuning.identification.bootstrap import FITS_PER_CHUNK
     from tuning.identification.identify import STAGE_COUNT, IdentificationOptions, identify
 
-    pieces = open_checkpoints(options.output, options.resume)
+    checkpoints = open_checkpoints(options.output, options.resume)
     settings = IdentificationOptions(
         order=order,
         law=options.law,
@@ -61,7 +62,7 @@ def run(options: IdentifyOptions) -> int:
         limit=options.limit,
         seed=options.seed,
         scheduler=options.scheduler,
-        kept=pieces,
+        kept=checkpoints,
     )
     with terminal.show_stages(STAGE_COUNT + 2 + -(-options.bootstrap // FITS_PER_CHUNK)) as stages:
         stages.turn_to("reading the logs")
@@ -74,8 +75,8 @@ def run(options: IdentifyOptions) -> int:
             _write(result.mechanism, result.verdict, document, folder)
             stages.turn_to("drawing")
             _draw(result, document, folder)
-        pieces.remove()
-    warn_about_checkpoints(pieces)
+        checkpoints.remove()
+    warn_about_checkpoints(checkpoints)
     terminal.warn([*campaign.notes, *result.notes])
     if options.json:
         terminal.emit_json(document)
@@ -85,7 +86,7 @@ def run(options: IdentifyOptions) -> int:
 
 
 def _check_options(options: IdentifyOptions) -> None:
-    """Check the values and combinations of options. Raise `InputError`."""
+    """Raise `InputError` if an option's value, or a combination of options, is not allowed."""
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
@@ -95,14 +96,14 @@ def _check_options(options: IdentifyOptions) -> None:
     for name in ("scheduler", "resume"):
         if getattr(options, name) and not options.bootstrap:
             raise InputError(
-                f"--{name}: found no --bootstrap, expected beside one: its fits are what takes long"
+                f"--{name}: found no --bootstrap, expected --bootstrap, for whose fits --{name} is meant"
             )
 
 
 def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:
-    """Write the document and the mechanism file.
+    """Write the JSON document, then the mechanism file.
 
-    The document is first: with it, the next run recognises the mechanism file as its own.
+    The order matters: by the document, the next run recognises that the mechanism file is an earlier result.
     """
     from tuning.identification.mechanism_file import to_toml
 
@@ -114,9 +115,9 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
 
 
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
-    """Raise `InputError` if earlier results in the folder come from other logs.
+    """Raise `InputError` if the folder contains results of other logs, which would be overwritten.
 
-    Without a prior, the name of the mechanism does not identify the rig.
+    This check is needed without a prior, when all mechanisms have the same default name.
     """
     sources = earlier.get("sources")
     if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
@@ -124,13 +125,13 @@ def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) 
     log, others = next(iter(sources)), f" and {len(sources) - 1} more" if len(sources) > 1 else ""
     raise InputError(
         f"{to_one_line(str(path))}: found results of other logs ({format_value(log)}{others}), expected "
-        "those of the "
-        "same logs, or none: name another folder by --output, or the mechanism by --prior"
+        "results of the same logs or none: choose another folder by --output, or name the mechanism by "
+        "--prior"
     )
 
 
 def _print_draft_mapping(options: IdentifyOptions, logs: list[Path]) -> int:
-    """Print a draft of the mapping of the logs' columns; return 0."""
+    """Print a draft of the file that maps the logs' columns; return exit code 0."""
     from tuning.identification.logs.mapping_draft import draft_mapping
 
     text = draft_mapping(logs)
@@ -142,14 +143,19 @@ def _print_draft_mapping(options: IdentifyOptions, logs: list[Path]) -> int:
 
 
 def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
-    """Compare the logs with a mechanism, and print the result; return 1 if it does not explain them."""
+    """Compare the logs with a mechanism file, and print the result.
+
+    Return the exit code: 1 if the mechanism does not explain the logs, else 0.
+    """
     for name in ("order", "law", "fix", "bayes"):
         if getattr(options, name) != getattr(IdentifyOptions(), name):
-            raise InputError(f"--check: found --{name} beside it, expected none: nothing is estimated")
+            raise InputError(
+                f"--{name}: found together with --check, expected without it: --check estimates nothing"
+            )
     path = options.prior
     if path is None:
         if len(logs) < 2:
-            raise InputError("--check: found no mechanism, expected one after the logs, or --prior")
+            raise InputError("--check: found no mechanism, expected a mechanism after the logs, or --prior")
         path = str(logs.pop())
     mechanism = load(path).mechanism
     from tuning.identification.mechanism_check import check_against_mechanism
@@ -157,7 +163,7 @@ def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
     with terminal.show_stages(2) as stages:
         stages.turn_to("reading the logs")
         campaign = _select_stage(read_logs(logs, options.map, mechanism), options.stage)
-        stages.turn_to("setting them against the mechanism")
+        stages.turn_to("comparing the logs with the mechanism")
         result = check_against_mechanism(campaign, mechanism, options.limit)
     document = _build_document(options, campaign, mechanism, result)
     terminal.warn(campaign.notes)
@@ -166,13 +172,14 @@ def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
     else:
         runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
         terminal.emit(
-            _check_table(document, f"What {mechanism.name} leaves of runs: {runs}"), f"{document['reason']}."
+            _check_table(document, f"What {mechanism.name} does not explain in runs: {runs}"),
+            f"{document['reason']}.",
         )
     return 0 if result.good else 1
 
 
 def _draw(result, document: dict[str, Any], folder: Path) -> None:
-    """Draw the plots, and delete those of an earlier run that this run does not draw."""
+    """Write the plots, and delete plots of an earlier run for which this run has no data."""
     from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.identification import draw_identification
 
@@ -186,7 +193,20 @@ def _draw(result, document: dict[str, Any], folder: Path) -> None:
 
 
 def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) -> Campaign:
-    """Read log files into a campaign; `mapping` is the path of the file that maps their columns."""
+    """Read log files into a campaign.
+
+    Args:
+        logs: paths of the log files.
+        mapping: path of the TOML file with the meaning of the columns; None if the columns have the default
+            names.
+        prior: mechanism with values that the logs do not contain.
+
+    Returns:
+        The runs of all logs, with notes on unusable parts.
+
+    Raises:
+        InputError: If a log or the mapping cannot be read.
+    """
     from tuning.identification.logs.campaign import read_campaign
     from tuning.identification.logs.mapping import load_mapping
 
@@ -195,24 +215,26 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
     try:
         return read_campaign(logs, None, prior)
     except InputError as error:
-        raise InputError(f"{error} (--map says what columns mean; --guess drafts one)") from None
+        raise InputError(
+            f"{error} (state the meaning of the columns by --map; --guess drafts such a file)"
+        ) from None
 
 
 def _select_stage(campaign: Campaign, stage: str | None) -> Campaign:
-    """Return the campaign with only the runs of one kind and those at rest."""
+    """Return the campaign with only the runs of the kind `stage` and the runs at rest."""
     if stage is None:
         return campaign
     runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
     kinds = sorted({run.kind for run in campaign.runs} - {"rest"})
     if stage not in kinds:
         raise InputError(
-            f"--stage: found {format_value(stage)}, expected a kind that the logs have: {', '.join(kinds)}"
+            f"--stage: found {format_value(stage)}, expected a kind of run in the logs: {', '.join(kinds)}"
         )
     return replace(campaign, runs=runs)
 
 
 def _parse_order(options: IdentifyOptions) -> int | None:
-    """Return the order of the motion simulator, or None for 'auto'. Raise `InputError`."""
+    """Return the motion simulator's order, or None for 'auto'; raise `InputError` for other texts."""
     if options.order == "auto":
         return None
     if not options.order.isdecimal() or int(options.order) > MAX_ORDER:
@@ -221,7 +243,7 @@ def _parse_order(options: IdentifyOptions) -> int | None:
 
 
 def _parse_fixed_values(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the values that the user fixed, by key. Raise `InputError`."""
+    """Parse the options `--fix KEY=VALUE` to values by key; raise `InputError` for wrong texts."""
     fixed: dict[str, Any] = {}
     for text in options.fix:
         try:
@@ -229,7 +251,7 @@ def _parse_fixed_values(options: IdentifyOptions) -> dict[str, Any]:
         except KeyProblem as problem:
             raise InputError(f"--fix {to_one_line(text, 60)}: {problem}") from None
         if not _is_number_or_list(value):
-            allowed = "a number, or a list of them"
+            allowed = "a number or a list of numbers"
             raise InputError(
                 f"--fix {to_one_line(text, 60)}: found {format_value(value)}, expected {allowed}"
             )
@@ -238,7 +260,7 @@ def _parse_fixed_values(options: IdentifyOptions) -> dict[str, Any]:
 
 
 def _is_number_or_list(value: Any) -> bool:
-    """Return whether a value is a finite number or a non-empty list of them."""
+    """Return whether a value is a finite number or a non-empty list of finite numbers."""
     if isinstance(value, list):
         return bool(value) and all(map(_is_number_or_list, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
@@ -286,7 +308,7 @@ def _build_document(
 
 
 def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
-    """Return the JSON entry of an estimate, with the prior's value and the deviation from it in std."""
+    """Return the JSON entry of an estimate, with its deviation from the prior in standard deviations."""
     expected = _prior_value(prior, estimate.key)
     return {
         "key": estimate.key,
@@ -304,7 +326,7 @@ def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
 
 
 def _prior_value(prior: Mechanism | None, key: str) -> float | None:
-    """Return the prior's value of a key; the last entry of a list repeats."""
+    """Return the prior's value of a key, or None if there is none; the last entry of a list repeats."""
     if prior is None:
         return None
     path, _, index = key.rpartition(".")
@@ -318,15 +340,15 @@ def _prior_value(prior: Mechanism | None, key: str) -> float | None:
 
 
 def _print(document: dict[str, Any], folder: Path | None) -> None:
-    """Print the estimates, the checks and the verdict."""
+    """Print the estimates, the checks of the model and the verdict."""
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
     rows = [_estimate_row(entry) for entry in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
     items: list[Any] = [terminal.build_table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
-    items.append(_check_table(document, "What the model leaves"))
+    items.append(_check_table(document, "What the model does not explain"))
     items += [
-        f"{pair['one']} and {pair['other']} are hardly told apart (correlation {pair['correlation']:.3f}): "
-        f"{pair['experiment']} would."
+        f"The estimates of {pair['one']} and {pair['other']} are strongly correlated "
+        f"({pair['correlation']:.3f}): {pair['experiment']} would separate them."
         for pair in document["confounded"]
     ]
     wrote = (
@@ -338,7 +360,7 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
 
 
 def _check_table(document: dict[str, Any], title: str) -> Any:
-    """Return the table of checks."""
+    """Return the table of the model's checks, with the effect of each finding on e and e - e*."""
     rows = []
     for check in document["checks"]:
         finding = ", ".join(filter(None, (check["finding"], check["where"])))
@@ -351,7 +373,7 @@ def _check_table(document: dict[str, Any], title: str) -> Any:
 
 
 def _estimate_row(entry: dict[str, Any]) -> list[Any]:
-    """Return the table row of an estimate, with as many digits as its uncertainty supports."""
+    """Return the table row of an estimate; the uncertainty determines the number of digits."""
     digits = 4
     if entry["std"] and entry["value"]:
         digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 9)

@@ -1,4 +1,4 @@
-"""Command `jaxhil identify --design`: designs the rig commands that best identify a mechanism."""
+"""Command `jaxhil identify --design`: designs rig commands that best identify a mechanism."""
 
 from __future__ import annotations
 
@@ -28,10 +28,15 @@ COMPENSATOR = "response_error"
 
 
 def run(options: IdentifyOptions) -> int:
-    """Write the commands of both runs and the predicted uncertainty; return 0."""
+    """Write the rig commands of a free run and a press run, and the predicted uncertainty.
+
+    Return exit code 0.
+    """
     mechanisms = [*options.logs, *([options.prior] if options.prior is not None else [])]
     if len(mechanisms) != 1:
-        raise InputError(f"--design: found {len(mechanisms)} mechanisms, expected one, roughly known")
+        raise InputError(
+            f"--design: found {len(mechanisms)} mechanisms, expected one file with approximate values"
+        )
     if not 0.0 < options.stroke <= 1.0:
         raise InputError(f"--stroke: found {options.stroke:g} m, expected a number > 0 and <= 1 m")
     arguments.check_integers(0, seed=options.seed)
@@ -43,13 +48,13 @@ def run(options: IdentifyOptions) -> int:
         from jaxhil.simulation.gain_choice import choose_gains
         from tuning.identification.design.excitation import design_excitation, differentiate_error
 
-        stages.turn_to("looking for the motions that tell most")
+        stages.turn_to("optimising the rig commands")
         gains = choose_gains(mechanism, COMPENSATOR, None)[1]
         slopes_by = partial(differentiate_error, mechanism, COMPENSATOR, gains)
         result = design_excitation(mechanism, options.stroke, slopes_by, options.seed)
     sensors = mechanism.rig.position_sensor, mechanism.rig.force_sensor
     if not all(sensor.noise_std or sensor.quantum for sensor in sensors):
-        terminal.warn(["where the mechanism states no noise, 5 um and 0.5 N are assumed"])
+        terminal.warn(["for a sensor without noise in the mechanism file, 5 um or 0.5 N is assumed"])
     document = _build_document(options, mechanism.name, result)
     period = mechanism.rig.control_period
     for name, excitation in (("free", result.free), ("press", result.press)):
@@ -111,12 +116,12 @@ def _print(document: dict[str, Any], folder: Path) -> None:
         [entry[name] for name in ("key", "value", "std", "unit", "effect")] for entry in document["predicted"]
     ]
     headings = ["number", "value", "std", "unit", "effect on e"]
-    items: list[Any] = [terminal.build_table("What logs of both runs will tell", headings, rows, (0, 3))]
+    items: list[Any] = [terminal.build_table("Predicted uncertainty after both runs", headings, rows, (0, 3))]
     runs = document["runs"]
     items.append(
-        f"Together they leave {document['error']:.2g} of e, flat spectra within the same limits "
-        f"{document['flat']:.2g} times that; crest factors {runs['free']['crest_factor']:.2f} and "
-        f"{runs['press']['crest_factor']:.2f}."
+        f"The predicted uncertainty of e is {document['error']:.2g}; with flat spectra within the same "
+        f"limits it would be {document['flat']:.2g} times as large. The crest factors are "
+        f"{runs['free']['crest_factor']:.2f} and {runs['press']['crest_factor']:.2f}."
     )
     files = ", ".join(str(folder / name) for name in ("free.csv", "press.csv"))
     items.append(f"Wrote {files} and {folder / DOCUMENT_FILE}")

@@ -25,7 +25,7 @@ SUFFIX = ".toml"
 
 
 def run(options: InitOptions) -> int:
-    """Write the mechanism file, or list the names; return 0."""
+    """Write a mechanism file, or list the names of the built-in mechanisms; return exit code 0."""
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if options.list:
         if options.json:
@@ -36,7 +36,7 @@ def run(options: InitOptions) -> int:
     source, output = options.name or DEFAULT_MECHANISM, options.output
     if source.endswith(SUFFIX):  # the argument is the file, not a built-in name
         if output is not None:
-            raise InputError(f"--output: found {format_value(output)} beside a file, expected one of them")
+            raise InputError(f"--output: found {format_value(output)} and {source}, expected only one file")
         source, output = DEFAULT_MECHANISM, source
     builtin_path(source)  # raises InputError for a name that is not built in
     path = Path(output or f"mechanism{SUFFIX}")
@@ -48,24 +48,24 @@ def run(options: InitOptions) -> int:
         try:
             write_new(path, text.encode())
         except FileExistsError:
-            taken = "found something there, expected a name that is not taken: nothing is overwritten"
-            raise InputError(f"--output: {label}: {taken}") from None
+            problem = "found an existing file, expected a new name: no file is overwritten"
+            raise InputError(f"--output: {label}: {problem}") from None
     if options.json:
         terminal.emit_json({"file": str(path), "name": name, "from": source})
     else:
         law = " --compensator phase_lead" if source in six_axis_names() else ""
-        then = f"jaxhil tune {shlex.quote(label)}{law}"
-        terminal.emit(f"{label}: written, with the values of {source}. Change it, then: {then}")
+        next_command = f"jaxhil tune {shlex.quote(label)}{law}"
+        terminal.emit(f"{label}: written, with the values of {source}. Change it, then: {next_command}")
     return 0
 
 
 def _one_axis_text(source: str, name: str) -> str:
-    """Return the text of a built-in one-axis mechanism, with a comment for every key."""
+    """Return the file text of a built-in one-axis mechanism under a new name, with a comment for each key."""
     return format_mechanism_file(msgspec.structs.replace(load(source).mechanism, name=name))
 
 
 def _six_axis_text(source: str, name: str) -> str:
-    """Return the text of a built-in six-axis file, whose comments explain its keys, under a new name."""
+    """Return the file text of a built-in six-axis mechanism under a new name."""
     # A mechanism's name is printable, so its JSON string is also valid TOML.
     named = f"name = {json.dumps(name, ensure_ascii=False)}"
     return builtin_path(source).read_text(encoding="utf-8").replace(f'name = "{source}"', named, 1)

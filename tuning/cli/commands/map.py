@@ -17,7 +17,7 @@ from tuning.cli.options_report import Map
 
 
 def run(options: Map) -> int:
-    """Compute, write and report the map; return 0."""
+    """Compute a stability map, and write and print it; return exit code 0."""
     check_options(options)
     mechanism = load_named_mechanism(options)
     target = Path(options.output)
@@ -39,7 +39,7 @@ def run(options: Map) -> int:
 
 
 def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on the nominal point, its margins, and why theory is missing."""
+    """Yield sentences on the nominal point and its margins, and on the reason if theory does not apply."""
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
     if error is None:
@@ -65,11 +65,11 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
         yield f"No spectral radius: {document['spectral_radius']['none_because']}."
     else:
         radius, rate = growth["spectral_radius"], growth["per_second"]
-        text_of_rate = f"{'grows' if rate > 0 else 'decays'} by {abs(rate):.4g} per second"
-        text_of_rate += f" at {growth['frequency']:.3g} Hz"
+        rate_text = f"{'grows' if rate > 0 else 'decays'} by {abs(rate):.4g} per second"
+        rate_text += f" at {growth['frequency']:.3g} Hz"
         half = growth["per_half_oscillation"]
         factor = "" if half is None else f", by the factor {half:.4f} over half an oscillation"
-        yield f"A contact that lasts {text_of_rate}{factor} (spectral radius {radius:.6f} a control period)."
+        yield f"A contact that lasts {rate_text}{factor} (spectral radius {radius:.6f} a control period)."
         if growth["by_gain"]:
             slopes = ", ".join(f"{slope:+.3g} by {name}" for name, slope in growth["by_gain"].items())
             yield f"Derivative of the spectral radius, in SI units: {slopes}."
@@ -79,17 +79,17 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
                 for text in _describe_margins(document, margins)
             )
     if (reason := document["theory"]["none_because"]) is not None:
-        yield f"No closed form beside it: {reason}."
+        yield f"No closed form applies: {reason}."
 
 
 def _describe_bounds(document: Mapping[str, Any]) -> str:
-    """Return the bounds on real peak force and duration, in words."""
+    """Return the bounds on the real contact's peak force and duration as text."""
     force, *duration = document["bounds"].values()
     return f"{force:g} times the peak force and {duration[0]:g} to {duration[1]:g} times the duration"
 
 
 def _describe_margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the range of each key in which a condition holds."""
+    """Yield a text for each key of the map: the range of values around the nominal one within the limit."""
     for axis in "xy":
         margin, values = margins[axis], document[axis]["values"]
         ends = [

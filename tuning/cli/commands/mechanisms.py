@@ -1,4 +1,4 @@
-"""Command `jaxhil mechanisms`: lists the built-in mechanism files and suites, or prints the schema."""
+"""Command `jaxhil mechanisms`: lists the built-in mechanism files and suites, or prints their JSON Schema."""
 
 import math
 from typing import Any
@@ -21,7 +21,7 @@ from tuning.cli.options import MechanismsOptions
 
 
 def run(options: MechanismsOptions) -> int:
-    """Print the lists or the schema; return 0."""
+    """Print the lists of mechanisms, or the JSON Schema of mechanism files; return exit code 0."""
     if options.schema:
         terminal.emit_json(build_json_schema())
         return 0
@@ -97,7 +97,10 @@ def _six_axis_entry(name: str) -> dict[str, Any]:
 
 
 def _contact_frequencies(mechanism: Mechanism) -> list[float]:
-    """Return sqrt(k/M)/(2 pi) [Hz] for every distinct stiffness; an empty list for a power law."""
+    """Return the contact frequency sqrt(k/M)/(2 pi) [Hz] of each distinct stiffness k.
+
+    The list is empty for a contact law with an exponent, whose k is no stiffness in N/m.
+    """
     if find_contact_law(mechanism.contact.law).stiffness_unit != "N/m":
         return []
     stiffness: list[float] = []

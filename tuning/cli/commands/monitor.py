@@ -1,4 +1,4 @@
-"""Command `jaxhil monitor`: compares later contacts with the identified mechanism, one by one."""
+"""Command `jaxhil monitor`: compares each later contact with the identified mechanism."""
 
 from pathlib import Path
 from typing import Any
@@ -14,20 +14,20 @@ from tuning.identification.monitor.monitor import MonitorResult, monitor_contact
 
 SCHEMA = "jaxhil/monitor/1"
 NO_UNCERTAINTY_NOTE = (
-    "the mechanism file has no [uncertainty]: what is off by more than a clock or a scale may be is bad"
+    "the mechanism file has no [uncertainty]: every deviation beyond plausible clock and scale errors is bad"
 )
 
 
 def run(options: MonitorOptions) -> int:
-    """Compare the contacts of the logs with the mechanism, and print the result.
+    """Compare the contacts in the logs with the mechanism file, and print the result.
 
-    Return 1 if the rig changed by more than the file's uncertainty, else 0.
+    Return the exit code: 1 if the rig changed by more than the file's uncertainty, else 0.
     """
     loaded = load(options.mechanism)
     with terminal.show_stages(2) as stages:
         stages.turn_to("reading the logs")
         campaign = read_logs([Path(log) for log in options.logs], options.map, loaded.mechanism)
-        stages.turn_to("setting the contacts against the mechanism")
+        stages.turn_to("comparing the contacts with the mechanism")
         result = monitor_contacts(campaign, loaded.mechanism)
     content = {
         "schema": SCHEMA,
@@ -54,24 +54,24 @@ def run(options: MonitorOptions) -> int:
 
 
 def _count_from_one(number: int | None) -> int | None:
-    """Return an index as a number that counts from 1; None stays None."""
+    """Convert an index that counts from 0 to a number that counts from 1; None stays None."""
     return None if number is None else number + 1
 
 
 def _contact_entry(number: int, result: MonitorResult) -> dict[str, Any]:
-    """Return the JSON entry of one contact."""
+    """Return the JSON entry of contact `number`, counted from 0: log, state and metrics."""
     contact = result.contacts[number]
-    figures = {
+    metrics = {
         name: {"value": float(value), "predicted_std": float(std), "z": float(z)}
         for (name, _, _), value, std, z in zip(
             METRICS, contact.value, contact.predicted_std, contact.z, strict=True
         )
     }
-    return {"contact": number + 1, "log": contact.source, "state": contact.state, "figures": figures}
+    return {"contact": number + 1, "log": contact.source, "state": contact.state, "figures": metrics}
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the table of contacts and the verdict."""
+    """Print the table of contacts with their metrics, and the verdict."""
     headings = ["contact", *(_format_heading(name, unit) for name, unit, _ in METRICS)]
     rows = [
         [
@@ -81,22 +81,24 @@ def _print(document: dict[str, Any]) -> None:
         ]
         for contact in document["contacts"]
     ]
-    title = f"By {document['mechanism']}: 0 where the rig is that of the file"
+    title = f"Deviations from {document['mechanism']}: 0 if the rig matches the file"
     table = terminal.build_table(title, [*headings, "state"], rows, texts=(len(headings),))
     spread = ", ".join(
         f"{name} {terminal.format_number(scale * std, 2)}{'' if unit == '1' else f' {unit}'}"
         for name, unit, scale in METRICS
         if (std := document["contacts"][-1]["figures"][name]["predicted_std"]) is not None
     )
-    terminal.emit(table, f"Predicted to scatter in the last contact by: {spread}.", f"{document['reason']}.")
+    terminal.emit(
+        table, f"Predicted standard deviations in the last contact: {spread}.", f"{document['reason']}."
+    )
 
 
 def _format_heading(name: str, unit: str) -> str:
-    """Return a column's heading on three lines, so that all columns fit."""
+    """Return a column heading on three lines, so that the table is narrow enough for a terminal."""
     first, _, last = name.rpartition(" ")
     return "\n".join([first, last, "" if unit == "1" else f"[{unit}]"])
 
 
 def _format_scaled(value: float | None, scale: float) -> str:
-    """Return a scaled value as text, or a dash for None."""
+    """Return `scale * value` as text with its sign, or a dash if the value is None."""
     return "-" if value is None else f"{scale * value:+.2g}"

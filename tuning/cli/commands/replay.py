@@ -1,4 +1,4 @@
-"""Command `jaxhil replay`: runs one scenario of a sweep again and compares it bit by bit."""
+"""Command `jaxhil replay`: runs one scenario of a sweep again, and compares its numbers bit by bit."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options import ReplayOptions
 
+# Metrics of a contact in the document.
 CONTACT_KEYS = (
     "restitution",
     "reference_restitution",
@@ -17,13 +18,20 @@ CONTACT_KEYS = (
     "peak_force",
     "reference_peak_force",
     "peak_command",
+    "duration",
+    "reference_duration",
+    "position_shortfall",
+    "approach_velocity",
+    "energy_in",
+    "energy_out",
 )
-CONTACT_KEYS = (*CONTACT_KEYS, "duration", "reference_duration", "position_shortfall", "approach_velocity")
-CONTACT_KEYS = (*CONTACT_KEYS, "energy_in", "energy_out")
 
 
 def run(options: ReplayOptions) -> int:
-    """Run the scenario and print its contacts; return 0 if all numbers equal the stored ones, else 1."""
+    """Run the scenario again, and print its contacts.
+
+    Return the exit code: 0 if all numbers equal the stored ones, else 1.
+    """
     arguments.check_integers(0, index=options.index)
     if options.plot is not None:
         checks.check_plot(options.plot)
@@ -51,7 +59,7 @@ def run(options: ReplayOptions) -> int:
 
 
 def _build_document(options: ReplayOptions, store, result) -> dict[str, Any]:
-    """Return the JSON document of the replayed scenario."""
+    """Return the JSON document of the replayed scenario: inputs, contacts and differences."""
     from tuning.sweeps.columns import (
         EPISODE_METRICS,
         SIX_AXIS_ERRORS,
@@ -87,7 +95,7 @@ def _build_document(options: ReplayOptions, store, result) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print inputs, contacts and the verdict."""
+    """Print the scenario's inputs and contacts, and the verdict."""
     inputs = terminal.build_table(
         f"{document['mechanism']}, compensation: {document['compensator']}, scenario {document['index']}",
         ["input", "drawn"],
@@ -98,12 +106,12 @@ def _print(document: dict[str, Any]) -> None:
         lines.append("Good: every number is the stored one, to the bit.")
     else:
         lines.append(f"Bad: differs from what is stored in {', '.join(document['different'][:8])}.")
-    lines += [f"The store was made elsewhere: {difference}." for difference in document["unlike"]]
+    lines += [f"The sweep was computed differently: {difference}." for difference in document["unlike"]]
     terminal.emit(inputs, _contact_table(document), *lines)
 
 
 def _contact_table(document: dict[str, Any]) -> Any:
-    """Return the table of contacts (one axis) or episodes (six axes)."""
+    """Return the table of the scenario's contacts (one axis) or episodes (six axes)."""
     if "contacts" in document:
         kind, runs, errors = "contact", document["contacts"], ["error"]
         cells = [[terminal.format_error(run["error"])] for run in runs]

@@ -1,4 +1,4 @@
-"""Command `jaxhil report`: writes one page from the results of the other commands."""
+"""Command `jaxhil report`: writes one HTML page with the results of the other commands."""
 
 from pathlib import Path
 
@@ -13,9 +13,9 @@ PAGE_SUFFIXES = (".html", ".htm")
 
 
 def run(options: ReportOptions) -> int:
-    """Write the page; return 1 if its verdict is bad, else 0."""
+    """Write the page, and print its requirements; return exit code 1 if its verdict is bad, else 0."""
     if not options.results:
-        raise InputError("RESULT: found nothing, expected what jaxhil identify, tune, sweep, ... wrote")
+        raise InputError("RESULT: found none, expected results of jaxhil identify, tune, sweep, ...")
     target = Path(options.output)
     if target.suffix.lower() not in PAGE_SUFFIXES:
         allowed = f"a name that ends in {', '.join(PAGE_SUFFIXES)}"
@@ -32,8 +32,8 @@ def run(options: ReportOptions) -> int:
         )
     else:
         rows = [tuple(requirement.values()) for requirement in page.requirements]
-        heads = ["judged", "required", "result", "margin", "verdict"]
-        tables = [terminal.build_table("Requirements", heads, rows, texts=range(5))] if rows else []
+        headings = ["quantity", "required", "result", "margin", "verdict"]
+        tables = [terminal.build_table("Requirements", headings, rows, texts=range(5))] if rows else []
         terminal.emit(*tables, f"Verdict: {page.verdict}.")
         terminal.emit_line(f"Wrote {to_one_line(str(target))}, {len(page.html) / 1e6:.2g} MB")
     return 1 if page.verdict == "bad" else 0

@@ -12,14 +12,17 @@ from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
 
-MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop
-EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop over the run's duration
-MAX_TICKS = 2_000_000
+MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the loop without control law
+EMPTY_LOOP_SHARE = 0.2  # duration of the loop without control law, divided by the run's duration
+MAX_TICKS = 2_000_000  # ticks of a run, all of which are recorded in memory
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
 def run(options: RigOptions) -> int:
-    """Run an empty loop, then the controller; return 0 if all is good, 1 if not, 130 if interrupted."""
+    """Run a loop without control law for comparison, then the controller, and print the result.
+
+    Return exit code 0 if the verdict is good, else 1. Raise KeyboardInterrupt after an interruption.
+    """
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)
     _check_injection(options)
@@ -42,7 +45,10 @@ def run(options: RigOptions) -> int:
             pass
     except OSError as error:
         reason = to_one_line(error.strerror or str(error), 100)
-        raise InputError(f"--realtime: found no such priority ({reason}), expected without it") from None
+        raise InputError(
+            f"--realtime: found no permission for real-time priority ({reason}), expected permission: run "
+            "without --realtime"
+        ) from None
 
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
         scratch = Path(temporary)
@@ -58,7 +64,7 @@ def run(options: RigOptions) -> int:
             priority=options.realtime,
         )
         session = run_session(setup, scratch, terminal.note, _LoopProgress(period).tell)
-    # jax is first imported here, so that it does not disturb the loop.
+    # The next function imports jax, which must not disturb the real-time loop.
     references = ideal_restitutions(mechanism, session.contacts)
     result = evaluate_session(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
@@ -78,17 +84,17 @@ def run(options: RigOptions) -> int:
 
 
 def check_bundle_code(folder: Path, compensator: str) -> None:
-    """Raise `InputError` if the folder is a bundle that is damaged or has other code than this version."""
+    """Raise `InputError` if the folder is a bundle that is damaged or contains code of another version."""
     from tuning.bundle.checking import find_code_differences
     from tuning.bundle.manifest import is_bundle
 
     reasons = find_code_differences(folder, compensator) if is_bundle(folder) else []
     if reasons:
-        raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}; jaxhil verify says more")
+        raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
 
 
 def write_controller_files(compensator: str, scratch: Path) -> Path:
-    """Write the files of the controller's process, as in a bundle, to `scratch`, and return it."""
+    """Write the code of the controller's process, as in a bundle, to `scratch`; return this folder."""
     from tuning.bundle.content import code_files
 
     for name, content in code_files(compensator).items():
@@ -97,7 +103,10 @@ def write_controller_files(compensator: str, scratch: Path) -> Path:
 
 
 def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any]:
-    """Return the gain file's document and mechanism, checked like on the rig. Raise `InputError`."""
+    """Return the document and the mechanism of a gain file, after the checks that the rig's runtime makes.
+
+    Raise `InputError` if a check fails.
+    """
     from jaxhil.mechanism.file import from_plain_data
     from jaxhil.rig import GainFileError
     from jaxhil.rig.gain_file import check_gain_document, read_gain_document
@@ -120,13 +129,13 @@ def read_command_limits(document: dict[str, Any]) -> tuple[float, float]:
 
 
 class _LoopProgress:
-    """Progress of the loop on standard error; short texts, because the loop itself writes them."""
+    """Progress display of the real-time loop; the texts are short, because the loop itself writes them."""
 
     def __init__(self, period: float) -> None:
         self._period, self._terminal = period, sys.stderr.isatty()
 
     def tell(self, done: int, total: int) -> None:
-        """Report that `done` of `total` ticks are finished."""
+        """Write the elapsed and the total time to standard error, from the ticks `done` and `total`."""
         seconds = round(done * self._period)
         if self._terminal:
             sys.stderr.write(f"\r{seconds} of {total * self._period:.0f} s \r")
@@ -137,7 +146,7 @@ class _LoopProgress:
 
 
 def _check_injection(options: RigOptions) -> None:
-    """Check the probabilities and delays of the injected faults. Raise `InputError`."""
+    """Raise `InputError` if a probability or delay of the injected faults is not allowed."""
     if not 0.0 <= options.drops < 1.0:
         raise InputError(f"--drops: found {options.drops:g}, expected a probability >= 0 and < 1")
     for name in ("jitter", "delay"):
@@ -147,14 +156,14 @@ def _check_injection(options: RigOptions) -> None:
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the tables and remarks."""
+    """Print the tables of ticks, times and contacts, and the remarks with the verdict."""
     loops = {"empty loop": document["empty_loop"], "controller": document["run"]}
-    reached = {name: loop for name, loop in loops.items() if loop is not None}
-    terminal.emit(*_build_tables(document, reached), *_session_remarks(document, reached))
+    recorded = {name: loop for name, loop in loops.items() if loop is not None}
+    terminal.emit(*_build_tables(document, recorded), *_session_remarks(document, recorded))
 
 
-def _build_tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any]:
-    """Return the tables of ticks, times and contacts."""
+def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
+    """Return the tables of missed ticks, computing times and contacts, for each loop that was run."""
     rate = f"{1 / document['control_period']:g} Hz over UDP"
     ticks = terminal.build_table(
         f"{document['mechanism']}, {document['compensator']}, {rate}: ticks",
@@ -167,16 +176,16 @@ def _build_tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any
                     for key in ("ticks", "missed", *(f"missed_by_{cause}" for cause in _MISS_CAUSES))
                 ),
             )
-            for name, loop in reached.items()
+            for name, loop in loops.items()
         ],
     )
     times = terminal.build_table(
         "Times [µs]: median, 99.9th percentile, maximum",
         ["", "loop", "median", "99.9 %", "maximum"],
         [
-            (words, name, *(f"{1e6 * value:.1f}" for value in loop[key].values()))
-            for key, words in _TIME_LABELS.items()
-            for name, loop in reached.items()
+            (label, name, *(f"{1e6 * value:.1f}" for value in loop[key].values()))
+            for key, label in _TIME_LABELS.items()
+            for name, loop in loops.items()
         ],
         texts=(0, 1),
     )
@@ -196,8 +205,8 @@ def _build_tables(document: dict[str, Any], reached: dict[str, Any]) -> list[Any
     return [ticks, times, *([contacts] if rows else [])]
 
 
-def _session_remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[str]:
-    """Return the sentences below the tables; the last ones are the verdict."""
+def _session_remarks(document: dict[str, Any], loops: dict[str, Any]) -> list[str]:
+    """Return the sentences below the tables; the last sentences state the verdict and its reasons."""
     lines = []
     if len(document["contacts"]) > MAX_TABLE_ROWS:
         lines.append(f"... and {len(document['contacts']) - MAX_TABLE_ROWS} more contacts.")
@@ -206,7 +215,7 @@ def _session_remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[
     lines += [
         f"{loop['replayed']} ticks of the controller took more than their share of CPU time, and at most "
         f"{1e6 * loop['replayed_most']:.0f} µs when the same packets were gone through again."
-        for loop in reached.values()
+        for loop in loops.values()
         if loop["replayed"]
     ]
     if document["stalled"]:
@@ -218,17 +227,17 @@ def _session_remarks(document: dict[str, Any], reached: dict[str, Any]) -> list[
         lines.append(f"{len(document['resets'])} times the controller tripped over that, and was reset.")
     lines += [
         f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
-        for name, loop in reached.items()
+        for name, loop in loops.items()
         if loop["stood_still"] > 0
     ]
     flags = document["run"]["controller"]["doubts"] if document["run"] is not None else {}
     if flags:
         counts = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in flags.items())
-        lines.append(f"Of {sum(flags.values())} contacts the law says that it did not know them: {counts}.")
+        lines.append(f"The compensator reports quality flags for {sum(flags.values())} contacts: {counts}.")
     if document["tripped"]:
         lines.append(f"The controller {document['tripped']}.")
     if document["interrupted"]:
-        lines.append("Interrupted: this is what was measured.")
+        lines.append("Interrupted: the results are those of the time before the interruption.")
     return lines + ([f"Bad: {reason}" for reason in document["reasons"]] or [f"Good: {document['good']}"])
 
 

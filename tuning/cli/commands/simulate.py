@@ -16,12 +16,15 @@ from tuning.cli.options import SimulateOptions
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
-# Estimates of a compensator: the column's heading and decimals; values are shown times 1000.
+# Estimates of a compensator, with heading and decimals of the column, which shows 1000 times the SI value.
 ESTIMATE_COLUMNS = {"force_delay": ("force delay [ms]", 2)}
 
 
 def run(options: SimulateOptions) -> int:
-    """Run the contacts and report each; return 0 if `Run.reasons` is empty, else 1."""
+    """Simulate the contacts, and print a table of contacts and the verdict.
+
+    Return the exit code: 0 if the verdict is good, that is, if `Run.reasons` is empty, else 1.
+    """
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)
     if options.plot is not None:
@@ -37,11 +40,11 @@ def run(options: SimulateOptions) -> int:
         prepare_jax()
         return simulate_six.run(options, mechanism)
     if options.animate is not None:
-        allowed = "none: there is an animation of six axes only"
+        allowed = "no animation of a one-axis mechanism"
         raise InputError(f"--animate: found {format_value(options.animate)}, expected {allowed}")
     if options.reference:
-        allowed = "a mechanism of six axes: of one axis the table has e* beside e"
-        raise InputError(f"--reference: found one axis, expected {allowed}")
+        allowed = "a six-axis mechanism: for one axis, the table always contains e*"
+        raise InputError(f"--reference: found a one-axis mechanism, expected {allowed}")
     prepare_jax()
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS
     from jaxhil.simulation.run import simulate
@@ -96,17 +99,17 @@ def _explain_status(status: str) -> str | None:
 
 
 def _contact_entry(contact: "ContactResult") -> dict[str, Any]:
-    """Return the JSON entry of a contact, without the estimates that its compensator does not make."""
+    """Return the JSON entry of a contact, without estimates that the compensator does not compute."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
 
 
 def _print(
     options: SimulateOptions, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]
 ) -> None:
-    """Print the table of contacts and the verdict."""
+    """Print the table of contacts, and the verdict with its reasons."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
 
-    # Contacts that were not reached are counted below the table.
+    # A line below the table states the number of contacts that were not reached.
     contacts = [contact for contact in contacts if contact["status"] != "not reached"]
     estimates = [name for name in ESTIMATE_COLUMNS if any(name in contact for contact in contacts)]
     rows = [
@@ -131,10 +134,10 @@ def _print(
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     title += f", {rule}" if result.compensator != "none" else ""
-    number_wanted = len(result.contacts)
+    total = len(result.contacts)
     lines = []
-    if len(contacts) < number_wanted:
-        lines.append(f"{number_wanted - len(contacts)} of {number_wanted} contacts were not reached.")
+    if len(contacts) < total:
+        lines.append(f"{total - len(contacts)} of {total} contacts were not reached.")
     if reasons:
         lines += [f"Bad: {reason}." for reason in reasons]
     else:

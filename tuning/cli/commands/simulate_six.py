@@ -18,23 +18,23 @@ GOOD_STATUSES = ("rebounded", "captured")  # statuses of a run that ended well
 
 
 def check_six_axis_options(options: SimulateOptions) -> None:
-    """Raise `InputError` for options that six axes do not support."""
+    """Raise `InputError` if an option is set that a six-axis simulation does not support."""
     if options.setting is not None:
         found = f"--setting: found {format_value(options.setting)}"
-        raise InputError(f"{found}, expected none: in six axes there is none so far")
+        raise InputError(f"{found}, expected none: compensators have no settings for six axes")
     if options.reference:
         for key in ("compensator", "gains", "plot", "animate", "log"):
             value = getattr(options, key)
             if value is not None:
                 raise InputError(
-                    f"--{key}: found {format_value(str(value))}, expected none beside --reference"
+                    f"--{key}: found {format_value(str(value))}, expected none together with --reference"
                 )
     if options.animate is not None:
         _check_animation_path(options.animate)
 
 
 def _check_animation_path(path: str) -> None:
-    """Check that an animation can be written to `path`. Raise `InputError`."""
+    """Raise `InputError` if an animation cannot be written to `path`; create its parent folders."""
     suffix = Path(path).suffix.lower()
     if suffix not in ANIMATION_SUFFIXES:
         raise InputError(
@@ -43,13 +43,17 @@ def _check_animation_path(path: str) -> None:
         )
     if suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise InputError(
-            f"--animate: found {format_value(path)}, expected .gif: there is no ffmpeg, which makes .mp4"
+            f"--animate: found {format_value(path)}, expected .gif: .mp4 needs ffmpeg, which is not installed"
         )
     checks.check_file_path(path)
 
 
 def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
-    """Run the episodes and report each; return 0 if both errors are within the limit, else 1."""
+    """Simulate the episodes of contact, and print a table of episodes and the verdict.
+
+    Return the exit code: 0 if energy and twist errors are within the limit, and real peak force and time in
+    contact within their bounds, else 1.
+    """
     if options.reference:
         return _run_ideal_contact(options, mechanism)
     from jaxhil.sixdof.run import simulate_six_axes
@@ -71,7 +75,10 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
 
 
 def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
-    """Simulate and report the ideal contact without a rig; return 0 if anything touches, else 1."""
+    """Simulate the ideal contact without a rig, and print its metrics.
+
+    Return the exit code: 1 if the bodies do not touch, else 0.
+    """
     from jaxhil.sixdof.alone import simulate_in_space
 
     result = simulate_in_space(mechanism)
@@ -100,12 +107,12 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
 
 
 def _worst_error(episode: "Episode") -> float:
-    """Return the larger of an episode's energy and twist errors."""
+    """Return the larger of an episode's |energy error| and twist error [1]."""
     return max(abs(episode.energy_error), episode.twist_error)
 
 
 def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
-    """Return for every episode whether the real contact is unlike the ideal one."""
+    """Return for each episode whether real peak force or duration is out of bounds of the ideal contact's."""
     from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 
     period = result.mechanism.rig.control_period
@@ -122,7 +129,7 @@ def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
 
 
 def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
-    """Write the plot, the animation and the log that the options request."""
+    """Write those of plot, animation and log that the options request."""
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     if options.plot is not None:
         from jaxhil.files import report_write_errors, resolve_output_path
@@ -145,7 +152,7 @@ def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
 
 
 def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) -> dict[str, Any]:
-    """Return the JSON document of the run."""
+    """Return the JSON document of a six-axis run: episodes, final states and verdict."""
     return {
         "mechanism": result.mechanism.name,
         "axes": 6,
@@ -162,7 +169,7 @@ def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) 
 
 
 def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
-    """Print the table of episodes and the verdict."""
+    """Print the table of episodes, the parts of the twist errors, and the verdict."""
     rows = [
         [
             number,
@@ -192,7 +199,7 @@ def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
 
 
 def _describe_twist_error(number: int, episode: "Episode") -> str:
-    """Return a sentence with the parts of an episode's twist error and the ideal contact's values."""
+    """Return a sentence with the parts of an episode's twist error and the metrics of the ideal contact."""
     parts = f"normal {episode.normal_part:+.3f}, lateral {episode.lateral_part:.3f}"
     parts += f", rotational {episode.rotational_part:.3f}"
     space = f"{episode.reference_peak_force:.4g} N, {episode.reference_peak_moment:.3g} N m"
@@ -202,7 +209,7 @@ def _describe_twist_error(number: int, episode: "Episode") -> str:
 
 
 def _verdict(options: SimulateOptions, result: "SixAxisRun", good: bool) -> str:
-    """Return the verdict and its reason."""
+    """Return the verdict on a six-axis run and its reason as a sentence."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT, CONTACT_BOUNDS_TEXT
 
     if result.status == "miss":

@@ -1,4 +1,4 @@
-"""Command `jaxhil sweep`: failure probability with its interval, and the worst of many scenarios."""
+"""Command `jaxhil sweep`: estimates the failure probability from many scenarios, and lists the worst ones."""
 
 from pathlib import Path
 
@@ -11,7 +11,11 @@ from tuning.cli.options import Sweep
 
 
 def run(options: Sweep) -> int:
-    """Run the scenarios that the store lacks, and report all; return 0 if the verdict is good, else 1."""
+    """Compute the scenarios that are not stored yet, and print the results of all scenarios.
+
+    Return the exit code: 0 if the verdict is good, else 1. If a result could not be written, raise
+    `InputError` after printing.
+    """
     options.check()
     path = find_gain_file(options.gains)
     prepare_jax()

@@ -1,4 +1,4 @@
-"""Tables and lines that `jaxhil sweep` prints from its document."""
+"""Tables and sentences that `jaxhil sweep` prints from its JSON document."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from tuning import terminal
 
 
 def print_sweep(document: dict[str, Any]) -> None:
-    """Print the tables and the verdict on standard output."""
+    """Print a sweep's tables and its verdict on standard output."""
     terminal.emit(*_build_tables(document), *_summary_lines(document))
 
 
@@ -20,7 +20,7 @@ def _build_tables(document: dict[str, Any]) -> list[Any]:
         ["outcome", "scenarios", "share"],
         [(name, count, count / number) for name, count in document["outcomes"].items()],
     )
-    # The inputs are too many for one table; `replay` prints them.
+    # The inputs do not fit into the table; `jaxhil replay` prints those of one scenario.
     worst = terminal.build_table(
         "Worst scenarios",
         ["index", "outcome", "error", "episode" if document["axes"] == 6 else "contact"],
@@ -45,7 +45,7 @@ def _build_tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _summary_lines(document: dict[str, Any]) -> list[str]:
-    """Return the sentences below the tables; the last ones are the verdict and the paths."""
+    """Return the sentences below the tables; the last sentences state the verdict and the files written."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
     from jaxhil.simulation.metrics import CONTACT_STATUS_REASONS
     from tuning.sweeps.columns import UNLIKE_IDEAL, UNLIKE_IDEAL_MEANING
@@ -68,7 +68,7 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
     ]
     if left_out := document["left_out_of_replicates"]:
         lines.append(
-            f"The last {left_out} scenarios, in no whole replicate, are in neither probability nor quantiles."
+            f"The last {left_out} scenarios do not fill a replicate; probability and quantiles exclude them."
         )
     if document.get("rare", {}).get("spread_beyond_formula"):
         lines.append(
@@ -109,9 +109,9 @@ def _quantile_table(document: dict[str, Any], symbol: str):
 
 
 def _sobol_index_table(drivers: dict[str, Any], symbol: str):
-    """Return the table of Sobol indices."""
+    """Return the table of each input's first-order and total Sobol indices, with confidence intervals."""
     return terminal.build_table(
-        f"What drives the worst {symbol}, errors cut at {drivers['cap']:g} ({drivers['capped']} of "
+        f"Sobol indices of the worst {symbol}, errors clipped at {drivers['cap']:g} ({drivers['capped']} of "
         f"{drivers['evaluations']} runs): shares of the variance",
         ["input", "first order", "95 % from", "to", "total", "95 % from", "to"],
         [
@@ -122,7 +122,7 @@ def _sobol_index_table(drivers: dict[str, Any], symbol: str):
 
 
 def _subset_simulation_table(rare: dict[str, Any]):
-    """Return the table of the subset simulation."""
+    """Return the table with the failure probability from subset simulation."""
     return terminal.build_table(
         "Subset simulation",
         [
@@ -146,7 +146,7 @@ def _subset_simulation_table(rare: dict[str, Any]):
 
 
 def _describe_interval_width(document: dict[str, Any]) -> list[str]:
-    """Return a sentence on the width of the interval if `--until-width` was given."""
+    """Return a list with a sentence on the interval's width, or an empty list without `--until-width`."""
     width = document["until_width"]
     if width is None:
         return []
@@ -154,16 +154,17 @@ def _describe_interval_width(document: dict[str, Any]) -> list[str]:
     reached = probability["high"] - probability["low"]
     if reached <= width:
         return [
-            f"Stopped after {document['scenarios']} of at most {most}: {reached:.3g} wide, {width:g} wanted."
+            f"Stopped after {document['scenarios']} of at most {most} scenarios: the interval's width is "
+            f"{reached:.3g}, requested {width:g}."
         ]
-    return [f"Not as narrow as wanted after all {most} scenarios: {reached:.3g} wide, {width:g} wanted."]
+    return [f"After all {most} scenarios, the interval's width is {reached:.3g}, requested {width:g}."]
 
 
-def _format_error(value: float, endless: str = "no result") -> str:
-    """Return an error as text, or `endless` for infinity."""
-    return endless if value == float("inf") else f"{value:.4g}"
+def _format_error(value: float, infinite: str = "no result") -> str:
+    """Return an error as text, or the text `infinite` if the error is infinite."""
+    return infinite if value == float("inf") else f"{value:.4g}"
 
 
 def _format_share(value: float) -> str:
-    """Return a share in percent as text, or a dash for infinity."""
+    """Return a ratio as text in percent, or a dash if the ratio is infinite."""
     return "-" if value == float("inf") else f"{100 * value:.3g} %"

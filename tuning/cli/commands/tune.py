@@ -1,4 +1,4 @@
-"""Command `jaxhil tune`: tunes gains for every mechanism file and evaluates them on fresh scenarios."""
+"""Command `jaxhil tune`: tunes gains for each mechanism file, and evaluates them on fresh scenarios."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,36 +25,37 @@ if TYPE_CHECKING:
 
 PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW_FILE = "overview.png"
-MAX_PLOTTED_MECHANISMS = 4  # largest number of mechanisms with plots each; more mechanisms share one plot
+MAX_PLOTTED_MECHANISMS = 4  # up to this number, each mechanism has its own plots; more share an overview plot
 
 
 def run(options: Tune) -> int:
     """Tune the mechanisms of all files, and return the exit code.
 
-    The results of a mechanism are written as soon as it is finished. With `--resume`, finished work is not
-    repeated.
+    The results of a mechanism are written as soon as its tuning is finished. With `--resume`, finished work
+    is not repeated. The exit code is 0 if all verdicts are good, 1 if a verdict is bad, 2 if a file is
+    unusable, and 130 after an interruption.
     """
     if options.pareto:
         prepare_jax()
     options.check()
     if options.start or options.setting is not None:
-        # Errors in these options are reported before errors in the files.
+        # Errors in these options are reported before errors in the mechanism files.
         prepare_jax()
         options.settings()
-        options.known()
+        options.load_start_gains()
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
-        # This is checked before jax starts, so that no tuning is lost if the folder cannot be written.
+        # The folder is checked before the tuning, whose results would be lost if it could not be written.
         _check_output(Path(options.output), [entry.mechanism for entry in loaded])
         loaded = _check_mechanisms(options, loaded, problems)
     if loaded:
-        pieces = open_checkpoints(options.output, options.resume)
+        checkpoints = open_checkpoints(options.output, options.resume)
         try:
-            entries = _tune_all(options, loaded, problems, pieces)
-        except _TuningInterrupted as stop:
-            entries, interrupted = stop.entries, True
-        warn_about_checkpoints(pieces)
+            entries = _tune_all(options, loaded, problems, checkpoints)
+        except _TuningInterrupted as interruption:
+            entries, interrupted = interruption.entries, True
+        warn_about_checkpoints(checkpoints)
     if options.json:
         terminal.emit_json(
             {
@@ -67,13 +68,13 @@ def run(options: Tune) -> int:
             }
         )
     if interrupted:
-        finished = f"{len(entries)} of {len(loaded)} mechanisms finished and kept"
-        terminal.note(f"jaxhil: interrupted, {finished}; the same with --resume goes on")
+        finished = f"{len(entries)} of {len(loaded)} mechanisms finished and saved"
+        terminal.note(f"jaxhil: interrupted, {finished}; to continue, repeat the command with --resume")
         return 130
     if problems:
         if entries:
-            # The problems are repeated, because the first notes have scrolled away.
-            terminal.note(f"jaxhil: {len(problems)} could not be done:")
+            # The problems are printed again, because the first notes are far above.
+            terminal.note(f"jaxhil: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}:")
             for problem in problems:
                 terminal.note(f"jaxhil: {problem}")
         return 2
@@ -81,9 +82,9 @@ def run(options: Tune) -> int:
 
 
 def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
-    """Raise `InputError` if the output folder holds files that are not results for these mechanisms.
+    """Raise `InputError` if files would be overwritten that are not results for these mechanisms.
 
-    Warn if only the name of a mechanism is the same.
+    Print a warning if the earlier results are for a different mechanism with the same name.
     """
     checks.prepare_output_folder(output)
     for mechanism in mechanisms:
@@ -92,32 +93,32 @@ def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
         if earlier and earlier.get("mechanism") != to_plain_data(mechanism):
             name = format_value(mechanism.name)
             terminal.warn(
-                [f"{to_one_line(str(path))}: replaced: it is of another mechanism of the name {name}"]
+                [f"{to_one_line(str(path))}: replaced; it was for a different mechanism with the name {name}"]
             )
     if len(mechanisms) > MAX_PLOTTED_MECHANISMS and not any(output.glob("*/gains.json")):
         checks.check_earlier_results(output / "gains.json", "compensator", [OVERVIEW_FILE])
 
 
 class _TuningInterrupted(Exception):
-    """Error that carries the entries of the mechanisms that were finished before an interruption."""
+    """Exception for an interrupted tuning, with the JSON entries of the finished mechanisms."""
 
     def __init__(self, entries: list[dict[str, Any]]):
         self.entries = entries
 
 
 def _load(options: Tune) -> tuple[list[LoadedAnyMechanism], list[str]]:
-    """Load the mechanism files, and return the usable ones and the problems with the others."""
+    """Load the mechanism files; return the usable mechanisms, and a message for each unusable file."""
     loaded, problems, folders = [], [], {}
     for file in _expand_folders(options.files, problems):
         try:
             entry = load_any(file, options.overrides, options.unset)
-            options.fits(entry.mechanism)
+            options.check_mechanism(entry.mechanism)
             folder = make_folder_name(entry.mechanism.name)
             if (first_label := folders.get(folder.casefold())) is not None:
                 raise InputError(
-                    f"{entry.label}: name: found {format_value(entry.mechanism.name)}, expected a name "
-                    "whose folder, "
-                    f"{to_one_line(folder)}, differs by more than capitals from that of {first_label}"
+                    f"{entry.label}: name: found {format_value(entry.mechanism.name)}, whose results would "
+                    f"be in the folder {to_one_line(folder)}, expected a name with another folder than that "
+                    f"of {first_label} (capitals do not count)"
                 )
             folders[folder.casefold()] = entry.label
             loaded.append(entry)
@@ -131,7 +132,10 @@ def _load(options: Tune) -> tuple[list[LoadedAnyMechanism], list[str]]:
 def _check_mechanisms(
     options: Tune, loaded: list[LoadedAnyMechanism], problems: list[str]
 ) -> list[LoadedAnyMechanism]:
-    """Return the mechanisms that can be simulated, and print a summary of each; report the others."""
+    """Return the mechanisms that can be simulated, and print their summaries.
+
+    For each of the others, add a message to `problems` and print it.
+    """
     prepare_jax()
     options.settings()
     usable = []
@@ -148,7 +152,10 @@ def _check_mechanisms(
 
 
 def _expand_folders(files: tuple[str, ...], problems: list[str]) -> list[str | None]:
-    """Return every file, a folder replaced by its .toml files; [None] for the default mechanism."""
+    """Return the files, with each folder replaced by its .toml files; [None] if `files` is empty.
+
+    For a folder without .toml files, add a message to `problems` and print it.
+    """
     expanded: list[str | None] = []
     for file in files:
         if not Path(file).is_dir():
@@ -168,9 +175,12 @@ def _tune_all(
     options: Tune,
     loaded: list[LoadedAnyMechanism],
     problems: list[str],
-    pieces: "Checkpoints",
+    checkpoints: "Checkpoints",
 ) -> list[dict[str, Any]]:
-    """Tune all mechanisms, write and print the results, and return their entries in order."""
+    """Tune all mechanisms, write and print the results, and return the JSON entries of the mechanisms.
+
+    Raise `_TuningInterrupted` after an interruption.
+    """
     prepare_jax()
     entries, done, fronts = {}, {}, {}
     drawn = len(loaded) <= MAX_PLOTTED_MECHANISMS
@@ -180,7 +190,7 @@ def _tune_all(
                 first = loaded[0].mechanism
                 if isinstance(first, Mechanism):
                     meanwhile.submit(_prepare_drawing, first, options.compensator)
-            for index, result in tune_each(loaded, options, bar, pieces):
+            for index, result in tune_each(loaded, options, bar, checkpoints):
                 try:
                     entries[index] = _write_result(options, loaded[index], result, drawn, bar.say)
                 except InputError as error:
@@ -193,7 +203,7 @@ def _tune_all(
                     print_result(options, result.found, entries[index])
         if options.pareto and done:
             with terminal.show_progress(len(done), "fronts") as bar:
-                fronts = tune_pareto.compute_fronts(options, done, entries, problems, bar, pieces)
+                fronts = tune_pareto.compute_fronts(options, done, entries, problems, bar, checkpoints)
     except KeyboardInterrupt:
         raise _TuningInterrupted(_sort_by_index(entries)) from None
     if len(loaded) > 1 and done:
@@ -211,7 +221,7 @@ def _tune_all(
 
 
 def _show_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
-    """Print the table of all mechanisms, and draw one common plot if they have no plots each."""
+    """Print the table of all mechanisms; unless each mechanism has its own plots, write a common plot."""
     if not drawn:
         from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.tuning_results import overview_plot
@@ -222,14 +232,14 @@ def _show_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 
 def _sort_by_index(by_index: dict[int, Any]) -> list[Any]:
-    """Return the values of a dictionary, sorted by index."""
+    """Return the values of a dictionary in the order of its integer keys."""
     return [by_index[index] for index in sorted(by_index)]
 
 
 def _write_result(
     options: Tune, loaded: LoadedAnyMechanism, result: TunedGains, drawn: bool, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write the gain file and the plots of one mechanism, and return its entry."""
+    """Write the gain file and, if `drawn`, the plots of one mechanism; return its JSON entry."""
     from tuning.gains.tasks import has_sensor_noise
 
     folder = Path(options.output) / make_folder_name(loaded.mechanism.name)
@@ -271,14 +281,18 @@ def _write_result(
 
 
 def _start_entry(start) -> dict[str, Any]:
-    """Return the JSON entry of a start of the solver."""
+    """Return the JSON entry of one start of the solver: status, steps and history of the objective."""
     return {
         name: value for name, value in start._asdict().items() if name not in ("coordinates", "curvature")
     }
 
 
 def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
-    """Return the starts that began at earlier tuned gains, with their mechanisms and distances."""
+    """Return a JSON entry for each start from earlier tuned gains.
+
+    The entry contains the number of the start, the source of the gains, and the mechanism for which the gains
+    were tuned, with its distance from this mechanism.
+    """
     from tuning.gains.transfer import compute_mechanism_distance
 
     return [
@@ -293,7 +307,7 @@ def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
-    """Import and compile the code for the plots while the solver compiles on another core."""
+    """Import and compile the code for the plots, in parallel with the compilation of the solver."""
     from jaxhil.laws.compensators import literature_gains
     from jaxhil.simulation.motion_curves import prepare_motion
     from tuning.gains.tune import remove_compensation
@@ -305,13 +319,13 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
     )
 
 
-def is_better(figures, other) -> bool:
-    """Return whether `figures` have fewer failed contacts or, if equal, a smaller rms error."""
-    return figures.failed < other.failed or (figures.failed == other.failed and figures.rms < other.rms)
+def is_better(metrics, other) -> bool:
+    """Return whether `metrics` have fewer failed contacts than `other` or, if equally many, a smaller rms."""
+    return metrics.failed < other.failed or (metrics.failed == other.failed and metrics.rms < other.rms)
 
 
 def _draw(result, options: Tune, folder: Path) -> list[str]:
-    """Draw the plots of one mechanism, and return their paths."""
+    """Write the plots of one mechanism's tuning to a folder, and return their paths."""
     from jaxhil.simulation.contact_plot import plot_contacts, save_figure
     from jaxhil.simulation.motion_curves import compute_nominal_motion
     from tuning.gains.tune import remove_compensation
@@ -335,7 +349,7 @@ def _draw(result, options: Tune, folder: Path) -> list[str]:
 
 
 def _verdict(entries, problems, interrupted) -> str:
-    """Return the verdict on all mechanisms."""
+    """Return "good" if the gains of every mechanism are good, else "bad"; or why there is no verdict."""
     if interrupted:
         return "interrupted"
     if problems:

@@ -23,12 +23,15 @@ def compute_fronts(
     entries: Mapping[int, dict[str, Any]],
     problems: list[str],
     bar: terminal.Progress,
-    pieces: "Checkpoints",
+    checkpoints: "Checkpoints",
 ) -> dict[int, Any]:
-    """Compute and write the fronts of the tuned mechanisms, add them to `entries`, and return them."""
+    """Compute and write the Pareto front of each tuned mechanism, and return the fronts by index.
+
+    The JSON entry of a front is added to the mechanism's entry in `entries`, and an error to `problems`.
+    """
     order, fronts = sorted(done), {}
     results = [done[index] for index in order]
-    arguments = options.pareto, options.pareto_against, bar, pieces, options.scheduler
+    arguments = options.pareto, options.pareto_against, bar, checkpoints, options.scheduler
     for number, points in tune_pareto.compute_fronts(results, *arguments):
         index = order[number]
         folder = Path(entries[index]["gain_file"]).parent
@@ -43,14 +46,14 @@ def compute_fronts(
 
 
 def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -> None:
-    """Print every point, and the point of least cost whose error is within the limit."""
+    """Print the points of a Pareto front, and the point of least cost with an error within the limit."""
     rows: list[list[Any]] = [
         ["literature's rule", None, *_point_cells(result, front.literature), ""],
         ["tuned", None, *_point_cells(result, front.tuned), ""],
     ]
     for number, point in enumerate(front.points, start=1):
-        like = next(n for n, earlier in enumerate(front.points, start=1) if earlier.place == point.place)
-        remark = f"as point {like}" if like < number else "front" if point.on_front else "dominated"
+        equal = next(n for n, earlier in enumerate(front.points, start=1) if earlier.place == point.place)
+        remark = f"as point {equal}" if equal < number else "front" if point.on_front else "dominated"
         rows.append([str(number), point.weight, *_point_cells(result, point), remark])
     axis = front.axis
     weight = axis.weight.replace("_", " ")
@@ -64,26 +67,26 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
     )
     paths = [traded["gain_file"] for traded in entry["points"]]
     lines = [f"wrote {paths[0]} to {paths[-1]}", f"wrote {entry['plot']}"]
-    enough = [
+    within_limit = [
         (point.place[1], number, point.figures.rms)
         for number, point in enumerate(front.points, start=1)
         if point.figures.failed == 0 and point.figures.rms <= options.limit
     ]
-    if enough:
-        cost, number, rms = min(enough)
-        words = {
-            "noise": f"Quietest within {options.limit:g}: point {number}, sensor noise x {cost:.4g}",
-            "peak": f"Gentlest within {options.limit:g}: point {number}, peak x {cost:.4g}",
-            "honesty": f"Most honest within {options.limit:g}: point {number}, error {cost:.2g}",
+    if within_limit:
+        cost, number, rms = min(within_limit)
+        texts = {
+            "noise": f"Least noise within {options.limit:g}: point {number}, sensor noise x {cost:.4g}",
+            "peak": f"Least peak command within {options.limit:g}: point {number}, peak x {cost:.4g}",
+            "honesty": f"Best transparency within {options.limit:g}: point {number}, error {cost:.2g}",
         }
-        lines.append(f"{words[axis.name]}, rms {rms:.2g}.")
+        lines.append(f"{texts[axis.name]}, rms {rms:.2g}.")
     else:
-        lines.append(f"No point's rms error is within {options.limit:g}.")
+        lines.append(f"No point has an rms error within {options.limit:g}.")
     terminal.emit(table, *lines, "")
 
 
 def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[str, Any]:
-    """Write a gain file for each point and the plot of all, and return the entry for `--json`."""
+    """Write a gain file for each point of a front, and the front's plot; return the front's JSON entry."""
     from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.tuning_results import front_plot
 
@@ -109,7 +112,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
 
 
 def _remove_stale_points(folder: Path, number: int) -> None:
-    """Remove the gain files of an earlier, longer front from the folder."""
+    """Remove from the folder the gain files of an earlier front that had more than `number` points."""
     for path in folder.iterdir():
         name = path.name
         is_beyond = name.isdecimal() and int(name) > number and name == f"{int(name):02d}"
@@ -121,7 +124,7 @@ def _remove_stale_points(folder: Path, number: int) -> None:
 
 def _is_gain_file(path: Path) -> bool:
     """Return whether a path is a valid gain file."""
-    # This imports jax, which a refused command must not load.
+    # The import is local, because it loads jax, which a command with unusable options must not do.
     from jaxhil.simulation.gain_file import load_gain_file
 
     try:
@@ -133,7 +136,7 @@ def _is_gain_file(path: Path) -> bool:
 
 
 def _is_rms_objective(result: Any) -> bool:
-    """Return whether the objective without the traded term is the rms error itself."""
+    """Return whether the tuning minimised the plain rms error, without any weights."""
     objective = result.settings.objective
     weights = (
         objective.divergence_weight,
@@ -145,9 +148,9 @@ def _is_rms_objective(result: Any) -> bool:
 
 
 def _point_cells(result: Any, point: Any) -> list[Any]:
-    """Return the cells of a point: cost, errors, and failed contacts."""
-    figures = point.figures
-    errors = [figures.rms] if _is_rms_objective(result) else [point.error, figures.rms]
-    # A small cost is an error, not a factor.
+    """Return the table cells of a point of a front: cost, errors, and number of failed contacts."""
+    metrics = point.figures
+    errors = [metrics.rms] if _is_rms_objective(result) else [point.error, metrics.rms]
+    # A cost below 0.1 is an error; larger costs are amplification factors or peak ratios.
     cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
-    return [cost, *errors, figures.p99, figures.max, figures.failed]
+    return [cost, *errors, metrics.p99, metrics.max, metrics.failed]

@@ -1,4 +1,4 @@
-"""Tables that `jaxhil tune` prints: one mechanism in detail, or many in one table."""
+"""Tables that `jaxhil tune` prints: details of one mechanism, or an overview of many mechanisms."""
 
 import math
 from typing import Any
@@ -9,9 +9,9 @@ from tuning.cli.options import Tune
 
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
-    """Print one table with all mechanisms."""
+    """Print a table with one row per mechanism: errors, best start and verdict."""
     rows = []
-    # A column of zeros would only make the names wrap.
+    # The column is omitted if no contact failed, so that the names have more space.
     some_failed = any(result.figures["tuned"].failed for result in results)
     for result, entry in zip(results, entries, strict=True):
         tuned = result.figures["tuned"]
@@ -42,7 +42,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 
 def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
-    """Print errors, gains and starts of one mechanism, and the verdict."""
+    """Print the tuning of one mechanism: tables of errors, gains and starts, and the verdict."""
     if "energy_error" in entry:
         tables = [_six_axis_error_table(options, result, entry)]
     else:
@@ -61,13 +61,14 @@ def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
 
 
 def _error_table(options: Tune, result: Any, better: bool) -> Any:
-    """Return the table of restitution errors before tuning, with the literature's gains and tuned."""
+    """Return the table of restitution errors: uncompensated, with the literature's gains, and tuned."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
-    judged, rows = {**result.figures}, []
+    metrics_by_gains, rows = {**result.figures}, []
     if result.without_noise is not None:
-        names["without noise"], judged["without noise"] = "tuned, without noise", result.without_noise
+        names["without noise"] = "tuned, without noise"
+        metrics_by_gains["without noise"] = result.without_noise
     for key, label in names.items():
-        figures = judged[key]
+        metrics = metrics_by_gains[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
         shares = f"{100 * figures.diverging:.0f} %", f"{figures.peak_ratio:.3f}", f"{figures.chatter:.3f}"
@@ -81,7 +82,7 @@ def _error_table(options: Tune, result: Any, better: bool) -> Any:
 
 
 def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> Any:
-    """Return the table of energy and twist errors of a six-axis mechanism."""
+    """Return the table of a six-axis mechanism's energy and twist errors, before and after tuning."""
     names = {"before": "before (uncompensated)", "literature": "literature's rule", "tuned": "tuned"}
     if not entry["better_than_literature"]:
         names["tuned"] = "tuned (NOT better than the literature's)"
@@ -128,29 +129,33 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
 
 
 def _describe_aim(options: Tune, result: Any) -> list[str]:
-    """Return a sentence on the aim of tuning, least noise or least error, if results decided it."""
+    """Return a list with a sentence on the aim of the tuning, least noise or least error.
+
+    The list is empty if the options fixed the aim.
+    """
     if not result.settings.quiet or result.without_noise is None or not result.starts:
         return []
     if result.quiet:
         return [f"Quietest gains found within {options.limit:g}; of least error: --noise-weight 0."]
     return [
-        f"Gains of least error: none were found well within {options.limit:g}, of which to take the quietest."
+        f"Gains of least error: no gains were found well within {options.limit:g}, among which the quietest "
+        "would be chosen."
     ]
 
 
 def _describe_confidence(result: Any) -> list[str]:
-    """Return sentences on the tolerance of the gains, the starts and the global search."""
+    """Return sentences on the tolerances of the gains, the spread of the starts, and the global search."""
     lines = []
     if result.freedom:
         lines.append(
             "Free: the share of its range by which a gain may move, alone or with the others moved along, "
             "before the loss rises by 1 %."
         )
-    ends = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
-    if result.settings.probed and len(ends) > 1:
-        above = 100 * (ends[-1] / ends[0] - 1)
+    errors = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
+    if result.settings.probed and len(errors) > 1:
+        above = 100 * (errors[-1] / errors[0] - 1)
         lines.append(
-            f"Starts: {len(ends)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
+            f"Starts: {len(errors)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
         )
     if result.global_comparison:
         search = result.global_comparison
@@ -170,20 +175,20 @@ def _transparency_table(result: Any) -> Any:
         for key, label in labels.items()
     ]
     return terminal.build_table(
-        "Honesty: transparency to an early and a late push, slope of e against e*, peak command (95 %)",
+        "Transparency to an early and a late push, slope of e against e*, peak command (95 %)",
         ["gains", *result.transparency["tuned"]],
         rows,
     )
 
 
-def _format_with_interval(figure: Any) -> str:
-    """Return a metric with its confidence interval as text."""
-    value, low, high = (terminal.format_number(float(number), 3) for number in figure)
+def _format_with_interval(metric: Any) -> str:
+    """Return a metric, given as (value, low, high), with its confidence interval as text."""
+    value, low, high = (terminal.format_number(float(number), 3) for number in metric)
     return f"{value} ({low} to {high})"
 
 
 def _start_table(options: Tune, result: Any) -> Any:
-    """Return the table of all starts; it has a column for their origins if any was not the default."""
+    """Return the table of the solver's starts, with a column for their origin if earlier gains were used."""
     objective_name = "objective" if result.settings.probed else options.objective
     headings = ["start", "status", "steps", f"{objective_name} on training scenarios"]
     rows: list[list[Any]] = [[n, s.status, s.steps, s.rms] for n, s in enumerate(result.starts, start=1)]

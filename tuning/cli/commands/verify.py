@@ -8,10 +8,10 @@ from tuning.cli.options_rig import Verify
 
 
 def run(options: Verify) -> int:
-    """Verify a bundle or gain file, and print the result.
+    """Verify a bundle or a gain file, and print the result.
 
-    Return 0 if the runtime agrees with the simulation, and 1 if it does not or a file is corrupt; an
-    unreadable file raises an error.
+    Return exit code 0 if the runtime's commands agree with the simulated ones, and 1 if they differ or a file
+    is corrupt. Raise `InputError` for an unreadable file.
     """
     result = verify(
         options.path, key=options.key, scenarios=options.scenarios, seed=options.seed, progress=True
@@ -26,12 +26,12 @@ def run(options: Verify) -> int:
 
 def _format_exponential(value: float | None) -> str:
     """Return a number in exponential notation, or a dash for None."""
-    # The document stores values that are not finite as None.
+    # In the document, None stands for a value that is not finite.
     return "-" if value is None else f"{value:.1e}"
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the tables of the verification and the verdict."""
+    """Print the tables of replayed runs and of contacts, and the verdict."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
     tables: list[Any] = list(document.get("self_test", ()))
