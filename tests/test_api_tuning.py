@@ -160,7 +160,7 @@ def test_tune_rejects_unusable_objective(objective, words):
         (lambda: tuning.sweep("nowhere.json"), "nowhere.json: cannot be read"),
         (lambda: tuning.sweep(7), "gains: found 7, expected a path"),
         (lambda: tuning.sweep("x", sampling="grid"), "sampling: found 'grid', expected random, sobol"),
-        (lambda: tuning.sweep("x", resume=True), "resume: found without a folder"),
+        (lambda: tuning.sweep("x", resume=True), "resume: found no folder"),
         (lambda: tuning.compare("varying", ["none", "lead"]), "compensators: found 'lead'"),
         (lambda: tuning.compare("varying", 3), "compensators: found 3"),
         (lambda: tuning.export("nowhere.json", "x"), "nowhere.json: cannot be read"),

@@ -65,7 +65,7 @@ def test_cli_exits_with_130_on_interrupt(jaxhil, monkeypatch):
         (["verify", "nowhere.json"], ["nowhere.json", "No such file"]),
         (["verify", "x", "--scenarios", "0"], ["--scenarios"]),
         (["init", "rig-300"], ["rig-300", "did you mean rig-300kg"]),
-        (["init", "a.toml", "-o", "b.toml"], ["--output", "'b.toml' beside a file", "one of them"]),
+        (["init", "a.toml", "-o", "b.toml"], ["--output", "'b.toml' and a.toml", "only one file"]),
     ],
 )
 def test_cli_reports_unusable_input_in_one_line(jaxhil, arguments, words):

@@ -41,18 +41,18 @@ def test_bode_plot_shows_response_of_the_rig(identified):
     assert {axes.get_xlabel() for axes in (off, coherence)} == {"frequency [Hz]"}
 
 
-def test_contact_plots_show_touches_and_residuals(identified):
+def test_contact_plots_show_contacts_and_residuals(identified):
     left, right = plot_force_delay(identified.contact, 0.0037).axes
     profile = line(left, "profile of the likelihood")
     assert profile[1].max() == 1.0 and abs(profile[0][np.argmax(profile[1])] - 3.7) < 0.5
     assert line(left, "prior")[0][0] == pytest.approx(3.7) and "correlation 0." in right.get_title()
     panels = plot_contacts(identified.contact).axes
-    assert len(panels) == 6 and panels[0].get_title() == "touch 0" and panels[2].get_title() == "touch 2"
+    assert len(panels) == 6 and panels[0].get_title() == "contact 0" and panels[2].get_title() == "contact 2"
     for axes, speed in zip(panels[:3], (0.003, 0.006, 0.012), strict=True):
         measured, model = line(axes, "measured")[1], line(axes, "model")[1]
         assert np.nanstd(measured - model) < 0.7 and model.max() > 3e3 * speed
     over_time, _, correlations, _ = plot_residuals(identified.contact).axes
-    shown = line(over_time, "all touches")[1]
+    shown = line(over_time, "all contacts")[1]
     assert 0.9 < shown.std() < 1.1 and np.abs(line(correlations, "correlation")[1]).max() < 0.1
 
 

@@ -137,7 +137,10 @@ def test_gains_of_another_mechanism_of_same_name_are_replaced_with_warning(jaxhi
     assert "replaced" not in jaxhil(TUNE[0], *options).err
     assert "replaced" not in jaxhil(TUNE[0], *options).err
     ran = jaxhil(TUNE[0], *options, "--set", "bodies.equivalent_mass=301")
-    assert "warning: " in ran.err and "replaced: it is of another mechanism of the name '機構一'" in ran.err
+    assert (
+        "warning: " in ran.err
+        and "replaced; it was for a different mechanism with the name '機構一'" in ran.err
+    )
     assert (tmp_path / "out" / "機構一" / "gains.json").exists()
 
 

@@ -133,7 +133,7 @@ def test_third_party_results_are_refused_in_one_line(jaxhil, put, tmp_path, docu
 def test_report_arguments_are_checked(jaxhil, put, tmp_path):
     one = put(identified())
     for arguments, message in (
-        ([], "found nothing"),
+        ([], "RESULT: found none"),
         ([one, one], "one of each kind"),
         ([tmp_path / "none"], "cannot be read"),
         ([tmp_path], "found no result"),

@@ -141,7 +141,7 @@ def check_one_axis_arguments(mechanism: AnyMechanism, **values: Any) -> None:
     for name, value in values.items():
         if isinstance(mechanism, SixAxisMechanism) and value:
             found = "a function" if callable(value) else format_value(value)
-            raise ArgumentError(name, found, "none: six axes do not support it")
+            raise ArgumentError(name, found, "none: this option is not available for six axes")
 
 
 def compensator_names() -> tuple[str, ...]:

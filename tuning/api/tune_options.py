@@ -137,7 +137,7 @@ class TuneOptions:
     def check(self) -> None:
         """Raise `InputError` if a value or a combination of options is not allowed.
 
-        Values that only jax can check are not checked here.
+        Values whose check needs jax are not checked here.
         """
         check_options(self)
         arguments.check_supports_mechanism(self.compensator, None)

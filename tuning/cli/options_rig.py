@@ -74,9 +74,9 @@ class RigOptions:
 
     Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
 
-    First, a loop without control law runs for comparison. The exit code is 1 if the controller causes a
-    missed tick, a restitution error exceeds the limit, or the controller trips although no faults are
-    injected.
+    First, an empty loop, which only exchanges packets, runs for comparison. The exit code is 1 if the
+    controller causes a missed tick, a restitution error exceeds the limit, or the controller trips although
+    no faults are injected.
     """
 
     path: Annotated[

@@ -1,4 +1,4 @@
-"""Animation of a six-axis contact: the ideal contact beside the contact on the rig."""
+"""Animation of a six-axis contact: the ideal contact and the contact on the rig, side by side."""
 
 import tempfile
 from pathlib import Path

@@ -27,7 +27,7 @@ from tuning.reporting.documents import (
 from tuning.sweeps.manifest import load_gains
 from tuning.sweeps.store import VERDICT_FILE, SweepStore, read_store
 
-MAX_DOCUMENT_BYTES = 200_000_000  # bytes; a larger file is not read, to protect the memory
+MAX_DOCUMENT_BYTES = 200_000_000  # bytes; a larger file is not read
 DOCUMENT_NAMES = ("manifest.json", "gains.json", "identification.json", "compare.json", "map.json")
 ALLOWED_RESULTS = (
     "a result of jaxhil identify, tune, sweep, compare, map or export (the folder, or the JSON file in it), "
@@ -268,7 +268,9 @@ def _check_consistency(results: Results) -> None:
             continue
         for key in ("compensator", "gains", "mechanism"):
             if getattr(gains, key) != getattr(subject, key):
-                raise InputError(f"{name}: {key}: found a value, expected that of the other results")
+                raise InputError(
+                    f"{name}: {key}: found a value that differs from the other results, expected the same value"
+                )
     comparison, mechanism = results.comparison, subject.mechanism.name
     if comparison is not None and mechanism not in (entry.mechanism for entry in comparison.mechanisms):
         names = ", ".join(entry.mechanism for entry in comparison.mechanisms)

@@ -130,7 +130,7 @@ def _key_axis(
     paths = [name for name in numeric_keys() if not name.startswith("uncertainty")]
     if path not in paths:
         raise InputError(
-            f"{name}: found {format_value(key)}, expected a key of a number{suggest_names(path, paths)}"
+            f"{name}: found {format_value(key)}, expected the key of a number{suggest_names(path, paths)}"
         )
     value = value_at(mechanism, path)
     shape = np.shape(value)

@@ -30,7 +30,7 @@ def load_named_mechanism(options: SimulateOptions | Map) -> Mechanism | None:
 
 
 def load_any_named_mechanism(options: SimulateOptions) -> AnyMechanism | None:
-    """Load the one-axis or six-axis mechanism of FILE; return None if the gain file's is used instead.
+    """Load the mechanism of FILE, with one or six axes; return None if the gain file's mechanism is used.
 
     Raise `InputError` if FILE is unusable or the compensator does not support its axes.
     """

@@ -21,7 +21,7 @@ from tuning.cli.options_identify import IdentifyOptions
 from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
 
 SCHEMA = "jaxhil/identification/1"
-MAX_ORDER = 4
+MAX_ORDER = 4  # highest order of a motion simulator that `--order` accepts
 MECHANISM_FILE, DOCUMENT_FILE = "mechanism.toml", "identification.json"
 PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
@@ -90,7 +90,7 @@ def _check_options(options: IdentifyOptions) -> None:
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
-        raise InputError(f"--hold-out: found {options.hold_out}, expected a share from 0 to below 1")
+        raise InputError(f"--hold-out: found {options.hold_out}, expected a share >= 0 and < 1")
     if options.bayes and options.prior is None:
         raise InputError("--bayes: found no prior, expected --prior with a normal entry in [uncertainty]")
     for name in ("scheduler", "resume"):

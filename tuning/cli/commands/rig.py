@@ -12,14 +12,14 @@ from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
 
-MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the loop without control law
-EMPTY_LOOP_SHARE = 0.2  # duration of the loop without control law, divided by the run's duration
-MAX_TICKS = 2_000_000  # ticks of a run, all of which are recorded in memory
+MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which only exchanges packets
+EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
+MAX_TICKS = 2_000_000  # largest number of ticks of a run
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
 def run(options: RigOptions) -> int:
-    """Run a loop without control law for comparison, then the controller, and print the result.
+    """Run an empty loop, which only exchanges packets, then the controller, and print the result.
 
     Return exit code 0 if the verdict is good, else 1. Raise KeyboardInterrupt after an interruption.
     """

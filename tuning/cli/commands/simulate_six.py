@@ -129,7 +129,7 @@ def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
 
 
 def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
-    """Write those of plot, animation and log that the options request."""
+    """Write the plot, the animation and the log to the files that the options name, if any."""
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     if options.plot is not None:
         from jaxhil.files import report_write_errors, resolve_output_path
