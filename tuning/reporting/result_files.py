@@ -269,7 +269,7 @@ def _check_consistency(results: Results) -> None:
         for key in ("compensator", "gains", "mechanism"):
             if getattr(gains, key) != getattr(subject, key):
                 raise InputError(
-                    f"{name}: {key}: found a value that differs from the other results, expected the same value"
+                    f"{name}: {key}: found another value than in the other results, expected the same"
                 )
     comparison, mechanism = results.comparison, subject.mechanism.name
     if comparison is not None and mechanism not in (entry.mechanism for entry in comparison.mechanisms):

@@ -41,7 +41,8 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
         name, _, text = words.partition("=")
         if name not in LIMITS:
             raise InputError(
-                f"--set: found {format_value(words)}, expected LIMIT=VALUE with LIMIT one of {', '.join(LIMITS)}"
+                f"--set: found {format_value(words)}, expected LIMIT=VALUE with LIMIT "
+                f"one of {', '.join(LIMITS)}"
             )
         try:
             value = None if text == "none" else float(text)
