@@ -111,7 +111,7 @@ def test_user_registered_laws_are_tuned_swept_exported_and_verified(tmp_path):
 
     jaxhil.register(ScaledLead(), runtime=Other)
     actual = tuning.verify(tmp_path / "bundle")
-    assert not actual.good and "jaxhil_runtime.py: is not what this version exports" in actual.reasons
+    assert not actual.good and "jaxhil_runtime.py: differs from what this version exports" in actual.reasons
 
 
 @pytest.mark.slow

@@ -95,8 +95,8 @@ def test_self_consistent_foreign_bundle_is_not_run(files, folder, tmp_path, name
     verdict = tuning.verify(placed(folder, signed_files))
     assert not verdict.good and verdict.document["self_test"] == []
     first, last = verdict.reasons
-    assert first == f"{name}: is not what this version exports"
-    assert last.startswith("nothing of it was run: it says that this version, jaxhil ")
+    assert first == f"{name}: differs from what this version exports"
+    assert last.startswith("no code of the bundle was run: its manifest names this version, jaxhil ")
     assert (find_code_differences(folder, "phase_lead") == []) is (name not in CODE)
     assert not (tmp_path / "ran").exists()
 
@@ -106,8 +106,8 @@ def test_bundle_check_reports_missing_and_extra_files(files, folder):
     signed_files = signed({**remaining, "sitecustomize.py": b"open('ran', 'w')"}, document_of(files))
     reasons = check_bundle(placed(folder, signed_files)).reasons
     assert reasons[:2] == [
-        "sitecustomize.py: is no file that this version exports",
-        "udp_controller.py: is not here",
+        "sitecustomize.py: this version does not export such a file",
+        "udp_controller.py: is missing",
     ]
     assert find_code_differences(folder, "phase_lead") == reasons
 
@@ -125,18 +125,18 @@ def test_bundle_check_rejects_modified_summary_page(files, folder, old, new):
     page = files["summary.html"].replace(old, new)
     signed_files = signed({**files, "summary.html": page}, document_of(files))
     reason = check_bundle(placed(folder, signed_files)).reasons[0]
-    assert reason.startswith(("summary.html: is not", "gains.json: this version cannot export it")), reason
+    assert reason.startswith(("summary.html: differs from", "gains.json: this version cannot export it")), reason
 
 
 def test_bundle_check_names_version_that_wrote_bundle(files, folder):
-    for stated, words in [("jaxhil 0.0.9", "'jaxhil 0.0.9' wrote it"), (None, "does not say"), ([1], "[1]")]:
+    for stated, words in [("jaxhil 0.0.9", "names 'jaxhil 0.0.9'"), (None, "names no version"), ([1], "[1]")]:
         other = plain_manifest(files)
         other.update(version=stated)
         if stated is None:
             del other["version"]
         placed(folder, {**files, "manifest.json": resealed(other)})
         first, last = check_bundle(folder).reasons
-        assert first == "manifest.json: is not what this version writes of these files" and words in last
+        assert first == "manifest.json: differs from what this version exports for these files" and words in last
     assert run_selftest(folder)[0]  # the self-test on a rig sees a consistent bundle
 
 
@@ -167,9 +167,9 @@ def test_bundle_check_reports_pycache_beside_sources(files, folder):
     (folder / "__pycache__").mkdir()
     (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"who knows")
     [reason] = check_bundle(folder).reasons
-    assert reason.startswith("__pycache__/: holds compiled code, which is not checked")
+    assert reason.startswith("__pycache__/: contains compiled code, which is not checked")
     good, out = run_selftest(folder)
-    assert good and "note  __pycache__/: holds compiled code" in out
+    assert good and "note  __pycache__/: contains compiled code" in out
 
 
 HOSTILE_PATHS = [
@@ -236,7 +236,7 @@ def test_bundle_check_rejects_oversized_manifest_entries(files, folder):
     wrong = plain_manifest(files, **{"ros2.yaml": entry(files["ros2.yaml"], bytes=3)})
     placed(folder, {**files, "manifest.json": resealed(wrong)})
     [reason] = check_bundle(folder).reasons
-    assert reason == f"ros2.yaml: differs from what was exported ({len(files['ros2.yaml'])} bytes are here)"
+    assert reason == f"ros2.yaml: differs from what was exported (found {len(files['ros2.yaml'])} bytes)"
 
 
 def flipped(source, content):
@@ -265,7 +265,7 @@ def test_write_bundle_replaces_only_an_unmodified_bundle(files, folder, tmp_path
 
     def refused():
         with pytest.raises(
-            InputError, match="expected a new or empty folder, or a bundle as it was exported"
+            InputError, match="expected a new or empty folder, or an unchanged bundle"
         ):
             write_bundle(folder, files)
         assert (secret / "thesis.txt").read_text() == "years of work"

@@ -94,7 +94,7 @@ def test_export_command_writes_signed_bundle_that_verifies(jaxhil, gains, tmp_pa
     assert os.listdir(tmp_path / "new") == ["bundle"]
     ran = jaxhil("verify", folder, "--scenarios", "4", "--key", public)
     assert ran.code == 0 and "Good: commands agree" in ran.out and "\nPASSED\n" in ran.out
-    assert "Signature: by the key given." in ran.out
+    assert "Signature: valid for the given key." in ran.out
     # Export again into the same folder, without a signature.
     ran = jaxhil("export", folder, "-o", folder, "--format", "matlab", *blind)
     assert ran.code == 0 and "\nNot known to be good: " in ran.out and "selftest.py" in ran.out
@@ -102,7 +102,7 @@ def test_export_command_writes_signed_bundle_that_verifies(jaxhil, gains, tmp_pa
     ran = jaxhil("verify", folder, "--key", public, "--json")
     assert ran.code == 1 and ran.document["signature"] == "not signed" and ran.document["self_test"] == []
     [reason] = ran.document["reasons"]
-    assert reason == "manifest.sig: found none, expected the manifest's by the key given"
+    assert reason == "manifest.sig: found no signature, expected one of the manifest by the given key"
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_export_leaves_foreign_folder_untouched(jaxhil, gains, tmp_path):
     for name in ("manifest.json", "README.md"):
         content = (folder / name).read_bytes()
         (folder / name).write_bytes(content + b"my notes")
-        refused(jaxhil("export", gains, "-o", folder), name, "expected a new or empty folder, or a bundle as")
+        refused(jaxhil("export", gains, "-o", folder), name, "expected a new or empty folder, or an unchanged bundle")
         assert (folder / name).read_bytes() == content + b"my notes"
         (folder / name).write_bytes(content)
     check_bundle_folder(folder)
@@ -359,7 +359,7 @@ def test_export_rejects_folder_with_bundle_of_another_mechanism(tmp_path):
     check_same_mechanism(folder, json.loads(before)["mechanism"]["name"])
     check_same_mechanism(tmp_path / "none", "another")
     with pytest.raises(
-        InputError, match=r"bundle: found the bundle of mechanism .*, expected that of 'another'"
+        InputError, match=r"bundle: found a bundle of the mechanism .*, expected 'another'"
     ):
         check_same_mechanism(folder, "another")
 

@@ -124,9 +124,9 @@ def test_selftest_detects_damage_at_the_weak_points_of_its_guard(files, folder):
     for old, new in [
         ('if __name__ == "__main__":', 'if __name__ == "__main_":'),
         ('    if not good:\n        sys.exit("FAIL  the self-test")\n', ""),
-        ('    look_again()\n    if not good:\n        sys.exit("FAIL  the self-test")\n', ""),
-        ("    look_again()\n    if not good", "    if not good"),
-        ("\nlook_again()\n", "\n"),
+        ('    check_this_file()\n    if not good:\n        sys.exit("FAIL  the self-test")\n', ""),
+        ("    check_this_file()\n    if not good", "    if not good"),
+        ("\ncheck_this_file()\n", "\n"),
         ("good = not damaged", "good = True"),
         ("return good", "return True"),
         ("!= own:", "== own:"),
@@ -235,14 +235,14 @@ def test_selftest_reports_garbage_in_one_line_a_check(folder, name, garbage):
 def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
     document = json.loads(files["gains.json"])
     for name, text, reason in [
-        ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be run: SystemExit"),
-        ("jaxhil_runtime.py", "x = (", "cannot be run: SyntaxError"),
-        ("jaxhil_runtime.py", "Controller = 3", "cannot be run: NameError"),
+        ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be executed: SystemExit"),
+        ("jaxhil_runtime.py", "x = (", "cannot be executed: SyntaxError"),
+        ("jaxhil_runtime.py", "Controller = 3", "cannot be executed: NameError"),
         ("gains.json", "[]", "found a list"),
         ("vectors.csv", "a,b\n", "unknown columns"),
         ("vectors.csv", selftest.VECTOR_COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
         ("vectors.csv", selftest.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event 0.0"),
-        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n", "has no tick"),
+        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n", "contains no ticks"),
     ]:
         for other, content in signed({**files, name: text.encode()}, document).items():
             (folder / other).write_bytes(content)
@@ -259,14 +259,14 @@ def test_selftest_names_surplus_and_missing_files(files, folder):
     good, out = run_selftest(folder)
     assert not good and out.count("FAIL  ") == 2
     assert "FAIL  other/: is no file of this bundle" in out
-    assert "note  __pycache__/: holds compiled code, which is not checked" in out
+    assert "note  __pycache__/: contains compiled code, which is not checked" in out
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 
 
 def test_selftest_reports_other_line_endings(files, folder):
     (folder / "gains.csv").write_bytes(files["gains.csv"].replace(b"\n", b"\r\n"))
     good, out = run_selftest(folder)
-    assert not good and "FAIL  gains.csv: its line endings differ from those exported" in out
+    assert not good and "FAIL  gains.csv: its line endings differ from what was exported" in out
 
 
 def test_selftest_refuses_unknown_arguments(folder):
@@ -291,9 +291,9 @@ def test_selftest_compiles_and_runs_the_c_controller(files, folder, monkeypatch)
         good, out = run_selftest(folder, "--c")
         assert not good and re.search(reason, out), out
     (folder / "c99" / "jaxhil_controller.h").write_bytes(b"")
-    assert "FAIL  c99: differs or is not here, so it is not compiled" in run_selftest(folder, "--c")[1]
+    assert "FAIL  c99: is not compiled, because a file is missing or differs" in run_selftest(folder, "--c")[1]
     for name, content in files.items():
         (folder / name).write_bytes(content)
     monkeypatch.setenv("PATH", "")
     good, out = run_selftest(folder, "--c")
-    assert not good and "no C compiler is here" in out
+    assert not good and "found no C compiler" in out

@@ -66,7 +66,7 @@ def test_signature_is_that_of_rfc_8032(tmp_path):
 
 def test_verify_without_key_claims_no_proof(folder):
     checked = check_bundle(folder)
-    assert checked.reasons == [] and checked.signature.startswith("there is one; only verification with")
+    assert checked.reasons == [] and checked.signature.startswith("present, but not checked")
     good, out = run_selftest(folder)
     assert good and "note  manifest.json: is signed; only `jaxhil verify --key` proves by whom" in out
     (folder / "manifest.sig").unlink()
@@ -77,10 +77,10 @@ def test_verify_without_key_claims_no_proof(folder):
 
 def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
     by_key = load_verifier(key[1])
-    assert check_bundle(folder, by_key).signature == "by the key given"
+    assert check_bundle(folder, by_key).signature == "valid for the given key"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
     result = tuning.verify(folder, key=tmp_path / "other.pem")
-    expected = "manifest.sig: found another, expected the manifest's by the key given"
+    expected = "manifest.sig: found another signature, expected one of the manifest by the given key"
     assert not result.good and result.reasons == [expected] and result.document["self_test"] == []
     # Reseal after a change, as anybody without the key could: all but the signature fits.
     files = small_files()
@@ -164,6 +164,6 @@ def test_missing_signing_package_is_reported_in_one_line(key, folder, monkeypatc
     for name in [name for name in sys.modules if name.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
     for read, file in ((load_signer, key[0]), (load_verifier, key[1])):
-        with pytest.raises(InputError, match=r"expected with it: pip install 'jaxhil\[sign\]'"):
+        with pytest.raises(InputError, match=r"run pip install 'jaxhil\[sign\]'"):
             read(file)
     assert check_bundle(folder).reasons == []

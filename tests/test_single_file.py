@@ -34,7 +34,7 @@ def loaded(folder):
 def test_single_file_holds_one_law_and_only_what_it_needs(exported):
     compensator, folder = exported
     head = (folder / "jaxhil_runtime.py").read_text().partition("# ---- ")[0]
-    assert "nothing else to install" in head
+    assert "and no other package" in head
     foreign = {"jax", "jaxhil", "tuning", "numpy"}
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import jaxhil_runtime as runtime\n"
@@ -77,7 +77,8 @@ def test_single_file_keeps_comments_and_labels_each_part(exported):
     text = (folder / "jaxhil_runtime.py").read_text()
     assert "# ---- jaxhil.rig.controller ---" in text
     assert "# bool is an int to Python" in text
-    assert "from ." not in text and "from jaxhil" not in text and "\nimport jax" not in text
+    # Examples in docstrings may import the package.
+    assert not re.search(r"^\s*(from \.|from jaxhil|import jax)", text, re.MULTILINE)
 
 
 @pytest.fixture

@@ -118,8 +118,8 @@ def test_summary_states_purpose_quality_and_confidence(made, page):
         "False alarms 0 of 5000 good runs (95 %: 0 to 0.00073, limit 0.01)",
         "missed alarms 2 of 40 runs to be stopped (95 %: 0 to 0.17, limit 0.02)",
         "Unknown: missed alarms: <0 to 0.17>.",
-        "restitution_margin widened from 0.0025 to 0.013, or too many good runs would be stopped",
-        "errors from 0.018 on are noticed in 95 % of contacts",
+        "restitution_margin widened from 0.0025 to 0.013, because too many good runs would be stopped",
+        "errors above 0.018 are detected in 95 % of contacts",
     ):
         assert part in text, part
     rows = {row[0]: row for row in page.rows if row}
@@ -170,8 +170,8 @@ def test_summary_shows_a_name_as_text_and_no_markup(made):
 def test_summary_does_not_invent_unknown_values():
     bare = document("rattling", "none")
     text = " ".join(Page(summary_html(bare)).texts)
-    assert "None: the measured force is passed on." in text
-    assert "None in the gain file: those of the code hold." in text
+    assert "None: the force command is the measured force." in text
+    assert "None in the gain file: the controller's widest limits hold." in text
     assert "holds no figures" in text
     unknown = replace_limits(bare, {"force_limit": 1.0})
     assert "Rates of false and missed alarms are not known." in " ".join(Page(summary_html(unknown)).texts)

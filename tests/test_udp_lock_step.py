@@ -73,7 +73,7 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
     law = controller(mechanism, "response_error", gains)
     whole, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
     rig, task, answers = packets(mechanism, law, 2500, Unreliable(drops, ticks, seed=1))
-    assert not rig.tripped and task.made_up > (10 if drops else 0)
+    assert not rig.tripped and task.interpolated > (10 if drops else 0)
     assert (task.stale > 0) == (ticks > 0)
     assert all(math.isfinite(answer.position_command) for answer in answers)
     assert len(rig.contacts) >= 5
@@ -91,7 +91,7 @@ def test_contacts_unidentified_by_the_law_are_counted():
     assert udp_protocol.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
     reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
     assert len(rig.contacts) >= 3 and not rig.tripped
-    assert task.doubts == {"too_short": len(reported)} and len(reported) in (
+    assert task.quality_flags == {"too_short": len(reported)} and len(reported) in (
         len(rig.contacts),
         len(rig.contacts) + 1,
     )
@@ -105,7 +105,7 @@ def test_missing_tick_is_interpolated_linearly(varying):
     for tick in (0, 1, 4):
         result = gappy.answer(a_reading(tick, force=10.0 * tick))
     assert result == expected._replace(faults=MISSED_TICK)
-    assert gappy.made_up == 2 and gappy.stale == 0
+    assert gappy.interpolated == 2 and gappy.stale == 0
 
 
 def test_long_gap_is_left_to_the_controller(varying):
@@ -114,12 +114,12 @@ def test_long_gap_is_left_to_the_controller(varying):
     first = task.answer(a_reading(0, force=7.0))
     gap = MAX_INTERPOLATED_TICKS + 1
     answer = task.answer(a_reading(1 + gap, force=7.0))
-    assert task.made_up == 0 and not answer.words and answer.faults & MISSED_TICK
+    assert task.interpolated == 0 and not answer.trip_reason and answer.faults & MISSED_TICK
     # Model time is rig time: the model continued under the last force.
     mass, period = mechanism.bodies.equivalent_mass, mechanism.rig.control_period
     assert answer.velocity == pytest.approx(first.velocity - (gap + 1) * period * 7.0 / mass, rel=1e-12)
     tripped = task.answer(a_reading(60, force=7.0))
-    assert "missed_tick" in tripped.words and tripped.force_command == 0.0
+    assert "missed_tick" in tripped.trip_reason and tripped.force_command == 0.0
     assert math.isfinite(tripped.position_command) and math.isfinite(tripped.command_rate)
 
 

@@ -100,11 +100,11 @@ def test_ticks_that_took_too_long_are_replayed(varying):
     mechanism, _ = varying
     record = TickRecord(4)
     for tick, cpu in enumerate((10, 2_000_000_000, 30, 40)):
-        record.keep(encode_reading(a_reading(tick), 3))
+        record.store_packet(encode_reading(a_reading(tick), 3))
         record.add(tick + 10, cpu, cpu)
-    record.keep(encode_reading(a_reading(5), 3))
+    record.store_packet(encode_reading(a_reading(5), 3))
     record.add(15, 1, 3_000_000_000)
-    assert record.count == record.kept == 4  # rows that do not fit are dropped
+    assert record.count == record.packet_count == 4  # rows that do not fit are dropped
     again = replay_slow_ticks(lambda: prepared(mechanism), record, 1e9)
     # The machine's second is not needed again.
     assert list(again) == [11] and 0 < again[11] < 1e9

@@ -47,7 +47,7 @@ def test_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
         for other, content in signed({**made.files, name: made.files[name] + trap}, made.document).items():
             (folder / other).write_bytes(content)
         ran = jaxhil(*arguments)
-        assert (ran.code, ran.out) == (2, "") and f"{name}: is not what this version exports" in ran.err
+        assert (ran.code, ran.out) == (2, "") and f"{name}: differs from what this version exports" in ran.err
     assert not (tmp_path / "ran").exists()
 
 

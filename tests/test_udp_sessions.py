@@ -124,7 +124,7 @@ def test_controller_process_answers_its_rig_and_nobody_else(process):
     guesser.send(encode_session_request(5))
     for tick in range(5):
         answer = rig.ask(a_reading(tick))
-        assert (answer.tick, answer.sequence, answer.words) == (tick, tick + 10, "")
+        assert (answer.tick, answer.sequence, answer.trip_reason) == (tick, tick + 10, "")
     assert stranger.hears_nothing() and guesser.hears_nothing()
     rig.tell(a_reading(0, 99, event=STOP))
     code, result = served.ended()

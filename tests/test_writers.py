@@ -189,5 +189,5 @@ def test_missing_limit_is_written_as_the_runtimes_default():
 def test_name_too_long_for_matlab_is_refused():
     made = json.loads(json.dumps(gain_document("phase_lead")))
     made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
-    with pytest.raises(InputError, match="found 64 characters, expected 63"):
+    with pytest.raises(InputError, match="found 64 characters, expected at most 63"):
         matlab_files(made)

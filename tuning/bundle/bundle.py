@@ -1,7 +1,7 @@
-"""Bundle: folder with gains for a rig computer, which does not need jax.
+"""Bundle: folder with gains and controller for a rig computer, which does not need JAX.
 
-`build_bundle` makes the content of every file from a checked gain document; equal gains, limits and seed give
-equal files. `write_bundle` writes all files atomically.
+`build_bundle` computes the content of every file from a checked gain document. Equal gains, limits and seeds
+give equal files. `write_bundle` writes all files atomically.
 """
 
 import errno
@@ -31,17 +31,17 @@ from tuning.verification.stops import ControllerStop
 
 
 class Bundle(NamedTuple):
-    """Bundle in memory, and the results of its test vectors."""
+    """Files of a bundle in memory, and the comparison of its test vectors with the simulation."""
 
-    document: dict[str, Any]  # the gain document as exported
-    files: dict[str, bytes]  # the content of every file, by its path
-    ticks: int  # number of ticks in the vectors
-    runs: int  # number of runs in the vectors
-    # reason for an early end of the comparison with the simulation, for each recorded run; None if complete
+    document: dict[str, Any]  # exported gain document
+    files: dict[str, bytes]  # content of every file, by its path in the bundle
+    ticks: int  # number of ticks in the test vectors
+    runs: int  # number of runs in the test vectors
+    # for each recorded run, why the comparison with the simulation ended before the run; None if it did not
     ended: list[str | None]
-    reasons: list[str]  # disagreements, in words
-    stop: ControllerStop | None  # stop of the nominal run by the limits; None if there is none
-    passing: dict[str, float] | None  # limits with which that run is not stopped, or None
+    reasons: list[str]  # descriptions of the differences between runtime and simulation
+    stop: ControllerStop | None  # tick at which a limit stops the nominal run; None if no limit does
+    passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
 
 
 def build_bundle(
@@ -56,17 +56,17 @@ def build_bundle(
     """Build the bundle of a checked gain document.
 
     Args:
-        document: the gain document.
+        document: gain document.
         formats: names of the additional formats of the gains.
-        limits: limits for the rig [SI units], None for no limit; without them, those of the document are
-            kept.
-        rates: alarm rates of the watchdog under these limits, as plain data.
+        limits: limits for the rig [SI units]. A value of None disables a limit. Without this argument, the
+            limits of the document remain.
+        rates: alarm rates of the watchdog with these limits, as JSON data.
         seed: seed of the test vectors.
-        progress: function that is called with the name of each step.
-        sign: function that signs the manifest's bytes; None leaves the bundle unsigned.
+        progress: callback, called with the name of each step.
+        sign: function that returns the signature of the manifest's bytes; None leaves the bundle unsigned.
 
     Returns:
-        The bundle in memory.
+        Files of the bundle, and the comparison of its test vectors with the simulation.
 
     Raises:
         InputError: If the runtime refuses the limits, or the compensator does not support a format.
@@ -92,9 +92,10 @@ def replace_limits(
     limits: Mapping[str, float | None] | None,
     rates: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the gain document with these limits, None for no limit, and a new digest.
+    """Return a copy of the gain document with other limits and a new digest.
 
-    The rates become `figures.watchdog`. Without limits, the document is returned unchanged.
+    A value of None disables a limit. The alarm rates are stored in `figures.watchdog`. If `limits` is None,
+    the document stays unchanged.
     """
     if limits is None:
         return dict(document)
@@ -104,14 +105,14 @@ def replace_limits(
 
 
 def build_limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
-    """Return the section `limits` of a gain file: value and unit by name."""
+    """Return the section `limits` of a gain file, with value and unit of each limit by its name."""
     return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
 
 
 def check_bundle_folder(folder: Path) -> None:
-    """Check that a bundle may be written to a folder: a new or empty one, or one with an unchanged bundle.
+    """Raise `InputError` unless the folder is new, empty, or contains only an unchanged bundle.
 
-    Raise `InputError` otherwise, so that no changed or additional file is lost.
+    This protects changed and additional files from being overwritten.
     """
     where = to_one_line(str(folder))
     try:
@@ -129,16 +130,16 @@ def check_same_mechanism(folder: Path, name: str) -> None:
     try:
         earlier = read_gain_document(folder / "gains.json")["mechanism"]["name"]
     except (GainFileError, KeyError, TypeError):
-        return  # nothing there, or a changed bundle, for which `check_bundle_folder` raises an error
+        return  # there is no bundle, or a changed bundle, for which `check_bundle_folder` raises an error
     if earlier != name:
-        found = (
-            f"found the bundle of mechanism {format_value(earlier)}, expected that of {format_value(name)}"
+        raise InputError(
+            f"{to_one_line(str(folder))}: found a bundle of the mechanism {format_value(earlier)}, expected "
+            f"{format_value(name)}: choose another folder with --output"
         )
-        raise InputError(f"{to_one_line(str(folder))}: {found}, or none: name another folder by --output")
 
 
 def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write all files of the bundle, or keep the previous state after an error. Raise `InputError`."""
+    """Write all files of the bundle. After an error, restore the previous state and raise `InputError`."""
     check_bundle_folder(folder)
     target = folder.resolve()
     new = target.with_name(temporary_name())
@@ -164,14 +165,14 @@ def write_bundle(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _replace_folder(new: Path, target: Path) -> None:
-    """Move the new folder to the place of the old one, and delete the old one."""
+    """Replace the folder `target` by the folder `new`, and delete the previous content."""
     if not target.exists():
         os.replace(new, target)
         return
     _exchange_folders(new, target)
     old = new
     try:
-        # The old folder is checked again, so that files added in between are not deleted.
+        # Check the old folder again, because another program may have added files since the first check.
         names = _list_bundle_files(old)
     except BaseException:
         _exchange_folders(old, target)
@@ -190,7 +191,8 @@ def _exchange_folders(new: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.ENOSYS, errno.EINVAL):
             raise
-    # A power failure between the two steps leaves the old folder under its temporary name.
+    # This system cannot exchange names in one step. A power failure between the two steps leaves the old
+    # folder under a temporary name.
     old = target.with_name(f".{target.name}.{os.getpid()}.old{TEMPORARY_SUFFIX}")
     os.replace(target, old)
     try:
@@ -202,30 +204,28 @@ def _exchange_folders(new: Path, target: Path) -> None:
 
 
 def _list_bundle_files(folder: Path) -> list[str]:
-    """Return the paths of an unchanged bundle's files, then of its folders, the innermost first.
+    """Return the paths of all files in an unchanged bundle, then of its subfolders, innermost first.
 
-    Paths of folders end with a slash. The list is empty for an empty folder. Raise `InputError` if the folder
-    contains anything else.
+    Paths of subfolders end with a slash. The list is empty for an empty folder. Raise `InputError` if the
+    folder contains anything but an unchanged bundle.
     """
-    where, allowed = (
-        to_one_line(str(folder)),
-        "expected a new or empty folder, or a bundle as it was exported",
-    )
+    where = to_one_line(str(folder))
+    expected = "expected a new or empty folder, or an unchanged bundle"
     inside = sorted(os.listdir(folder))
     if not inside:
         return []
     if not is_bundle(folder):
-        raise InputError(f"{where}: found {format_value(inside[0])} and no bundle, {allowed}")
+        raise InputError(f"{where}: found {format_value(inside[0])} and no bundle, {expected}")
     contents, problems = selftest.find_differences(str(folder))
     files = [*contents]
     for name, text in problems:
         if not name.endswith(selftest.PYTHON_CACHE):
-            raise InputError(f"{where}: {to_one_line(name, 80)}: {text}; {allowed}")
+            raise InputError(f"{where}: {to_one_line(name, 80)}: {text}; {expected}")
         for entry in list(os.scandir(folder / name)):
-            # Python's cache may contain only compiled files.
+            # Delete Python's cache only if it contains nothing but compiled files.
             if not (entry.is_file(follow_symlinks=False) and entry.name.endswith(".pyc")):
                 raise InputError(
-                    f"{where}: {name}{to_one_line(entry.name, 80)}: no file of a bundle; {allowed}"
+                    f"{where}: {name}{to_one_line(entry.name, 80)}: is no file of this bundle; {expected}"
                 )
             files.append(name + entry.name)
     folders = {f"{name[:index]}/" for name in files for index, sign in enumerate(name) if sign == "/"}

@@ -1,9 +1,10 @@
-"""Controller in C99: source files made from a gain document, for a compiler on the rig computer.
+"""Generation of the controller's C99 source files from a gain document, for a compiler on the rig computer.
 
-`jaxhil.codegen` translates the rig's Python code of the controller, its guards and the compensator. This
-module and `c99_tables` add the rest: checks of the compiler, the tables of gains, limits, faults and
-statuses, and `jaxhil_init`, which checks gains and limits. The test program is `test_vectors.c`. The constant
-`JAXHIL_<NAME>_SAMPLES` is the length of a delay line whose delay is the gain or limit of that name.
+`jaxhil.codegen` translates the Python code of the controller, its guards and the compensator. This module and
+`c99_tables` add three more parts: checks of the compiler's options; tables of gains, limits, faults and
+statuses; and the function `jaxhil_init`, which checks gains and limits. The test program is `test_vectors.c`.
+The constant `JAXHIL_<NAME>_SAMPLES` is the number of samples in the delay line whose delay is the gain or
+limit NAME.
 """
 
 import functools
@@ -35,7 +36,7 @@ HEADER_FILE, SOURCE_FILE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS_FILE, TEST_FILE = "jaxhil_gains.h", "test_vectors.c"
 COMPILER_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 TEST_PROGRAM_FOLDER = resources.files("tuning") / "bundle"
-# Methods and properties in the C interface, in the header's order.
+# Names in C of the controller's methods and properties, in the order of the header.
 PUBLIC_METHODS = {
     "tare": "tare",
     "step": "step",
@@ -56,15 +57,15 @@ PUBLIC_METHODS = {
 _DELAY_LINE_LENGTH = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
 
 _HEADER_TEMPLATE = """\
-/* The controller of a hardware-in-the-loop docking rig, with the compensator `{law}`.
+/* Controller of a hardware-in-the-loop docking rig, with the compensator `{law}`.
  *
- * C99, no allocation, no library but math.h. The caller owns the struct:
+ * It is written in C99, allocates no memory, and uses no library but math.h. The caller owns the struct:
  *
  *     static jaxhil_controller controller;
  *     jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
  *
- * Compile with -ffp-contract=off (and never -ffast-math, nor a part of it): the results then are those of the
- * runtime in Python bit for bit, which test_vectors.c checks. The headers are C++ too, from C++11 on.
+ * Compile with -ffp-contract=off, and never with -ffast-math or a part of it. Then the results equal those of
+ * the Python runtime to the last bit, which test_vectors.c checks. The headers are also valid C++ (C++11).
  */
 #ifndef JAXHIL_CONTROLLER_H
 #define JAXHIL_CONTROLLER_H
@@ -76,19 +77,19 @@ _HEADER_TEMPLATE = """\
 #include <stdint.h>
 
 #if defined(__FAST_MATH__) || defined(_M_FP_FAST)
-#error "-ffast-math loses what is not finite, and the controller with it (of MSVC: /fp:precise)"
+#error "do not use -ffast-math: the controller needs NaN and infinity (MSVC: use /fp:precise)"
 #endif
 #if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
-#error "-ffinite-math-only loses what is not finite, and the controller with it"
+#error "do not use -ffinite-math-only: the controller needs NaN and infinity"
 #endif
 #if defined(__ASSOCIATIVE_MATH__) || defined(__RECIPROCAL_MATH__)
-#error "-fassociative-math and -freciprocal-math compute something else"
+#error "do not use -fassociative-math or -freciprocal-math: they change the results"
 #endif
 #if FLT_RADIX != 2 || DBL_MANT_DIG != 53 || DBL_MAX_EXP != 1024
-#error "a double has to be one of IEEE 754"
+#error "double must be the 64-bit format of IEEE 754"
 #endif
 #if FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1
-#error "a double has to be computed as one (on a 32-bit x86: -msse2 -mfpmath=sse)"
+#error "double must be computed in double precision (32-bit x86: use -msse2 -mfpmath=sse)"
 #endif
 {lengths}
 #ifdef __cplusplus
@@ -107,7 +108,7 @@ _SOURCE_TEMPLATE = """\
 /* See jaxhil_controller.h. */
 #include "jaxhil_controller.h"
 
-/* No a * b + c with one rounding. GCC does not know the pragma of C99, and warns of it. */
+/* Forbid fused operations, which compute a * b + c with one rounding. GCC does not support the C99 pragma. */
 #if defined(_MSC_VER) && !defined(__clang__)
 #pragma fp_contract(off)
 #elif defined(__GNUC__) && !defined(__clang__)
@@ -121,7 +122,7 @@ _SOURCE_TEMPLATE = """\
 _GAINS_TEMPLATE = """\
 /* Gains of the compensator `{law}` and limits, from the gain file whose content has the SHA-256
  * {digest}.
- * Decimal, 17 significant digits: a compiler reads back the same doubles.
+ * A compiler reads the same doubles from the numbers, which have 17 significant digits.
  */
 #ifndef JAXHIL_GAINS_H
 #define JAXHIL_GAINS_H
@@ -136,11 +137,12 @@ _GAINS_TEMPLATE = """\
 
 
 _PROTOTYPES_TEMPLATE = """
-/* Begin with these gains and limits. False if they are not admitted, or ask for a longer delay than this code
- * holds: the controller then stays tripped, with the cause JAXHIL_UNUSABLE. */
+/* Initialise the controller with these gains and limits. Return false if a value is out of its range, or if a
+ * delay is longer than the delay lines of this code: the controller then stays tripped, with the cause
+ * JAXHIL_UNUSABLE. */
 bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits);
 
-/* Identified stiffness [N/m] and damping [N s/m]; 0 and 0 if the law identifies none. */
+/* Get the identified stiffness [N/m] and damping [N s/m]; both are 0 without an identification. */
 void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
 """
 
@@ -180,12 +182,12 @@ void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, d
 
 
 def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> dict[str, str]:
-    """Return the files of the controller in C99 by name: header, source, gains, test program.
+    """Generate the C99 files of the controller: header, source, gains and test program.
 
-    Equal documents give equal texts.
+    Equal documents give equal files.
 
     Args:
-        document: the gain document.
+        document: gain document.
         source: label of the document in error messages.
 
     Returns:
@@ -193,10 +195,11 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
 
     Raises:
         GainFileError: If the runtime refuses the document.
-        InputError: If the compensator uses a construct without C code; the message names file and line.
+        InputError: If the compensator contains Python code that cannot be translated to C. The message names
+            file and line.
     """
     gain_file = check_gain_document(document, source)
-    Controller(gain_file, source)  # raises an error for delays longer than any delay line
+    Controller(gain_file, source)  # raises an error if a delay is too long for every delay line
     law = gain_file.compensator
     declarations, definitions = _generate_code(law, COMPENSATORS[law])
     return {
@@ -213,7 +216,7 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
 
 @functools.cache
 def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
-    """Return declarations and definitions of the controller with a compensator."""
+    """Return the C declarations and definitions of the controller with the compensator `law`."""
     signs = {
         "gains": {name: _sign_condition(gain.lowest) for name, gain in class_.gains.items()},
         "limits": {name: _sign_condition(limit.lowest) for name, limit in LIMITS.items()},
@@ -240,7 +243,9 @@ def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
         program.add(vars(Controller)["identified"].fget, Controller)
         output = program.output()
     except SubsetError as error:
-        raise InputError(to_one_line(f"c99: {law}: {error}; `--format csv` leaves C out")) from None
+        raise InputError(
+            to_one_line(f"c99: {law}: {error}; use `--format csv` to export without C code")
+        ) from None
     tables = [gains_fragment(law), limits_fragment(), faults_fragment(), statuses_fragment()]
     declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
     defined = "\n".join(table.definitions for table in tables if table.definitions)
@@ -251,18 +256,18 @@ def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
 
 
 def _sign_condition(lowest: float) -> str:
-    """Return the C condition on the sign of a value with this lower bound."""
+    """Return the C condition on the sign of a value that follows from its lower bound; empty if none."""
     return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 
 def _define_lengths(declarations: str, gain_file: GainFile) -> str:
-    """Return the definitions of the lengths of all delay lines."""
+    """Return the C macros that define the number of samples in each delay line."""
     lines = []
     delays = {**gain_file.limits, **gain_file.gains}
     for name in dict.fromkeys(_DELAY_LINE_LENGTH.findall(declarations)):
         whole = math.floor(delays[name.lower()] / gain_file.control_period + 1e-9)
         lines.append(
-            f"\n/* Samples of the line that delays by `{name.lower()}`: raise it to load longer delays. */\n"
+            f"\n/* Samples in the delay line of `{name.lower()}`; increase the number for longer delays. */\n"
             f"#define JAXHIL_{name}_SAMPLES {whole + 2}\n"
         )
     return "".join(lines)

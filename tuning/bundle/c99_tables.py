@@ -1,7 +1,8 @@
-"""Parts of the controller in C99 that come from tables of the runtime: gains, limits, faults, statuses.
+"""C code for the runtime's tables of gains, limits, faults and statuses.
 
-Each table becomes a struct or constants with the Python descriptions, and a check that accepts the same
-values as the runtime. The struct of gains begins with control period and clearance, which the laws also need.
+Each table becomes a C struct or enumeration, with the descriptions of the Python code as comments. For gains
+and limits, a C function accepts exactly the values that the Python runtime accepts. The struct of gains
+starts with control period and clearance, which the compensators also need.
 """
 
 import math
@@ -19,7 +20,7 @@ from jaxhil.rig.registry import COMPENSATORS
 MAX_LINE_WIDTH = 110
 
 
-# Conditions of `limits.complete` besides the range of each limit.
+# Relations between limits that `jaxhil.rig.limits.complete` checks, besides the range of each limit.
 _LIMIT_RELATIONS = (
     "limits->measured_lowest < limits->measured_highest",
     "limits->command_lowest < limits->command_highest",
@@ -28,15 +29,15 @@ _LIMIT_RELATIONS = (
 
 
 class CFragment(NamedTuple):
-    """Fragment of C code made from a table."""
+    """C code of one table, divided by the files that contain it."""
 
-    comment: str  # comment above it
-    declarations: str  # code for the header
-    definitions: str  # code for the source
+    comment: str  # comment above the declarations
+    declarations: str  # code for the header file
+    definitions: str  # code for the source file
 
 
 def format_double(value: float) -> str:
-    """Return a double as C text with 17 significant digits, which is read back as the same double."""
+    """Return a C literal with 17 significant digits, from which a compiler reads the same double."""
     if math.isinf(value):
         return "INFINITY" if value > 0.0 else "-INFINITY"
     text = f"{value:.17g}"
@@ -44,25 +45,25 @@ def format_double(value: float) -> str:
 
 
 def gains_fragment(law: str) -> CFragment:
-    """Return the struct `jaxhil_gains` of a compensator, and the check of its values."""
+    """Return the C struct `jaxhil_gains` of the compensator `law`, and a function that checks its values."""
     clearance = f"(({_range_condition('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
     entries = [
         ("control_period", f"s, {format_range(*CONTROL_PERIODS)}"),
-        ("clearance", f"m, {format_range(*DISTANCES)}, of a contact with two sides; infinite with one"),
+        ("clearance", f"m, {format_range(*DISTANCES)}, between two surfaces; infinite for one surface"),
     ]
     checks = [_range_condition("control_period", *CONTROL_PERIODS), clearance]
     for name, gain in COMPENSATORS[law].gains.items():
         entries.append((name, f"{gain.unit}, {format_range(gain.lowest, gain.highest)}"))
         checks.append(_range_condition(name, gain.lowest, gain.highest))
     return CFragment(
-        f"/* The gains of the compensator `{law}`, within bounds that no gain file can move. */\n",
+        f"/* Gains of the compensator `{law}`; a gain file cannot change their ranges. */\n",
         _define_struct("jaxhil_gains", entries),
         _check_function("jaxhil_gains_admitted", "jaxhil_gains", "gains", checks),
     )
 
 
 def limits_fragment() -> CFragment:
-    """Return the struct `jaxhil_limits`, the check of its values, and the default limits."""
+    """Return the C struct `jaxhil_limits`, a function that checks its values, and the default limits."""
     entries = [
         (name, f"{limit.unit}, {format_range(limit.lowest, limit.highest)}: {limit.meaning}")
         for name, limit in LIMITS.items()
@@ -73,7 +74,7 @@ def limits_fragment() -> CFragment:
         {name: limit.unit for name, limit in LIMITS.items()},
     )
     return CFragment(
-        "/* The limits of the controller, each within bounds that no gain file can move. */\n",
+        "/* Limits of the controller; a gain file cannot change their ranges. */\n",
         _define_struct("jaxhil_limits", entries),
         f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
         + _check_function("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *_LIMIT_RELATIONS]),
@@ -81,22 +82,22 @@ def limits_fragment() -> CFragment:
 
 
 def faults_fragment() -> CFragment:
-    """Return the bits of the faults, and the function for their names."""
+    """Return a C enumeration of the faults' bits, and a function that returns the name of a fault."""
     named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in FAULTS]
     lines = []
     for name, fault in named:
         lines.append(_format_comment(f"{fault.condition}; reaction: {fault.reaction}", "    "))
         lines.append(f"    {name} = 0x{fault.bit:X},\n")
     lines.append(
-        "    /* the gains or limits given to jaxhil_init are not admitted; reaction: stays tripped */\n"
+        "    /* a gain or limit given to jaxhil_init is out of its range; reaction: stays tripped */\n"
     )
     lines.append(f"    JAXHIL_UNUSABLE = 0x{UNUSABLE:X}\n")
     cases = "".join(f'    case {name}:\n        return "{fault.name}";\n' for name, fault in named)
     return CFragment(
-        "/* What can go wrong on the rig, and what the controller does about it: one bit each, raised on\n"
-        " * the tick at which it happens. A trip is latched. */\n",
+        "/* Faults on the rig, and the controller's reactions. Each fault is one bit, which is set in the\n"
+        " * tick in which the fault occurs. A trip is latched. */\n",
         f"enum {{\n{''.join(lines)}}};\n\n"
-        '/* The name of a fault, from its one bit; "" if it has none. */\n'
+        '/* Return the name of the fault with this bit; "" if there is no such fault. */\n'
         "const char *jaxhil_fault_name(uint32_t bit);\n",
         "const char *jaxhil_fault_name(uint32_t bit) {\n    switch (bit) {\n"
         f"{cases}"
@@ -106,7 +107,7 @@ def faults_fragment() -> CFragment:
 
 
 def statuses_fragment() -> CFragment:
-    """Return the statuses of a compensator, and the function for their names."""
+    """Return a C enumeration of the compensator's statuses, and a function that returns a status's name."""
     named = [(f"JAXHIL_{status.name.upper()}", status) for status in STATUSES]
     lines = [
         f"{_format_comment(status.meaning, '    ')}    {name} = {status.number}" for name, status in named
@@ -114,9 +115,9 @@ def statuses_fragment() -> CFragment:
     joined = ",\n".join(lines)
     cases = "".join(f'    case {name}:\n        return "{status.name}";\n' for name, status in named)
     return CFragment(
-        "/* What a law may say of its last command. */\n",
+        "/* Statuses of the compensator at its last command. */\n",
         f"enum {{\n{joined}\n}};\n\n"
-        '/* The name of a status; "" if there is none of the number. */\n'
+        '/* Return the name of the status with this number; "" if there is no such status. */\n'
         "const char *jaxhil_law_status_name(int status);\n",
         "const char *jaxhil_law_status_name(int status) {\n    switch (status) {\n"
         f'{cases}    default:\n        return "";\n    }}\n}}\n',
@@ -124,7 +125,7 @@ def statuses_fragment() -> CFragment:
 
 
 def gain_file_constants(gain_file: GainFile) -> str:
-    """Return the gains and the limits of a gain file as constants of those structs."""
+    """Return C constants with the gains and limits of a gain file (`jaxhil_gains`, `jaxhil_limits`)."""
     units = {"control_period": "s", "clearance": "m"}
     units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
     gains = {
@@ -141,20 +142,20 @@ def gain_file_constants(gain_file: GainFile) -> str:
 
 
 def _initialisers(values: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """Return initialisers in the order of the struct; C++ has no names for fields before C++20."""
+    """Return the C initialisers of a struct's fields, in order; before C++20, they cannot name the fields."""
     return "".join(
         f"    {format_double(value)}, /* {name}, {units[name]} */\n" for name, value in values.items()
     )
 
 
 def _define_struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
-    """Return the definition of a struct of doubles."""
+    """Return the C definition of a struct of doubles; `entries` are names and comments of the fields."""
     lines = "".join(f"{_format_comment(meaning, '    ')}    double {entry};\n" for entry, meaning in entries)
     return f"typedef struct {{\n{lines}}} {name};\n"
 
 
 def _range_condition(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
-    """Return a C condition that a value is in its range; without bounds, that it is finite."""
+    """Return the C condition that a field is within its range, and finite if the range is unbounded."""
     open_below, open_above = math.isinf(lowest), math.isinf(highest)
     conditions = [f"isfinite({struct}->{name})"] * (open_below or open_above)
     conditions += [] if open_below else [f"{struct}->{name} >= {format_double(lowest)}"]
@@ -163,12 +164,12 @@ def _range_condition(name: str, lowest: float, highest: float, struct: str = "ga
 
 
 def _check_function(function: str, struct: str, argument: str, checks: Iterable[str]) -> str:
-    """Return a C function that checks all conditions."""
+    """Return a C function that returns true if a struct satisfies all conditions `checks`."""
     joined = " &&\n           ".join(checks)
     return f"static bool {function}(const {struct} *{argument}) {{\n    return {joined};\n}}\n"
 
 
 def _format_comment(text: str, indent: str) -> str:
-    """Return text as an indented C comment."""
+    """Return `text` as a C comment, wrapped and indented."""
     lines = textwrap.wrap(text, MAX_LINE_WIDTH - len(indent) - 6, break_long_words=False)
     return f"{indent}/* {f'{chr(10)}{indent} * '.join(lines)} */\n"

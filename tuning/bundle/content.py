@@ -1,7 +1,7 @@
-"""Content of the files of a bundle, as this version writes them.
+"""Content of all files in a bundle.
 
-Given the vectors and the plot of the summary, the gain document determines every byte of a bundle.
-`export` writes this content, and `verify` compares a bundle with it.
+The gain document, the test vectors and the plot of the summary determine every byte. `jaxhil export` writes
+this content, and `jaxhil verify` compares a bundle with it.
 """
 
 import json
@@ -20,7 +20,7 @@ COPIED_FILES = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol
 
 
 def code_files(compensator: str) -> dict[str, bytes]:
-    """Return the Python code of every bundle of a compensator, by path.
+    """Return the Python files that every bundle of a compensator contains.
 
     These are the runtime, the self-test and the UDP controller.
 
@@ -32,7 +32,7 @@ def code_files(compensator: str) -> dict[str, bytes]:
 
     Raises:
         KeyError: If the runtime does not know the compensator.
-        ValueError: If the runtime's modules cannot be joined to one file.
+        ValueError: If the runtime's modules cannot be joined into one file.
     """
     from tuning.bundle.single_file import build_runtime_source
 
@@ -43,27 +43,28 @@ def code_files(compensator: str) -> dict[str, bytes]:
 def bundle_files(
     document: Mapping[str, Any], formats: Sequence[str], vectors: bytes, plot: bytes | None = None
 ) -> dict[str, bytes]:
-    """Return all files of the bundle of a checked gain document, by path.
+    """Return all files of a bundle for a checked gain document.
 
     Args:
-        document: the gain document.
+        document: gain document.
         formats: names of the additional formats of the gains.
-        vectors: content of vectors.csv.
-        plot: plot of the summary (PNG); None draws it.
+        vectors: content of the file vectors.csv.
+        plot: plot for the summary, as PNG; None to draw a new plot.
 
     Returns:
         Content of each file by its path in the bundle.
 
     Raises:
         InputError: If the compensator does not support a format.
-        KeyError, ValueError: As `code_files`.
+        KeyError: If the runtime does not know the compensator.
+        ValueError: If the runtime's modules cannot be joined into one file.
     """
     from tuning.bundle.readme import readme_text
     from tuning.bundle.summary import summary_html
     from tuning.bundle.writers import WRITERS
 
     gains = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    # The file sorts its keys, so the content must not depend on the caller's order.
+    # Read the document back, so that all files have the key order of gains.json and not the caller's order.
     document = json.loads(gains)
     if limits := document.get("limits"):
         document = {**document, "limits": {name: limits[name] for name in LIMITS if name in limits}}
@@ -81,7 +82,7 @@ def bundle_files(
 
 
 def find_formats(names: Collection[str], document: Mapping[str, Any]) -> list[str]:
-    """Return the formats of which a bundle with these file names contains files."""
+    """Return the names of the additional formats that a bundle contains, from the names of its files."""
     from tuning.bundle.writers import WRITERS
 
     formats = []

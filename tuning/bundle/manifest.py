@@ -1,7 +1,8 @@
-"""Manifest of a bundle: the expected content of every file, detailed enough to locate a difference.
+"""Manifest of a bundle: checksums of every file, detailed enough to locate a changed line.
 
-It has the SHA-256 of each file, a check of every line of text files, the values of the gain file, the version
-that wrote it, and checks of the manifest itself. The bundle's self-test and `verify` read it.
+The manifest contains the SHA-256 of each file, a checksum of every line of text files, the values in the gain
+file, the version of jaxhil, and checksums of the manifest itself. The bundle's self-test and `jaxhil verify`
+read it.
 """
 
 import hashlib
@@ -14,12 +15,12 @@ from typing import Any
 
 from tuning.bundle import selftest
 
-# Files by which a folder is recognised as a bundle.
+# A folder that contains one of these files is a bundle.
 BUNDLE_MARKERS = (selftest.MANIFEST_FILE, selftest.SIGNATURE_FILE, "selftest.py", "jaxhil_runtime.py")
 
 
 def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> bytes:
-    """Return the manifest of the files of a bundle, by path, with the values of the gain document."""
+    """Return the content of manifest.json for the files of a bundle and its gain document."""
     entries = {}
     for name, content in sorted(files.items()):
         entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
@@ -42,7 +43,7 @@ def manifest_text(files: Mapping[str, bytes], document: Mapping[str, Any]) -> by
 
 
 def package_version() -> str:
-    """Return the version of this package, as written into manifests."""
+    """Return name and version of this package, such as "jaxhil 1.0"; manifests contain this text."""
     try:
         return f"jaxhil {metadata.version('jaxhil')}"
     except metadata.PackageNotFoundError:
@@ -50,7 +51,7 @@ def package_version() -> str:
 
 
 def is_text(content: bytes) -> bool:
-    """Return whether a file's content is text in UTF-8."""
+    """Return whether the content of a file is UTF-8 text."""
     try:
         content.decode("utf-8")
     except UnicodeDecodeError:
@@ -59,5 +60,5 @@ def is_text(content: bytes) -> bool:
 
 
 def is_bundle(folder: Path) -> bool:
-    """Return whether a folder contains a bundle, or remains of one."""
+    """Return whether a folder contains a bundle, even an incomplete one."""
     return folder.is_dir() and any(os.path.lexists(folder / name) for name in BUNDLE_MARKERS)

@@ -1,4 +1,4 @@
-"""README of a bundle: the template `bundle_readme.md`, filled with the data of the bundle."""
+"""README of a bundle, made from the template `bundle_readme.md` and the bundle's data."""
 
 import html
 import re
@@ -14,25 +14,25 @@ from jaxhil.rig.law_status import STATUSES
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 
-# Files and folders of a bundle with their purpose.
+# Purpose of each file and folder in a bundle.
 FILE_DESCRIPTIONS = {
-    "gains.json": "the gains, their limits for the rig, and all that they were tuned for and over",
-    "jaxhil_runtime.py": "the controller, in Python without further packages",
-    "vectors.csv": "recorded and hostile ticks, and what the controller commands at each",
-    "selftest.py": "checks all files and replays the vectors",
-    "summary.html": "one page for people: gains, limits, what they reach, where they hold",
-    "udp_controller.py": "the controller as a process that answers a rig over UDP",
-    "udp_protocol.py": "what that process and a rig say to each other",
-    "c99": "the controller in C99, its gains, its test program",
-    "ros2.yaml": "the gains as ROS 2 parameters",
-    "gains.mat": "the gains for MATLAB",
-    "gains.csv": "the gains as a table",
-    "manifest.json": "what every file must be, line by line",
+    "gains.json": "gains, limits for the rig, and the mechanism and uncertainty of the tuning",
+    "jaxhil_runtime.py": "controller in Python, which needs no further packages",
+    "vectors.csv": "test vectors: recorded and damaged ticks, with the controller's commands",
+    "selftest.py": "program that checks all files and replays the test vectors",
+    "summary.html": "summary on one page: gains, limits, errors, range of validity",
+    "udp_controller.py": "program that runs the controller as a process, which answers a rig over UDP",
+    "udp_protocol.py": "protocol between this process and a rig",
+    "c99": "controller in C99, its gains, and its test program",
+    "ros2.yaml": "gains as ROS 2 parameters",
+    "gains.mat": "gains for MATLAB",
+    "gains.csv": "gains as a table",
+    "manifest.json": "checksums of every file and of every line",
 }
 
 
 def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
-    """Return the README of the bundle of a gain document that contains these files."""
+    """Return the README of a bundle, in Markdown; `files` are the paths of the bundle's files."""
     present = {*(name.partition("/")[0] for name in files), "manifest.json"}
     table_rows = [f"| `{name}` | {text} |" for name, text in FILE_DESCRIPTIONS.items() if name in present]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
@@ -40,7 +40,7 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         compensator=document["compensator"],
         period=repr(document["control_period"]),
         digest=document["sha256"],
-        content="\n".join(("| file | is |", "|---|---|", *table_rows)),
+        content="\n".join(("| file | content |", "|---|---|", *table_rows)),
         statuses=status_table(),
         faults=fault_table(),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
@@ -49,13 +49,13 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
 
 
 def status_table() -> str:
-    """Return the runtime's table of a compensator's statuses in Markdown."""
+    """Return a Markdown table of the compensator's statuses: name and meaning."""
     rows = [f"| `{status.name}` | {_escape_cell(status.meaning)} |" for status in STATUSES]
-    return "\n".join(("| status | says |", "|---|---|", *rows))
+    return "\n".join(("| status | meaning |", "|---|---|", *rows))
 
 
 def fault_table() -> str:
-    """Return the runtime's table of faults in Markdown: bit, name, condition, reaction."""
+    """Return a Markdown table of the controller's faults: bit, name, condition and reaction."""
     rows = [
         f"| `{fault.bit:#x}` | `{fault.name}` | {_escape_cell(fault.condition)} | "
         f"{_escape_cell(fault.reaction)} |"
@@ -65,10 +65,10 @@ def fault_table() -> str:
 
 
 def _escape_text(text: str) -> str:
-    """Return a user's text with escaped Markdown and HTML."""
+    """Escape the Markdown and HTML characters in a user's text."""
     return re.sub(r"([\\`*_\[\]|~$#])", r"\\\1", html.escape(text, quote=False))
 
 
 def _escape_cell(text: str) -> str:
-    """Return a text for a cell of a Markdown table."""
+    """Escape the column separator in a text for a Markdown table."""
     return text.replace("|", "\\|")

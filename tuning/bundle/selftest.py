@@ -1,10 +1,10 @@
-"""Self-test of a bundle: checks its files, and replays recorded ticks through its controller.
+"""Self-test of a bundle: program that checks the files and replays recorded ticks through the controller.
 
-    python selftest.py          the files, the gains, and every test vector through jaxhil_runtime.py
-    python selftest.py --c      also the C controller, with the local C compiler (cc, or $CC)
+    python selftest.py          check the files and the gains, and replay all test vectors in Python
+    python selftest.py --c      also compile the C controller (with cc or $CC) and replay them in C
 
-It needs only Python 3.11 or later, prints one line per check, and ends with exit code 0 if all are good, else
-1. It cannot show who exported the bundle: for a signed one, use `jaxhil verify --key` on a workstation.
+The program needs only Python 3.11 or later. It prints one line per check. The exit code is 0 if all checks
+pass, else 1. The program cannot show who exported the bundle: use `jaxhil verify --key` on a workstation.
 """
 
 import hashlib
@@ -30,8 +30,10 @@ MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
     1 << 23,
 )  # of a bundle, and bytes of a text file in it
 SCHEMA = "jaxhil/bundle/1"
-MAX_SIMULATION_ERROR = 1e-11  # share of the range of a run's commands; the simulation rounds in another order
-MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences of one kind
+# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. The
+# simulation rounds in another order.
+MAX_SIMULATION_ERROR = 1e-11
+MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 VECTOR_COLUMNS = (
@@ -41,7 +43,7 @@ VECTOR_COLUMNS = (
 
 
 def main(arguments, folder):
-    """Run the checks on the bundle in `folder`; return True if all are good."""
+    """Run all checks on the bundle in `folder`; return True if all checks pass."""
     print(
         f"self-test of {escape_unprintable(os.path.basename(os.path.abspath(folder)))}, Python "
         f"{sys.version.split()[0]}"
@@ -52,12 +54,12 @@ def main(arguments, folder):
     agrees = runs and check_gains(folder, runtime) and check_vectors(folder, found, runtime)
     agrees_in_c = "--c" not in arguments or check_c(folder, found, damaged)
     good = not damaged and agrees is agrees_in_c is True
-    print("PASSED" if good else "FAILED: this bundle is not to be used on a rig")
+    print("PASSED" if good else "FAILED: do not use this bundle on a rig")
     return good
 
 
 def check_files(folder):
-    """Check every file against the manifest; return the contents, and the names of files that differ."""
+    """Check every file against the manifest; return the files' contents, and the names of differing files."""
     found, problems = find_differences(folder)
     reported = {}
     for name, text in problems:
@@ -81,7 +83,10 @@ def check_files(folder):
 
 
 def find_differences(folder):
-    """Return the content of each file by its path, and (path, difference in words) for each difference."""
+    """Compare all files with the manifest.
+
+    Return the content of each file by its path, and a list of (path, description) of the differences.
+    """
     found, problems, wrong, left = {}, [], [], MAX_BUNDLE_BYTES
     if os.path.lexists(os.path.join(folder, SIGNATURE_FILE)):
         problems += try_read_file(found, folder, SIGNATURE_FILE, 64)  # bytes of an Ed25519 signature
@@ -92,7 +97,7 @@ def find_differences(folder):
     except Exception as error:
         return found, [*problems, *wrong, (MANIFEST_FILE, f"cannot be read: {describe_error(error)}")]
     if wrong:
-        return found, problems + wrong  # a damaged manifest says nothing about other files
+        return found, problems + wrong  # a damaged manifest cannot be compared with other files
     for name, entry in files.items():
         problems += try_read_file(found, folder, name, left)
         content = found.get(name, b"")
@@ -103,82 +108,85 @@ def find_differences(folder):
             if name == "gains.json":
                 problems += [(name, text) for text in find_value_differences(content, values)]
     for name in find_unlisted_paths(folder, files):
-        compiled = "holds compiled code, which is not checked: take it out before use"
+        compiled = "contains compiled code, which is not checked: delete this folder before use"
         problems.append((name, compiled if name.endswith(PYTHON_CACHE) else "is no file of this bundle"))
     return found, problems
 
 
 def read_manifest_entries(manifest):
-    """Return the entry of each file, and the values of the gain file; raise an error for a wrong manifest."""
+    """Read from the manifest the entry of each file, and the values in the gain file.
+
+    Raise an error if the manifest is invalid.
+    """
     document = json.loads(manifest)
     if document["schema"] != SCHEMA:
         raise ValueError(f"schema: found {format_value(document['schema'])}, expected '{SCHEMA}'")
     files, values = document["files"], document["values"]
     for name, entry in files.items():
         if not PATH_PATTERN.fullmatch(name) or name in (MANIFEST_FILE, SIGNATURE_FILE):
-            raise ValueError(f"'{format_value(name)}' is no path of a file of a bundle")
+            raise ValueError(f"'{format_value(name)}' is not a valid path in a bundle")
         if (type(entry["sha256"]), type(entry["bytes"]), type(entry.get("lines", ""))) != (str, int, str):
-            raise ValueError("not the entries of a manifest")
+            raise ValueError(f"'{format_value(name)}': the entry has values of a wrong type")
     if len(files) > MAX_FILES or sum(entry["bytes"] for entry in files.values()) > MAX_BUNDLE_BYTES:
-        raise ValueError(f"more than {MAX_FILES} files or {MAX_BUNDLE_BYTES} bytes")
+        raise ValueError(f"the manifest lists more than {MAX_FILES} files or {MAX_BUNDLE_BYTES} bytes")
     return files, dict(values)
 
 
 def find_manifest_differences(content):
-    """Check a manifest against the checks of its lines at its end; return the differences in words."""
+    """Check a manifest against the checksums at its end; return descriptions of the differences."""
     body, found, seal = content.rpartition(b',\n "own_lines": ')
     try:
         own = json.loads(b'{"own_lines": ' + seal) if found else {}
         if hashlib.sha256(body).hexdigest() == own["own_sha256"]:
-            # A seal with the same values in another notation is not the exported one.
+            # The checksums must also have the exported notation.
             good = seal == build_manifest_seal(body).partition(b',\n "own_lines": ')[2]
             line = body.count(b"\n") + 2
-            return [] if good else [f"line {line} or after: its own checks differ"]
+            return [] if good else [f"line {line} or later: differs from what was exported"]
         return find_differing_lines(body, own["own_lines"])
     except Exception:
-        return ["its own checks at its end differ"]
+        return ["the checksums at its end differ from what was exported"]
 
 
 def build_manifest_seal(body):
-    """Return the end of a manifest: a check of each line of its body, and the body's SHA-256."""
+    """Return the end of a manifest: the checksum of each line of its body, and the SHA-256 of the body."""
     checks = json.dumps(line_checksums(body))
     return f',\n "own_lines": {checks},\n "own_sha256": "{hashlib.sha256(body).hexdigest()}"\n}}\n'.encode()
 
 
 def line_checksums(content):
-    """Return the CRC-32 of every line as eight hexadecimal digits; line endings do not count."""
+    """Return the CRC-32 of every line as eight hexadecimal digits, without the line endings."""
     lines = content.replace(b"\r\n", b"\n").split(b"\n")
     return " ".join(f"{zlib.crc32(line):08x}" for line in lines)
 
 
-def find_differing_lines(found, checks):
-    """Return in words which lines of a file differ from their checks."""
-    if checks is None or len(found) > MAX_TEXT_BYTES:
-        return [f"differs from what was exported ({len(found)} bytes are here)"]
-    here, expected = line_checksums(found).split(), checks.split()
-    if here == expected:
-        return ["its line endings differ from those exported"]
-    if len(here) == len(expected):
-        pairs = enumerate(zip(here, expected, strict=True), start=1)
+def find_differing_lines(content, checksums):
+    """Describe which lines of a file differ from their checksums; `checksums` is None for a binary file."""
+    if checksums is None or len(content) > MAX_TEXT_BYTES:
+        return [f"differs from what was exported (found {len(content)} bytes)"]
+    found, expected = line_checksums(content).split(), checksums.split()
+    if found == expected:
+        return ["its line endings differ from what was exported"]
+    if len(found) == len(expected):
+        pairs = enumerate(zip(found, expected, strict=True), start=1)
         return [f"line {number}: differs from what was exported" for number, (a, b) in pairs if a != b]
     first = [*(a == b for a, b in zip(here, expected, strict=False)), False].index(False)
     return [f"line {first + 1}: differs from what was exported; {len(here)} lines, expected {len(expected)}"]
 
 
 def find_value_differences(content, expected):
-    """Yield the key, the value found and the value expected of each changed value in a gain file."""
+    """Yield a text for each value of the gain file that differs: key, found value and expected value."""
     try:
         found = dict(flatten_document(json.loads(content), ""))
     except Exception:
         return
     for key in sorted({*expected, *found}):
-        here, there = (format_value(values.get(key, "nothing")) for values in (found, expected))
+        texts = [format_value(values.get(key, "nothing")) for values in (found, expected)]
         if found.get(key) != expected.get(key):
-            yield f"{escape_unprintable(key)}: found {here}, expected {there}"
+            yield f"{escape_unprintable(key)}: found {texts[0]}, expected {texts[1]}"
 
 
 def flatten_document(value, key):
-    """Yield (dotted key, value as JSON) for all values in a JSON document."""
+    """Yield (key, value) of all values in nested JSON data, with dotted keys and values as JSON text."""
     if isinstance(value, (dict, list)) and value:
         for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from flatten_document(inner, f"{key}.{name}" if key else str(name))
@@ -187,8 +195,8 @@ def flatten_document(value, key):
 
 
 def find_unlisted_paths(folder, files, within=""):
-    """Yield the paths of files and folders that the manifest does not name; folders end with a slash."""
-    for entry in sorted(os.scandir(os.path.join(folder, within)), key=lambda one: one.name):
+    """Yield the paths of files and folders that the manifest does not list; folders end with a slash."""
+    for entry in sorted(os.scandir(os.path.join(folder, within)), key=lambda item: item.name):
         path, is_folder = within + entry.name, entry.is_dir(follow_symlinks=False)
         if is_folder and any(name.startswith(f"{path}/") for name in files):
             yield from find_unlisted_paths(folder, files, f"{path}/")
@@ -197,19 +205,20 @@ def find_unlisted_paths(folder, files, within=""):
 
 
 def check_runtime(folder, found, damaged):
-    """Run the checked source of the runtime, and return its names; None if it does not run."""
+    """Execute the checked source of the runtime; return its namespace, or None after an error."""
     if {"jaxhil_runtime.py", MANIFEST_FILE} & damaged:
         return report_failure(
-            "jaxhil_runtime.py", "is not run: it, or the manifest, differs from what was exported"
+            "jaxhil_runtime.py",
+            "is not executed, because this file or the manifest differs from what was exported",
         )
     runtime = {"__name__": "jaxhil_runtime", "__file__": os.path.join(folder, "jaxhil_runtime.py")}
     try:
-        # An import could load the cache of an older source, and with -I it would not find the folder.
+        # An import statement could load a cached older version, and does not find this folder with -I.
         exec(compile(found["jaxhil_runtime.py"], "jaxhil_runtime.py", "exec"), runtime)
         if not {"Controller", "GainFileError"} <= {*runtime}:
-            raise NameError("it has no Controller or no GainFileError")
+            raise NameError("Controller or GainFileError is missing")
     except BaseException as error:
-        return report_failure("jaxhil_runtime.py", f"cannot be run: {describe_error(error)}")
+        return report_failure("jaxhil_runtime.py", f"cannot be executed: {describe_error(error)}")
     return runtime
 
 
@@ -226,13 +235,16 @@ def check_gains(folder, runtime):
 
 
 def check_vectors(folder, found, runtime):
-    """Check that every command equals the recorded one to the last bit, and is close to the simulated one."""
+    """Replay the test vectors through the runtime, and compare its commands.
+
+    Every command must equal the recorded command to the last bit, and be close to the simulated command.
+    """
     try:
         rows = list(read_vectors(found["vectors.csv"].decode("ascii")))
     except Exception as error:
         return report_failure("vectors.csv", f"cannot be read: {describe_error(error)}")
     if not rows:
-        return report_failure("vectors.csv", "has no tick")
+        return report_failure("vectors.csv", "contains no ticks")
     try:
         runs, different = replay_vectors(rows, os.path.join(folder, "gains.json"), runtime)
     except BaseException as error:
@@ -246,7 +258,7 @@ def check_vectors(folder, found, runtime):
 
 
 def check_simulated(runs):
-    """Check the commanded forces against those of the simulation, run by run."""
+    """Compare the force commands of each run with the simulated force commands."""
     largest, compared = 0.0, 0
     for run, ticks in runs.items():
         stated = [tick for tick in ticks if not math.isnan(tick[2])]
@@ -255,24 +267,23 @@ def check_simulated(runs):
         for number, force, simulated in stated:
             error = abs(force - simulated)
             if not error <= MAX_SIMULATION_ERROR * span:
-                text = f"run {run}: force {force!r} N, simulated {simulated!r} N"
-                return report_failure(
-                    "vectors.csv", f"line {number}: {text}, beyond {MAX_SIMULATION_ERROR} of {span!r} N"
-                )
+                text = f"run {run}: force command: found {force!r} N, expected {simulated!r} N"
+                limit = f"within {MAX_SIMULATION_ERROR} of the range {span!r} N"
+                return report_failure("vectors.csv", f"line {number}: {text} {limit}")
             largest = max(largest, error / span if span else 0.0)
-    text = f"the simulation's forces are met to {largest:.1e} of their range on {compared} ticks"
+    text = f"{compared} ticks, forces agree with the simulation within {largest:.1e} of their range"
     return (
         report_pass("vectors.csv", text)
         if compared
-        else report_failure("vectors.csv", "has no simulated force")
+        else report_failure("vectors.csv", "contains no simulated forces")
     )
 
 
 def read_vectors(text):
-    """Yield (line number, the row's numbers) for each tick; an empty field is None."""
+    """Yield (line number, list of numbers) for each row of vectors.csv; an empty field becomes None."""
     lines = text.split("\n")
     if lines[0].rstrip("\r") != VECTOR_COLUMNS:
-        raise ValueError("line 1: unknown columns")
+        raise ValueError(f"line 1: unknown columns, expected {VECTOR_COLUMNS}")
     width = VECTOR_COLUMNS.count(",") + 1
     for number, line in enumerate(lines[1:], start=2):
         if number == len(lines) and not line:
@@ -281,29 +292,35 @@ def read_vectors(text):
             row = [float(field) if field else None for field in line.rstrip("\r").split(",")]
         except ValueError:
             row = []
-        if len(row) != width or any(one is None for place, one in enumerate(row) if place != 6):
+        if len(row) != width or any(value is None for index, value in enumerate(row) if index != 6):
             raise ValueError(f"line {number}: not a row of {width} numbers")
         yield number, row
 
 
 def replay_vectors(rows, gains, runtime):
-    """Return (line, commanded force, simulated force) of each tick by run, and the differences in words."""
+    """Replay all rows of vectors.csv through the runtime's controller with the gain file `gains`.
+
+    Return a dictionary by run of lists of (line number, force command, simulated force command), and
+    descriptions of the differences from the recorded commands.
+    """
     controller, runs, different = None, {}, []
     for number, row in rows:
         run, event, force, position, velocity, measured, time, *motion = row[:10]
         if event == 1:
             controller = runtime["Controller"].from_file(gains)
         elif controller is None or event not in (0, 2):
-            raise ValueError(f"line {number}: event {event!r}, expected 0, 1 or 2, the first tick's 1")
+            raise ValueError(
+                f"line {number}: event: found {event!r}, expected 0, 1 or 2, and 1 in the first row"
+            )
         elif event == 2:
             controller.next_contact()
         command = controller.step(force, position, velocity, measured, time)
-        # The faults are the only integers in the file; they are compared as floats.
+        # The faults are integers in the file, and are compared as floats like all other columns.
         found = command, controller.position_command(*motion), float(controller.faults)
         texts = [
-            f"{name}: found {one!r}, expected {expected!r}"
-            for name, one, expected in zip(VECTOR_COLUMNS.split(",")[10:13], found, row[10:13], strict=True)
-            if not are_same_bits(one, expected)
+            f"{name}: found {value!r}, expected {expected!r}"
+            for name, value, expected in zip(VECTOR_COLUMNS.split(",")[10:13], found, row[10:13], strict=True)
+            if not are_same_bits(value, expected)
         ]
         if texts:
             different.append(f"line {number}, run {int(run)}: {', '.join(texts)}")
@@ -318,17 +335,17 @@ def are_same_bits(found, expected):
 
 
 def check_c(folder, found, damaged):
-    """Compile the C controller, and check that it reproduces the vectors."""
+    """Compile the C controller, and check that it reproduces the test vectors."""
     sources = [os.path.join(folder, name) for name in C_SOURCES]
     differs = any(name == MANIFEST_FILE or name.startswith("c99/") for name in damaged)
     if differs or not {*C_SOURCES} <= {*found}:
-        return report_failure("c99", "differs or is not here, so it is not compiled")
+        return report_failure("c99", "is not compiled, because a file is missing or differs")
     compiler = shutil.which(os.environ.get("CC") or "cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
-        return report_failure("c99", "no C compiler is here (cc, gcc, clang, or $CC)")
+        return report_failure("c99", "found no C compiler, expected cc, gcc, clang or $CC")
     try:
-        with tempfile.TemporaryDirectory() as place:
-            program = os.path.join(place, "test_vectors")
+        with tempfile.TemporaryDirectory() as build_folder:
+            program = os.path.join(build_folder, "test_vectors")
             vectors = os.path.join(os.path.abspath(folder), "vectors.csv")
             for command in ([compiler, *C_FLAGS, "-o", program, *sources, "-lm"], [program, vectors]):
                 done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
@@ -344,22 +361,22 @@ def check_c(folder, found, damaged):
 
 
 def read_plain_file(folder, name, most=MAX_BUNDLE_BYTES):
-    """Return the content of a plain file in the folder; links, pipes and devices are refused."""
+    """Return the content of a regular file in the folder; raise an error for links, pipes and devices."""
     path, parts = folder, name.split("/")
-    for place, part in enumerate(parts, start=1 - len(parts)):
+    for index, part in enumerate(parts, start=1 - len(parts)):
         path = os.path.join(path, part)
-        if not (stat.S_ISDIR if place else stat.S_ISREG)(os.lstat(path).st_mode):
-            raise ValueError("it is no plain file in folders of the bundle")
+        if not (stat.S_ISDIR if index else stat.S_ISREG)(os.lstat(path).st_mode):
+            raise ValueError("the path contains a link, or is not a regular file")
     flags = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
     with open(os.open(path, os.O_RDONLY | sum(flags)), "rb") as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode) or status.st_size > most:
-            raise ValueError(f"it is no plain file of at most {most} bytes")
+            raise ValueError(f"the path is not a regular file of at most {most} bytes")
         return file.read(status.st_size)
 
 
 def try_read_file(found, folder, name, most):
-    """Read a file into `found`; return a list with (path, reason) if that is not possible."""
+    """Read a file into the dictionary `found`; return [(path, reason)] after an error, else an empty list."""
     try:
         found[name] = read_plain_file(folder, name, most)
     except (OSError, ValueError) as error:
@@ -368,45 +385,45 @@ def try_read_file(found, folder, name, most):
 
 
 def report_pass(name, text):
-    """Print that a check is good; return True."""
+    """Print that a check has passed; return True."""
     print(f"ok    {escape_unprintable(name)}: {text}")
     return True
 
 
 def report_failure(name, text):
-    """Print in one line what is wrong; return None, which counts as a failure."""
+    """Print that a check has failed, and why; return None, which counts as false."""
     print(f"FAIL  {escape_unprintable(name)}: {text}")
 
 
 def describe_error(error):
-    """Return an error as text in one line."""
+    """Return type and message of an error in one printable line."""
     return escape_unprintable(f"{type(error).__name__}: {error}")[:200]
 
 
 def format_value(value):
-    """Return a value as a short printable text."""
+    """Return a value as a printable text of at most 80 characters."""
     return escape_unprintable(value if isinstance(value, str) else repr(value))[:80]
 
 
 def escape_unprintable(text):
-    """Return text with escapes for characters that a terminal may not print."""
+    """Escape all characters of a text that are not printable ASCII."""
     return "".join(c if c.isprintable() and c.isascii() else ascii(c)[1:-1] for c in text)
 
 
-def look_again():
-    """Check this file against the manifest without the functions above, which may be damaged."""
+def check_this_file():
+    """Check the SHA-256 of this file again, because a damaged check above could have passed it."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
         manifest = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))
         own = manifest["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
-        return  # the checks above have reported
+        return  # the checks above have reported this error
     if hashlib.sha256(read_plain_file(here, os.path.basename(__file__))).hexdigest() != own:
-        sys.exit("FAIL  selftest.py: differs from what the manifest says, and is not to be believed")
+        sys.exit("FAIL  selftest.py: differs from what was exported: do not trust its results")
 
 
 def report_exception(kind, error, trace):
-    """Report an unexpected error in one line."""
+    """Print an unexpected error in one line, instead of a traceback."""
     sys.stdout.flush()
     print(f"FAIL  selftest.py: cannot be run: {describe_error(error)}", file=sys.stderr)
 
@@ -416,7 +433,7 @@ if __name__ == "__main__":
     if {*sys.argv[1:]} - {"--c"}:
         sys.exit("usage: python selftest.py [--c]")
     good = main(sys.argv, os.path.dirname(os.path.abspath(__file__)))
-    look_again()
+    check_this_file()
     if not good:
         sys.exit("FAIL  the self-test")
-look_again()
+check_this_file()

@@ -1,7 +1,9 @@
-"""Signatures of bundles: Ed25519 (RFC 8032) over the manifest, which has the SHA-256 of every other file.
+"""Ed25519 signatures of bundles (RFC 8032).
 
-The signature is the file `manifest.sig` of 64 bytes; keys are PEM files, such as `openssl genpkey -algorithm
-ed25519` writes. It uses the package `cryptography`, the extra `jaxhil[sign]`, which is imported on use.
+The signature is made from the manifest, which contains the SHA-256 of every other file. The file
+`manifest.sig` contains the 64 bytes of the signature. Keys are PEM files, as `openssl genpkey -algorithm
+ed25519` writes them. This module needs the package `cryptography`, which `pip install 'jaxhil[sign]'`
+installs.
 """
 
 from collections.abc import Callable
@@ -11,28 +13,35 @@ from typing import Any
 from jaxhil.errors import InputError, to_one_line
 from jaxhil.files import open_input
 
-MAX_KEY_BYTES = 65536  # bytes; largest size of a key's file
+MAX_KEY_BYTES = 65536  # largest size of a key file [bytes]; real key files are much smaller
 
 
 def load_signer(path: Path) -> Callable[[bytes], bytes]:
-    """Return a function that signs bytes with the private key in a file. Raise `InputError`."""
+    """Return a function that signs bytes with the private key in a PEM file.
+
+    Raise `InputError` if the file or the package `cryptography` cannot be used.
+    """
     ed25519, serialization = _import_cryptography()
-    allowed = "an Ed25519 private key without a passphrase, as PEM"
-    key = _read_key(path, allowed, lambda text: serialization.load_pem_private_key(text, password=None))
+    expected = "an Ed25519 private key without a passphrase, as PEM"
+    key = _read_key(path, expected, lambda text: serialization.load_pem_private_key(text, password=None))
     if not isinstance(key, ed25519.Ed25519PrivateKey):
-        raise _key_error(path, "another kind of key", allowed)
+        raise _key_error(path, "another kind of key", expected)
     return key.sign
 
 
 def load_verifier(path: Path) -> Callable[[bytes, bytes], bool]:
-    """Return a function that checks signatures by the public key in a file. Raise `InputError`."""
+    """Return a function that checks a signature of bytes with the public key in a PEM file.
+
+    The function takes the signature and the signed bytes, and returns whether the signature is valid. Raise
+    `InputError` if the file or the package `cryptography` cannot be used.
+    """
     ed25519, serialization = _import_cryptography()
     from cryptography.exceptions import InvalidSignature
 
-    allowed = "an Ed25519 public key as PEM"
-    key = _read_key(path, allowed, serialization.load_pem_public_key)
+    expected = "an Ed25519 public key as PEM"
+    key = _read_key(path, expected, serialization.load_pem_public_key)
     if not isinstance(key, ed25519.Ed25519PublicKey):
-        raise _key_error(path, "another kind of key", allowed)
+        raise _key_error(path, "another kind of key", expected)
 
     def is_signature(signature: bytes, content: bytes) -> bool:
         try:
@@ -45,19 +54,22 @@ def load_verifier(path: Path) -> Callable[[bytes, bytes], bool]:
 
 
 def _import_cryptography() -> tuple[Any, Any]:
-    """Import and return the modules of `cryptography`. Raise `InputError` if it is not installed."""
+    """Import and return the modules of `cryptography`; raise `InputError` if it is not installed."""
     try:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError:
         raise InputError(
-            "signing: found no package cryptography, expected with it: pip install 'jaxhil[sign]'"
+            "signing: the package cryptography is not installed: run pip install 'jaxhil[sign]'"
         ) from None
     return ed25519, serialization
 
 
-def _read_key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
-    """Read a key from a PEM file by the function `load`. Raise `InputError`."""
+def _read_key(path: Path, expected: str, load: Callable[[bytes], Any]) -> Any:
+    """Read a PEM file and return the key that `load` decodes; raise `InputError` after an error.
+
+    `expected` describes the required kind of key for the error message.
+    """
     from cryptography.exceptions import UnsupportedAlgorithm
 
     try:
@@ -67,15 +79,15 @@ def _read_key(path: Path, allowed: str, load: Callable[[bytes], Any]) -> Any:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{to_one_line(str(path))}: cannot be read: {to_one_line(reason)}") from None
     if len(text) > MAX_KEY_BYTES:
-        raise _key_error(path, "a larger file", allowed)
+        raise _key_error(path, "a larger file", expected)
     try:
         return load(text)
     except TypeError:
-        raise _key_error(path, "an encrypted key", allowed) from None
+        raise _key_error(path, "an encrypted key", expected) from None
     except (ValueError, UnsupportedAlgorithm):
-        raise _key_error(path, "no such key", allowed) from None
+        raise _key_error(path, "no such key", expected) from None
 
 
-def _key_error(path: Path, found: str, allowed: str) -> InputError:
-    """Return the error for an unusable key file."""
-    return InputError(f"{to_one_line(str(path))}: found {found}, expected {allowed}")
+def _key_error(path: Path, found: str, expected: str) -> InputError:
+    """Return the error that describes an unusable key file."""
+    return InputError(f"{to_one_line(str(path))}: found {found}, expected {expected}")

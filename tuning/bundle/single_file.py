@@ -1,8 +1,8 @@
-"""Controller of the rig as one source file, with only the exported compensator.
+"""Generation of `jaxhil_runtime.py`: the rig's controller and one compensator in a single source file.
 
-It contains what `jaxhil.rig` offers in `__all__`, the compensator, and the modules of `jaxhil` that they
-import. The text of a module, with comments but without its docstring and imports, follows the modules that it
-imports. External imports come first, each once. Two modules that bind the same name raise an error.
+The file contains the modules of the names in `jaxhil.rig.__all__`, the module of the compensator, and all
+modules of `jaxhil` that these import. Imports of other packages come first. Each module follows the modules
+that it imports, with comments but without its imports. Two modules must not define the same name.
 """
 
 import ast
@@ -21,32 +21,32 @@ EXTERNAL_PACKAGES = {*sys.stdlib_module_names, "numpy"}
 
 
 class ModuleSource(NamedTuple):
-    """Source of a module of the package."""
+    """Source code of one module, with its imports."""
 
     name: str  # full name of the module
-    text: str  # whole text
-    tree: ast.Module  # syntax tree
-    inside: dict[str, str]  # module of the package by the name imported from it
-    outside: tuple[str, ...]  # import lines for external modules
-    # statements that are left out in one file: docstring, imports, `__all__`
+    text: str  # source code
+    tree: ast.Module  # syntax tree of the source code
+    inside: dict[str, str]  # for each name imported from this package, the module that defines it
+    outside: tuple[str, ...]  # import statements for other packages
+    # statements that the single file omits: docstring, imports and `__all__`
     omitted_statements: tuple[ast.stmt, ...]
 
 
 def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
-    """Return the text of `jaxhil_runtime.py`: all that `package` offers, with one compensator.
+    """Return the source code of `jaxhil_runtime.py`: the public names of `package` and one compensator.
 
     Args:
         compensator: name of the compensator.
         package: package of the runtime.
 
     Returns:
-        Python source.
+        Python source code.
 
     Raises:
-        KeyError: If the rig does not know the compensator.
-        ValueError: If the modules cannot be joined to one file: imports that are within a function, circular,
-            relative, renamed, or of packages other than this one, the standard library and NumPy; or a name
-            that two modules bind.
+        KeyError: If the runtime does not know the compensator.
+        ValueError: If the modules cannot be joined into one file. An import must not be circular, relative,
+            renamed or within a function, and may only use this package, the standard library and NumPy. Two
+            modules must not define the same name.
     """
     root = package.__name__.partition(".")[0]
     class_ = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS[compensator]
@@ -58,11 +58,11 @@ def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> 
     _check_unique(sources)
     public = [name for name in _public_names(offered) if name in offered.inside]
     imports = {line for source in sources for line in source.outside}
-    needed = "NumPy beside it" if any("numpy" in line for line in imports) else "nothing else to install"
+    needed = " and NumPy" if any("numpy" in line for line in imports) else ", and no other package"
     lines = [
-        f'"""The controller for the rig, compensator {compensator}: its whole source in this one file.',
+        f'"""Controller for the rig with the compensator {compensator}, in a single source file.',
         "",
-        f"Made of the package's modules by `jaxhil export`; Python 3.11 or later, {needed}.",
+        f"`jaxhil export` made this file from the modules of jaxhil. It needs Python 3.11 or later{needed}.",
         "",
         "    controller = Controller.from_file('gains.json')",
         '"""',
@@ -77,21 +77,24 @@ def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> 
     try:
         compile(text, "jaxhil_runtime.py", "exec")
     except SyntaxError as error:
-        raise ValueError(f"the runtime in one file does not compile: {error}") from None
+        raise ValueError(f"jaxhil_runtime.py: the joined modules do not compile: {error}") from None
     return text
 
 
 def read_source(name: str) -> ModuleSource:
-    """Return a module by its full name, with its docstring, imports and `__all__` separated."""
+    """Read and parse the source file of a module, given by its full name."""
     root, _, below = name.partition(".")
     path = Path(str(sys.modules[root].__file__)).parent / f"{below.replace('.', '/')}.py"
     if not path.is_file():
-        raise ValueError(f"{name}: found no module's file, expected imports of names from modules")
+        raise ValueError(f"{name}: found no source file, expected a module and not a package")
     return parse_source(path.read_text(encoding="utf-8"), name, path.name, root)
 
 
 def parse_source(text: str, name: str, file: str, root: str) -> ModuleSource:
-    """Return a module from its text; imports from the package `root` are internal."""
+    """Parse the source code of a module; imports from the package `root` are internal.
+
+    `file` is the file name for error messages.
+    """
     tree = ast.parse(text, file)
     inside: dict[str, str] = {}
     outside: list[str] = []
@@ -103,7 +106,7 @@ def parse_source(text: str, name: str, file: str, root: str) -> ModuleSource:
         where = f"{file}, line {node.lineno}"
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{root}."):
             if node not in tree.body:
-                raise ValueError(f"{where}: an import of the package within a block")
+                raise ValueError(f"{where}: found an import of {root} within a block, expected no block")
             inside.update(_internal_imports(node, where))
         elif node in tree.body:
             outside.extend(_external_imports(node, where))
@@ -113,35 +116,35 @@ def parse_source(text: str, name: str, file: str, root: str) -> ModuleSource:
 
 
 def _internal_imports(node: ast.ImportFrom, where: str) -> Iterator[tuple[str, str]]:
-    """Yield each name that an import of the package binds, and its module."""
+    """Yield (name, module) for each name that a statement imports from this package."""
     for alias in node.names:
         if alias.asname is not None:
-            raise ValueError(f"{where}: imports {alias.name} under another name, expected its own")
+            raise ValueError(f"{where}: imports {alias.name} under another name, expected no `as`")
         yield alias.name, str(node.module)
 
 
 def _external_imports(node: ast.Import | ast.ImportFrom, where: str) -> Iterator[str]:
-    """Yield one import line for each imported name."""
+    """Yield one import statement for each name that a statement imports from another package."""
     for alias in node.names:
         module = node.module or "" if isinstance(node, ast.ImportFrom) else alias.name
         if isinstance(node, ast.ImportFrom) and node.level:
-            raise ValueError(f"{where}: a relative import, expected imports by a module's full name")
+            raise ValueError(f"{where}: found a relative import, expected the module's full name")
         if module.partition(".")[0] not in EXTERNAL_PACKAGES:
-            raise ValueError(f"{where}: imports {module}, expected the standard library and NumPy")
+            raise ValueError(f"{where}: imports {module}, expected only the standard library and NumPy")
         line = f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
         yield f"from {module} {line}" if isinstance(node, ast.ImportFrom) else line
 
 
 def _sort_by_imports(names: Iterable[str], generated: dict[str, ModuleSource]) -> list[ModuleSource]:
-    """Return the wanted modules and all modules that they import, each after its own imports.
+    """Return the named modules and all modules that they import, in an order that satisfies the imports.
 
-    Modules in `generated` are not read from files.
+    The sources in `generated` replace source files.
     """
     ordered: dict[str, ModuleSource] = {}
 
     def visit(name: str, above: tuple[str, ...]) -> None:
         if name in above:
-            raise ValueError(f"modules that import each other: {' -> '.join([*above, name])}")
+            raise ValueError(f"these modules import each other: {' -> '.join([*above, name])}")
         if name in ordered:
             return
         source = generated.get(name) or read_source(name)
@@ -155,7 +158,7 @@ def _sort_by_imports(names: Iterable[str], generated: dict[str, ModuleSource]) -
 
 
 def _check_unique(sources: Iterable[ModuleSource]) -> None:
-    """Raise ValueError if two modules bind the same name, or a name has two external meanings."""
+    """Raise ValueError if two modules define the same name, or import different objects under it."""
     owners: dict[str, str] = {}
     for source in sources:
         bound = {name: source.name for statement in source.tree.body for name in _bound_names(statement)}
@@ -167,7 +170,7 @@ def _check_unique(sources: Iterable[ModuleSource]) -> None:
 
 
 def _bound_names(statement: ast.stmt) -> Iterator[str]:
-    """Yield the names that a top-level statement binds, except for imports and `__all__`."""
+    """Yield the names that a top-level statement defines, except for imports and `__all__`."""
     if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
         yield statement.name
     elif not isinstance(statement, (ast.Import, ast.ImportFrom)) and not _assigns(statement, "__all__"):
@@ -177,7 +180,7 @@ def _bound_names(statement: ast.stmt) -> Iterator[str]:
 
 
 def _module_section(source: ModuleSource) -> Iterator[str]:
-    """Yield the module's docstring as a comment, then its text without the dropped statements."""
+    """Yield the lines of a module in the single file: docstring as a comment, then the remaining code."""
     yield from ("", "", f"# ---- {source.name} " + "-" * (100 - len(source.name)))
     for line in (ast.get_docstring(source.tree) or "").splitlines():
         yield f"# {line}".rstrip()
@@ -190,20 +193,20 @@ def _module_section(source: ModuleSource) -> Iterator[str]:
 
 
 def _public_names(offered: ModuleSource) -> list[str]:
-    """Return the names in `__all__` of a module. Raise ValueError if there are none."""
+    """Return the names in the `__all__` of a module; raise ValueError if the module has no `__all__`."""
     for statement in offered.tree.body:
         if isinstance(statement, ast.Assign) and _assigns(statement, "__all__"):
             return list(ast.literal_eval(statement.value))
-    raise ValueError("the runtime's __init__ says nothing in __all__")
+    raise ValueError(f"{offered.name}: found no __all__, expected the public names of the runtime")
 
 
 def _public_modules(offered: ModuleSource) -> list[str]:
-    """Return the modules of the public names."""
+    """Return the modules that define the public names of a package."""
     return [offered.inside[name] for name in _public_names(offered) if name in offered.inside]
 
 
 def _assigns(statement: ast.stmt, name: str) -> bool:
-    """Return whether a statement assigns to a name."""
+    """Return whether a statement assigns a value to the variable `name`."""
     return isinstance(statement, ast.Assign) and any(
         isinstance(target, ast.Name) and target.id == name for target in statement.targets
     )

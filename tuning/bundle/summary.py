@@ -1,6 +1,6 @@
-"""Summary of a bundle on one page: purpose, gains, limits, watchdog, errors, and range of validity.
+"""Summary of a bundle for a printed A4 page: gains, limits, watchdog, errors, and range of validity.
 
-It is one HTML file with an embedded plot, made for one printed sheet of A4.
+The summary is one HTML file with an embedded plot.
 """
 
 import base64
@@ -13,7 +13,7 @@ from jaxhil.simulation.contact_plot import CURVE_LABELS
 from tuning.bundle.writers import GainOrLimit, gain_entries, limit_entries
 from tuning.plots.bundle_summary import ERROR_STATISTICS, summary_png
 
-# Prefixes of the limits that are fitted numbers of the watchdog's expected restitution.
+# Prefixes of those limits that are fitted coefficients of the watchdog's expected restitution.
 FITTED_LIMIT_PREFIXES = ("expected_", "softness_", "speed_", "loss_", "reference_")
 
 PAGE_STYLE = """
@@ -32,7 +32,10 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 
 
 def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
-    """Return the page of a checked gain document; `drawn` is its plot (PNG), None to draw it."""
+    """Return the HTML page for a checked gain document.
+
+    `drawn` is the plot as PNG; None to draw a new plot.
+    """
     mechanism = document["mechanism"]
     name = escape(to_one_line(mechanism["name"], 80))
     plot = base64.b64encode(summary_png(document) if drawn is None else drawn).decode("ascii")
@@ -47,7 +50,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
         f"Tuned {escape(to_one_line(document['created'], 40))}; seed {document['seed']}; "
         f"{escape(to_one_line(versions, 200))}.<br>",
         f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
-        f'<img alt="Restitution error, and what was tuned over" src="data:image/png;base64,{plot}">',
+        f'<img alt="Restitution error, and ranges of the uncertainty" src="data:image/png;base64,{plot}">',
         *_error_table(document),
         '<div class="columns"><div>',
         *_gain_table(document),
@@ -61,7 +64,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
 
 
 def describe_mechanism(mechanism: Mapping[str, Any]) -> str:
-    """Return a sentence on the mechanism and the rig."""
+    """Return a sentence that describes the mechanism and the rig."""
     bodies, contact, rig = mechanism["bodies"], mechanism["contact"], mechanism["rig"]
     mass = bodies.get("equivalent_mass")
     text = f"{_format_number(mass)} kg" if mass else f"bodies of {_format_list(bodies.values())} kg"
@@ -79,7 +82,7 @@ def describe_mechanism(mechanism: Mapping[str, Any]) -> str:
 
 
 def _error_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the table of errors on fresh scenarios."""
+    """Yield the HTML lines of the table of restitution errors in fresh scenarios."""
     robust = document["figures"].get("robust")
     rows = []
     for name, errors in robust.items() if isinstance(robust, Mapping) else ():
@@ -97,13 +100,13 @@ def _error_table(document: Mapping[str, Any]) -> Iterator[str]:
             "peak force / reference",
             "not ended",
         )
-        yield from _html_table("What is reached: restitution error |e - e*| [1]", heads, rows)
+        yield from _html_table("Restitution error |e - e*| [1]", heads, rows)
     else:
-        yield "<p>The gain file holds no figures of what the gains reach.</p>"
+        yield "<p>The gain file contains no restitution errors.</p>"
 
 
 def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the table of gains."""
+    """Yield the HTML lines of the table of gains."""
     rows = [
         (
             name,
@@ -116,14 +119,14 @@ def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:
     if rows:
         yield from _html_table("Gains", ("gain", "value", "unit", "bounds"), rows)
     else:
-        yield "<h2>Gains</h2><p>None: the measured force is passed on.</p>"
+        yield "<h2>Gains</h2><p>None: the force command is the measured force.</p>"
 
 
 def _limit_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the table of limits."""
+    """Yield the HTML lines of the table of limits."""
     limits = _active_limits(document)
     if not limits:
-        yield "<h2>Limits</h2><p>None in the gain file: those of the code hold.</p>"
+        yield "<h2>Limits</h2><p>None in the gain file: the controller's widest limits hold.</p>"
         return
     rows = [
         (name, _format_number(limit.value, 5), limit.unit)
@@ -134,7 +137,7 @@ def _limit_table(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _watchdog_section(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the verdict on the watchdog, its alarm rates, and the limits that are not set."""
+    """Yield the HTML lines on the watchdog: verdict, alarm rates, and the limits that are not set."""
     limits = _active_limits(document)
     if not limits:
         return
@@ -148,32 +151,32 @@ def _watchdog_section(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"<p>{escape(rates_text[0].upper() + rates_text[1:])}.</p>"
     fitted = sum(not is_user_limit(name) for name in limits)
     if fitted:
-        yield f"<p>Its expected restitution: {fitted} fitted numbers in the gain file.</p>"
+        yield f"<p>Expected restitution: {fitted} fitted coefficients in the gain file.</p>"
     unset = [name for name in document["limits"] if name not in limits]
     if unset:
-        yield f'<p class="note">Limited by the code alone: {escape(", ".join(unset))}.</p>'
+        yield f'<p class="note">Not set, the widest limit holds: {escape(", ".join(unset))}.</p>'
 
 
 def _watchdog_verdict(rates: Mapping[str, Any]) -> str:
-    """Return the verdict on the alarm rates, and the reasons against them."""
+    """Return a sentence with the verdict on the alarm rates and its reasons."""
     texts = [text for key in ("reasons", "unknown") for text in rates.get(key, ()) if isinstance(text, str)]
-    reasons = "; ".join(texts) or "wrong alarms are as rare as allowed"
+    reasons = "; ".join(texts) or "the rates of wrong alarms are within their limits"
     return to_one_line(f"{str(rates['verdict']).capitalize()}: {reasons}.", 500)
 
 
 def _active_limits(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
-    """Return the limits that have a value."""
+    """Return the limits that have a value in the gain document."""
     entries = limit_entries(document)
     return {name: entry for name, entry in entries.items() if document["limits"][name]["value"] is not None}
 
 
 def is_user_limit(limit: str) -> bool:
-    """Return whether a limit is meaningful to people; fitted numbers of the watchdog are not."""
+    """Return whether users set the limit; False for the watchdog's fitted coefficients."""
     return not limit.startswith(FITTED_LIMIT_PREFIXES)
 
 
 def describe_alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
-    """Yield texts on the rates of false and missed alarms, and on the errors that are noticed."""
+    """Yield texts on the rates of false and missed alarms, and on the errors that the watchdog detects."""
     for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
         rate = rates.get(name)
         if isinstance(rate, Mapping) and {"runs", "alarms", "low", "high"} <= rate.keys():
@@ -188,15 +191,15 @@ def describe_alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
         yield from _describe_noticed_errors(noticed, rates)
     calibrated = rates.get("calibrated_on")
     if isinstance(calibrated, Mapping) and calibrated.get("runs") not in (None, "good"):
-        yield "no run was good: the limits come from runs with errors beyond the limit"
+        yield "no run was good, so the limits were calibrated on runs with errors beyond the limit"
 
 
 def _describe_missed_faults(runs: Mapping[str, Any]) -> str:
-    """Return a text on how often a fault of known size is missed."""
+    """Return a text on how often the watchdog misses an injected fault of known size."""
     unit = "" if runs["unit"] == "1" else f" {runs['unit']}"
     if not runs["counted"]:
         most = f"up to {_format_number(runs['largest_size'], 2)}{unit}"
-        usable = f"{runs['runs']} of {runs['scenarios']} runs are good without it and just bad with it"
+        usable = f"only {runs['runs']} of {runs['scenarios']} runs are good without and bad with the fault"
         return f"{runs['meaning']}, {most}: not counted, {usable}"
     interval = f"95 %: {_format_number(runs['low'], 2)} to {_format_number(runs['high'], 2)}"
     interval += f", limit {_format_number(runs['allowed'], 2)}"
@@ -207,22 +210,26 @@ def _describe_missed_faults(runs: Mapping[str, Any]) -> str:
 
 
 def _describe_noticed_errors(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[str]:
-    """Yield texts on the smallest error that is noticed in 95 % of contacts."""
+    """Yield texts on the smallest error that the watchdog detects in 95 % of contacts."""
     if rates.get("widened_from") is not None:
         widened = (
             f"{_format_number(rates['widened_from'], 2)} to {_format_number(rates['restitution_margin'], 2)}"
         )
-        yield f"restitution_margin widened from {widened}, or too many good runs would be stopped"
+        yield f"restitution_margin widened from {widened}, because too many good runs would be stopped"
     if noticed.get("error") is not None:
-        yield f"errors from {_format_number(noticed['error'], 2)} on are noticed in 95 % of contacts"
+        yield f"errors above {_format_number(noticed['error'], 2)} are detected in 95 % of contacts"
     elif noticed.get("largest") is not None:
-        yield f"no error that occurred, up to {_format_number(noticed['largest'], 2)}, is noticed in 95 %"
+        largest = _format_number(noticed["largest"], 2)
+        yield f"no error in these runs (at most {largest}) is detected in 95 % of contacts"
 
 
 def _html_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] | None = None
 ) -> Iterator[str]:
-    """Yield the lines of an HTML table; columns `numbers` are right-aligned, by default all but the first."""
+    """Yield the lines of an HTML table; `numbers` are the indices of the right-aligned columns.
+
+    By default, all columns but the first and the unit are right-aligned.
+    """
     right = set(range(1, len(heads)) if numbers is None else numbers)
     if numbers is None and "unit" in heads:
         right.discard(list(heads).index("unit"))
@@ -239,12 +246,12 @@ def _html_table(
 
 
 def _format_number(value: Any, digits: int = 4) -> str:
-    """Return a number as text, or a dash if it is none."""
+    """Return a number as text; "-" for any other value."""
     return f"{value:.{digits}g}" if isinstance(value, (int, float)) else "-"
 
 
 def _format_list(values: Any, most: int = 4) -> str:
-    """Return numbers as text, at most `most` of them."""
+    """Return the first `most` numbers as text, followed by "..." if there are more."""
     texts = [_format_number(value) for value in values]
     return ", ".join(texts[:most]) + (", ..." if len(texts) > most else "")
 

@@ -1,7 +1,7 @@
-"""Source of the runtime class of a user-registered compensator, for the runtime in one file.
+"""Source code of a user-registered compensator's runtime class, for `jaxhil_runtime.py`.
 
-It contains the class and what the class uses of its own module: imports of the standard library, of NumPy and
-of `jaxhil.rig`, and the top-level statements that bind the other names.
+The source code contains the class and everything in its module that the class uses: imports, and the
+top-level statements that define the other names.
 """
 
 import ast
@@ -14,14 +14,14 @@ FORMER_PACKAGE, RIG_PACKAGE = "jaxhil.runtime.", "jaxhil.rig."
 
 
 def module_text(law: type, name: str) -> str:
-    """Return the text of a module with the class, registered as `name`, and all that it uses.
+    """Return the source code of a module that defines the class `law` and registers it as `name`.
 
-    Raise `InputError` for a class without source.
+    The module contains everything that the class uses. Raise `InputError` if the class has no source code.
     """
     try:
         text = inspect.getsource(sys.modules[law.__module__])
     except (OSError, TypeError, KeyError):
-        # A class in a notebook's cell has a source, but its module has none.
+        # A class in a notebook cell has source code, but its module has none.
         text = _class_text(law)
     tree = ast.parse(text)
     names, statements = {law.__name__}, set()
@@ -44,12 +44,14 @@ def module_text(law: type, name: str) -> str:
 
 
 def _class_text(law: type) -> str:
-    """Return the source of a class. Raise `InputError` if it has none."""
+    """Return the source code of a class; raise `InputError` if there is none."""
     try:
         return inspect.getsource(law)
     except (OSError, TypeError) as error:
         reason = to_one_line(str(error), 100)
-        raise InputError(f"{law.__name__}: found no source of the runtime class: {reason}") from None
+        raise InputError(
+            f"{law.__name__}: found no source code of the class ({reason}), expected a class in a file"
+        ) from None
 
 
 def _is_import(statement: ast.stmt) -> bool:
@@ -58,7 +60,7 @@ def _is_import(statement: ast.stmt) -> bool:
 
 
 def _bound_names(statement: ast.stmt) -> list[str]:
-    """Return the names that a top-level statement binds."""
+    """Return the names that a top-level statement defines or imports."""
     if isinstance(statement, (ast.Import, ast.ImportFrom)):
         return [alias.asname or alias.name.partition(".")[0] for alias in statement.names]
     if isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
@@ -68,7 +70,7 @@ def _bound_names(statement: ast.stmt) -> list[str]:
 
 
 def _restrict_import(statement: ast.stmt, names: set[str]) -> ast.stmt:
-    """Return an import of only the wanted names, with the present name of the rig's package."""
+    """Return the import without the names that are not in `names`, with today's name of the rig package."""
     assert isinstance(statement, (ast.Import, ast.ImportFrom))
     aliases = [alias for alias in statement.names if (alias.asname or alias.name.partition(".")[0]) in names]
     if isinstance(statement, ast.Import):

@@ -1,9 +1,9 @@
-"""Test vectors: inputs and commands of the runtime tick by tick, which a controller must reproduce.
+"""Test vectors: inputs and commands of the runtime in each tick, which every controller must reproduce.
 
-`record_vectors` replays the nominal run and random draws of the simulated loop through the runtime, together
-with the commands of the simulated controller. `make_damaged_rows` damages segments of the nominal run:
-readings and model states that are not finite, huge or stuck, and ticks that are late, missing or backwards in
-time. Position commands are those for a numerical model that is integrated under the runtime's force.
+`record_vectors` simulates the nominal run and random draws, and replays them through the runtime. The vectors
+contain the commands of both. `make_damaged_rows` adds damaged segments of the nominal run. The damage
+includes readings and model states that are infinite, NaN, huge or stuck, and clocks that jump or run
+backwards. The numerical model moves under the runtime's force command.
 """
 
 import csv
@@ -32,65 +32,67 @@ from tuning.verification.runtime_replay import (
 )
 from tuning.verification.stops import ControllerStop, find_passing_limits, find_stop
 
-RUN_START, NEXT_CONTACT = 1, 2  # events of a tick; 0 for none
-DEFAULT_DRAWS = 3
-MAX_RUN_TICKS = 6000  # ticks
-DAMAGED_RUNS, DAMAGED_RUN_TICKS = 48, 60
-DAMAGED_TICK_SHARE = 0.06  # share of the hostile ticks that are damaged
-KEYS_FIXED_BY_GAIN_FILE = ("rig.control_period", "contact.clearance")  # fixed by the gain file, so not drawn
-EXTREME_VALUES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)
+RUN_START, NEXT_CONTACT = 1, 2  # events that a tick can start with; 0 for no event
+DEFAULT_DRAWS = 3  # number of random draws besides the nominal run
+MAX_RUN_TICKS = 6000  # largest number of ticks of a recorded run, to limit the size of a bundle
+DAMAGED_RUNS, DAMAGED_RUN_TICKS = 48, 60  # number of damaged runs, and number of ticks in each
+DAMAGED_TICK_SHARE = 0.06  # fraction of ticks in a damaged run at which damage starts
+KEYS_FIXED_BY_GAIN_FILE = ("rig.control_period", "contact.clearance")  # not drawn: the gain file fixes them
+EXTREME_VALUES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)  # values for damaged inputs
 
 
 class ControllerInputs(NamedTuple):
-    """Inputs of the controller in one tick."""
+    """Inputs of the controller in one tick, and the command of the simulation."""
 
     run: int  # number of the run
     event: int  # `RUN_START`, `NEXT_CONTACT`, or 0
-    force_measured: float  # [N]
+    force_measured: float  # measured force [N]
     position_desired: float  # position of the numerical model [m]
     velocity_desired: float  # velocity of the numerical model [m/s]
-    position_measured: float  # [m]
-    time: float | None  # [s]; None without a clock
-    # the model's next position, velocity and acceleration [SI]; None if it is integrated here
+    position_measured: float  # measured position of the mechanism [m]
+    time: float | None  # time of the rig's clock [s]; None without a clock
+    # position [m], velocity [m/s] and acceleration [m/s^2] of the numerical model after the tick; None to
+    # integrate the model under the force command
     motion: tuple[float, float, float] | None = None
-    force_simulated: float = nan  # command of the simulated controller [N]
-    zeroed: bool = False  # whether the model gets no force, for any command
+    force_simulated: float = nan  # force command in the simulation [N]
+    zeroed: bool = False  # whether no force acts on the numerical model, whatever the force command
 
 
 class VectorRow(NamedTuple):
-    """Line of vectors.csv, in SI units."""
+    """Row of vectors.csv: inputs and commands of the controller in one tick."""
 
-    run: int  # this field and the next six as in `ControllerInputs`
-    event: int
-    force_measured: float
-    position_desired: float
-    velocity_desired: float
-    position_measured: float
-    time: float | None
-    position: float  # position of the numerical model at the next tick; the next two fields likewise
-    velocity: float
-    acceleration: float
-    force_command: float  # force command of the runtime
-    position_command: float  # position command of the runtime
-    faults: int  # bits of the faults
-    force_simulated: float  # simulated force command; NaN if there is none to compare with
+    run: int  # number of the run
+    event: int  # `RUN_START`, `NEXT_CONTACT`, or 0
+    force_measured: float  # measured force [N]
+    position_desired: float  # position of the numerical model before the tick [m]
+    velocity_desired: float  # velocity of the numerical model before the tick [m/s]
+    position_measured: float  # measured position of the mechanism [m]
+    time: float | None  # time of the rig's clock [s]; None without a clock
+    position: float  # position of the numerical model after the tick [m]
+    velocity: float  # velocity of the numerical model after the tick [m/s]
+    acceleration: float  # acceleration of the numerical model in the tick [m/s^2]
+    force_command: float  # force command of the runtime [N]
+    position_command: float  # position command of the runtime [m]
+    faults: int  # bits of the controller's faults
+    force_simulated: float  # force command in the simulation [N]; NaN if it is not comparable
 
 
 class RecordedVectors(NamedTuple):
-    """Vectors of recorded runs."""
+    """Test vectors, and the comparison of the recorded runs with the simulation."""
 
-    rows: list[VectorRow]  # ticks of all runs
-    mass: float  # equivalent mass of the nominal run [kg]
-    ended: list[str | None]  # for each run the reason for an early end of the comparison, or None
-    reasons: list[str]  # disagreements, in words
-    stop: ControllerStop | None  # stop of the nominal run by the limits; None if there is none
-    passing: dict[str, float] | None  # limits with which that run is not stopped, or None
+    rows: list[VectorRow]  # rows of all runs
+    mass: float  # equivalent mass in the nominal run [kg]
+    # for each recorded run, why the comparison with the simulation ended before the run; None if it did not
+    ended: list[str | None]
+    reasons: list[str]  # descriptions of the differences between runtime and simulation
+    stop: ControllerStop | None  # tick at which a limit stops the nominal run; None if no limit does
+    passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
 
 
 def record_vectors(
     loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DEFAULT_DRAWS
 ) -> RecordedVectors:
-    """Replay the nominal run and draws of the uncertain numbers through the runtime."""
+    """Simulate the nominal run and random draws of the uncertain values, and replay them in the runtime."""
     mechanism = remove_fixed_uncertainty(loaded.mechanism)
     batch = nominal_and_draws(mechanism, 1 + draws, seed)
     _, lanes = record_lanes(loaded, batch)
@@ -117,9 +119,9 @@ def record_vectors(
 def make_damaged_rows(
     nominal: Sequence[VectorRow], integrator: str, mass: float, gain_file: GainFile, seed: int
 ) -> list[VectorRow]:
-    """Return the runtime's rows for damaged segments of the nominal run.
+    """Return the rows of damaged runs: random segments of the nominal run with random damage of the inputs.
 
-    `mass` is the equivalent mass of the numerical model [kg].
+    `mass` is the equivalent mass of the numerical model [kg], `integrator` its integration rule.
     """
     source = random.Random(seed)
     rows: list[VectorRow] = []
@@ -132,7 +134,7 @@ def make_damaged_rows(
 
 
 def make_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> RecordedVectors:
-    """Return the recorded runs, followed by the hostile ones."""
+    """Return the test vectors of a bundle: first the recorded runs, then the damaged runs."""
     gain_file = check_gain_document(loaded.document)
     vectors = record_vectors(loaded, gain_file, seed, draws)
     nominal = [row for row in vectors.rows if row.run == 0]
@@ -142,7 +144,10 @@ def make_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> 
 
 
 def format_csv(rows: Sequence[VectorRow]) -> str:
-    """Return the text of vectors.csv: a header, then one line per tick with Python's repr; '' for None."""
+    """Return the text of vectors.csv: a header, then one line for each row.
+
+    Numbers have the shortest notation that preserves their bits; None becomes an empty field.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(VectorRow._fields)
@@ -151,12 +156,12 @@ def format_csv(rows: Sequence[VectorRow]) -> str:
 
 
 def remove_fixed_uncertainty(mechanism: Mechanism) -> Mechanism:
-    """Return the mechanism without uncertainty of the values that the gain file fixes."""
+    """Return the mechanism without the uncertainty of values that a gain file fixes."""
     return fix_at_nominal(mechanism, KEYS_FIXED_BY_GAIN_FILE)
 
 
 def _lane_inputs(run: int, lane: LaneRecord, period: float) -> Iterator[ControllerInputs]:
-    """Yield the inputs of one simulated run, tick by tick."""
+    """Yield the controller's inputs in each tick of one simulated run."""
     readings = zip(*(leaf.tolist() for leaf in lane.signals), strict=True)
     for tick, (force, position, velocity, measured, age) in enumerate(readings):
         if tick == MAX_RUN_TICKS:
@@ -172,7 +177,7 @@ def _lane_inputs(run: int, lane: LaneRecord, period: float) -> Iterator[Controll
 def _damage_inputs(
     source: random.Random, run: int, segment: Sequence[VectorRow], period: float
 ) -> Iterator[ControllerInputs]:
-    """Yield the inputs of a segment of the nominal run with random damage."""
+    """Yield the controller's inputs in each tick of a segment, with random damage."""
     timed = source.random() < 0.8
     time, stuck = source.uniform(0.0, 1e3), {}
     for tick, row in enumerate(segment):
@@ -204,7 +209,7 @@ _DAMAGE_KINDS = (*ControllerInputs._fields[2:6], "stuck", "clock", "motion")
 
 
 def _draw_extreme(source: random.Random, value: float) -> float:
-    """Return a random extreme value, or a random change of `value`."""
+    """Return a random choice of the extreme values and of changed copies of `value`."""
     return source.choice((*EXTREME_VALUES, 1e3 * value, -value, value + source.gauss(0.0, 1.0)))
 
 
@@ -215,7 +220,11 @@ def _run_controller(
     mass: float,
     gain_file: GainFile,
 ) -> tuple[list[VectorRow], list[tuple[float, float]], list[int]]:
-    """Return per tick the runtime's row, the identified stiffness and damping, and the acting faults."""
+    """Run the controller over the inputs.
+
+    Return, for each tick, the row of the test vectors, the identified stiffness [N/m] and damping [N s/m],
+    and the bits of the faults that change a command.
+    """
     rows, identified, acting = [], [], []
     move = INTEGRATORS[integrator]
     inverse_mass, period = 1.0 / mass, gain_file.control_period
@@ -232,11 +241,12 @@ def _run_controller(
         else:
             motion = reading.motion
         command = controller.position_command(*motion)
-        # The faults of a tick are complete only after both commands.
+        # The faults of a tick are complete only after the calls of `step` and `position_command`.
         faults = controller.faults
         rows.append(VectorRow(*reading[:7], *motion, force, command, faults, reading.force_simulated))
         identified.append(controller.identified)
-        # The fault LAW_IN_DOUBT changes no command, and a trip between two contacts is in the cause only.
+        # The fault LAW_IN_DOUBT changes no command. A trip between two contacts is not in the faults of a
+        # tick, but in the cause.
         acting.append(faults & ~LAW_IN_DOUBT | controller.cause)
     return rows, identified, acting
 
@@ -251,9 +261,9 @@ def _compare_with_simulation(
 ) -> tuple[list[VectorRow], str | None, str | None]:
     """Compare the runtime's rows with the simulation.
 
-    Return the rows with the simulated force as far as it is comparable, the reason for an early end, and the
-    disagreement. The comparison ends at the first tick at which a guard acts or rounding decides at a
-    threshold.
+    The comparison ends at the first tick in which a fault changes a command, or in which a rounding error
+    decides on which side of a threshold a value lies. Return the rows with the simulated forces up to that
+    tick, the reason for an early end or None, and a description of the first difference or None.
     """
     number = len(rows)
     if not number:

@@ -1,8 +1,8 @@
-"""Gain documents in the formats of other programs: ROS 2 parameters, MATLAB, CSV, C99.
+"""Export of gain documents to the formats of other programs: ROS 2 parameters, MATLAB, CSV and C99.
 
-`WRITERS` maps the names of `--format` to functions, which return the content of files by path for a checked
-gain document. Numbers are written so that the same doubles are read back; a limit of null is written as its
-default. A new format needs one function and its entry in `WRITERS`.
+`WRITERS` maps the name of each format (`--format`) to a function that takes a checked gain document and
+returns the content of each file by its path. All formats preserve the bits of the numbers. A limit of null is
+written as its default. To add a format, add a function and its entry in `WRITERS`.
 """
 
 import csv
@@ -16,21 +16,21 @@ from jaxhil.errors import InputError, format_value
 from jaxhil.rig.limits import LIMITS
 
 ROS2_NODE = "/jaxhil_controller"
-MAX_MATLAB_NAME_LENGTH = 63
+MAX_MATLAB_NAME_LENGTH = 63  # longest name of a struct's field in MATLAB [characters]
 _MAT_HEADER = b"MATLAB 5.0 MAT-file, made by jaxhil export"
 
 
 class GainOrLimit(NamedTuple):
-    """Gain or limit."""
+    """Value, unit and bounds of a gain or limit."""
 
-    value: float  # [SI]
-    unit: str  # unit of the value and its bounds
+    value: float  # value in SI units
+    unit: str  # unit of the value and of its bounds
     lower: float | None = None  # lower bound; None for a limit, which has no bounds
     upper: float | None = None  # upper bound; None for a limit
 
 
 def gain_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
-    """Return the document's gains by name."""
+    """Return the gains of a gain document by name."""
     return {
         name: GainOrLimit(float(gain["value"]), gain["unit"], float(gain["lower"]), float(gain["upper"]))
         for name, gain in document["gains"].items()
@@ -38,7 +38,7 @@ def gain_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
 
 
 def limit_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
-    """Return the document's limits by name; an empty dictionary if it has none."""
+    """Return the limits of a gain document by name; empty if the document has no limits."""
     return {
         name: GainOrLimit(_limit_value(name, limit["value"]), limit["unit"])
         for name, limit in document.get("limits", {}).items()
@@ -46,7 +46,7 @@ def limit_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
 
 
 def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return a ROS 2 parameter file: `/jaxhil_controller: ros__parameters:` with nested names.
+    """Return the content of `ros2.yaml`, a ROS 2 parameter file for the node `/jaxhil_controller`.
 
     Every number has a decimal point and every text is quoted, so that ROS 2 reads them as double and string.
     """
@@ -56,7 +56,7 @@ def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
         pass
 
     class Text(str):
-        """Quoted value, unlike an unquoted name."""
+        """Text that is written with quotes."""
 
     Dumper.add_representer(
         Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", str(text), style='"')
@@ -75,7 +75,7 @@ def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
             "limits": {name: Text(entry.unit) for name, entry in limits.items()},
         },
     }
-    # ROS 2 refuses empty tables.
+    # ROS 2 does not accept empty tables.
     tables = {ROS2_NODE: {"ros__parameters": _without_empty(parameters)}}
     text = yaml.dump(tables, Dumper=Dumper, sort_keys=False, default_flow_style=False, width=1000)
     heading = f"# Parameters of the compensator {document['compensator']}, in SI units.\n"
@@ -83,10 +83,10 @@ def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def matlab_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return `gains.mat` with a struct `jaxhil`.
+    """Return the content of `gains.mat`, a MATLAB file that contains the struct `jaxhil`.
 
-    Its fields are compensator, control_period, mechanism, sha256, gains and limits; each gain and limit is a
-    struct with value, unit and, for gains, lower and upper.
+    The fields of this struct are compensator, control_period, mechanism, sha256, gains and limits. Each gain
+    is a struct with the fields value, unit, lower and upper. Each limit is a struct with value and unit.
     """
     from scipy.io import savemat
 
@@ -102,16 +102,21 @@ def matlab_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     }
     for name in (*gains, *limits):
         if len(name) > MAX_MATLAB_NAME_LENGTH:
-            allowed = f"expected {MAX_MATLAB_NAME_LENGTH}"
-            raise InputError(f"matlab: {format_value(name)}: found {len(name)} characters, {allowed}")
+            raise InputError(
+                f"matlab: {format_value(name)}: found {len(name)} characters, expected at most "
+                f"{MAX_MATLAB_NAME_LENGTH}"
+            )
     file = io.BytesIO()
     savemat(file, {"jaxhil": content}, format="5", long_field_names=True, oned_as="row")
-    # SciPy writes the date into the first 116 characters; without it, equal gains give equal files.
+    # SciPy writes the date into the first 116 characters. Replace it, so that equal gains give equal files.
     return {"gains.mat": _MAT_HEADER.ljust(116) + file.getvalue()[116:]}
 
 
 def csv_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return `gains.csv`: name, value, unit, lower, upper; limits are named `limits.NAME`, without bounds."""
+    """Return the content of `gains.csv`, with the columns name, value, unit, lower and upper.
+
+    Limits have the names `limits.NAME` and no bounds.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("name", *GainOrLimit._fields))
@@ -126,7 +131,10 @@ def csv_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the controller in C99, in the folder `c99_files`. Raise `InputError` if it has no C code."""
+    """Return the controller's C99 files, in the folder `c99`.
+
+    Raise `InputError` if the compensator cannot be translated to C.
+    """
     from tuning.bundle.c99 import generate_c99
 
     return {f"c99/{name}": text.encode("ascii") for name, text in generate_c99(document).items()}
@@ -141,19 +149,19 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
 
 
 def _limit_value(name: str, value: float | None) -> float:
-    """Return the value of a limit; for null its default, which has no effect."""
+    """Return the value of a limit; for None its default, the widest limit."""
     return LIMITS[name].default if value is None else float(value)
 
 
 def _format_cell(value: float | str | None) -> str:
-    """Return a table cell as text; empty for None."""
+    """Return the text of a CSV cell; empty for None."""
     if value is None or isinstance(value, str):
         return value or ""
     return repr(value)
 
 
 def _without_empty(value: Any) -> Any:
-    """Return nested dictionaries without the empty ones."""
+    """Remove empty dictionaries from nested dictionaries."""
     if not isinstance(value, dict):
         return value
     inner = {key: _without_empty(item) for key, item in value.items()}

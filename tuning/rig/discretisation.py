@@ -1,9 +1,10 @@
-"""Exact discretisation of the motion simulator G(s) in plain floats, by one matrix exponential.
+"""Exact discretisation of the motion simulator's transfer function G(s), by matrix exponentials.
 
-A transport delay commutes with a linear system. So G is driven by the undelayed command, which is linear
-within each control period ("sampling interval"), and a delayed reading is its response at an earlier time.
-The response at the fraction s of a sampling interval is a constant row of numbers times (state, command at
-the interval's start, command at its end).
+A transport delay commutes with a linear system. Therefore G is driven by the undelayed command, which is
+linear within each control period ("sampling interval"), and a delayed sensor reading is the response of G at
+an earlier time. The response at a given fraction of a sampling interval is linear in three quantities: the
+state of G, the command at the interval's start, and the command at its end. A `ResponseRow` holds the
+coefficients.
 """
 
 import math
@@ -14,50 +15,61 @@ from scipy.linalg import expm
 
 from jaxhil.mechanism.structs import Simulator
 
+# Coefficients of (state, command at the sampling interval's start, command at its end).
 ResponseRow = tuple[float, ...]
-DELAY_ROUNDING_TOLERANCE = 1e-9  # rounding error [periods] within which a delay is a whole number of periods
+DELAY_ROUNDING_TOLERANCE = 1e-9  # [periods]; a delay this close to a whole number of periods is rounded to it
 
 
 class MotionRows(NamedTuple):
-    """Rows for position [m] and velocity [m/s] at one fraction of a sampling interval."""
+    """Coefficients of position [m] and velocity [m/s] at one fraction of a sampling interval."""
 
     position: ResponseRow
     velocity: ResponseRow
 
 
 class DiscreteSimulator(NamedTuple):
-    """Rows of the response over one period (see the module's text)."""
+    """Response of the motion simulator during one control period, as coefficient rows (`ResponseRow`)."""
 
     transition: tuple[ResponseRow, ...]  # state one period later
-    start: MotionRows  # start of the interval, as a limit from inside
-    sample: MotionRows  # sample of the force
-    end: MotionRows  # end of the interval, as a limit from inside
-    measured: ResponseRow  # position at the sample of the position sensor
-    steady_command: ResponseRow  # state of a uniform motion per current command [1/m]
-    steady_step: ResponseRow  # state of a uniform motion per increment of the command in a period [1/m]
+    start: MotionRows  # motion at the interval's start, as the limit from inside the interval
+    sample: MotionRows  # motion at the time at which the force sensor samples
+    end: MotionRows  # motion at the interval's end, as the limit from inside the interval
+    measured: ResponseRow  # position at the time at which the position sensor samples
+    # In uniform motion, the state is steady_command * command + steady_step * command increment per period.
+    steady_command: ResponseRow  # [1/m]
+    steady_step: ResponseRow  # [1/m]
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
-    """Return the whole sampling intervals of a delay [s], and the fraction in (0, 1] of that interval."""
+    """Return where a sample with a `delay` [s] lies: how many whole intervals earlier, and at which fraction.
+
+    The fraction is in (0, 1] and measured from the start of that sampling interval.
+    """
     periods = delay / period
     whole = math.floor(periods + DELAY_ROUNDING_TOLERANCE)
     return whole, min(1.0, 1.0 - (periods - whole))
 
 
 def discretise_simulator(
-    simulator: Simulator, period: float, hold: str, force_place: float, position_place: float
+    simulator: Simulator, period: float, hold: str, force_fraction: float, position_fraction: float
 ) -> DiscreteSimulator:
-    """Discretise G(s) exactly by the exponential of the system augmented by its input (Van Loan 1978).
+    """Discretise G(s) exactly by the matrix exponential of the system augmented by its input (Van Loan 1978).
 
-    With z' = A z + B u, z(s T) = E(s) (z, u(0), u(1) - u(0)), E the exponential of s T [[A, B, 0],
-    [0, 0, 1/T], [0, 0, 0]]. `hold` is "linear" or "zoh"; `force_place` and `position_place` are the fractions
-    of the period [s] at which the sensors sample.
+    For z' = A z + B u, the state at the fraction s of the period T is z(s T) = E(s) (z, u(0), u(T) - u(0)).
+    E(s) is the exponential of s T [[A, B, 0], [0, 0, 1/T], [0, 0, 0]].
+
+    Args:
+        simulator: motion simulator with the transfer function G(s).
+        period: control period T [s].
+        hold: interpolation of the command within a period, "linear" or "zoh".
+        force_fraction: fraction of the period at which the force sensor samples [1].
+        position_fraction: fraction of the period at which the position sensor samples [1].
     """
     numerator, denominator = transfer_function(simulator)
     order = len(denominator) - 1
     if order == 0:
-        return _discretise_ideal(period, hold, force_place, position_place)
-    # With time in periods the components of the state have similar magnitudes.
+        return _discretise_ideal(period, hold, force_fraction, position_fraction)
+    # Time is measured in periods, so that the components of the state have similar magnitudes.
     powers = period ** np.arange(order + 1.0)
     system = np.eye(order, k=1)
     system[-1] = -(denominator[::-1] / denominator[0])[:order] * powers[:0:-1]
@@ -67,18 +79,18 @@ def discretise_simulator(
     drive = np.zeros(order)
     drive[-1] = 1.0
 
-    def state_rows(place: float) -> np.ndarray:
+    def state_rows(fraction: float) -> np.ndarray:
         generator = np.zeros((order + 2, order + 2))
         generator[:order, :order] = system
         generator[order - 1, order] = 1.0
         generator[order, order + 1] = 1.0
-        rows = expm(place * generator)[: order + 1]
-        # This changes the columns from (z, u(0), u(1) - u(0)) to (z, u(0), u(1)).
+        rows = expm(fraction * generator)[: order + 1]
+        # Convert the columns from (z, u(0), u(1) - u(0)) to (z, u(0), u(1)), with time in periods.
         rows[:, order] -= rows[:, order + 1]
         return rows
 
-    def motion(place: float) -> MotionRows:
-        rows = state_rows(place)
+    def motion(fraction: float) -> MotionRows:
+        rows = state_rows(fraction)
         rates = system @ rows[:order] + np.outer(drive, rows[order])
         return MotionRows(_as_row(output @ rows[:order]), _as_row(output @ rates / period))
 
@@ -87,21 +99,22 @@ def discretise_simulator(
     if hold == "linear":
         steady_step = np.linalg.solve(system, steady_command)
     else:
-        # With a stepwise command, z(k) = alpha u(k+1) + beta step and z(k+1) = Ad z(k) + Bd u(k+1).
+        # A zero-order hold applies u(k+1) during interval k: z(k+1) = Ad z(k) + Bd u(k+1). Solve this for the
+        # state of a uniform motion, z(k) = steady_command u(k+1) + steady_step (u(k+1) - u(k)).
         steady_step = -np.linalg.solve(np.eye(order) - transition[:, :order], steady_command)
     return DiscreteSimulator(
         transition=tuple(_as_row(row) for row in transition),
         start=motion(0.0),
-        sample=motion(force_place),
+        sample=motion(force_fraction),
         end=motion(1.0),
-        measured=motion(position_place).position,
+        measured=motion(position_fraction).position,
         steady_command=_as_row(steady_command),
         steady_step=_as_row(steady_step),
     )
 
 
 def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Return numerator and denominator of G(s) in descending powers of s; order 0 is the ideal simulator."""
+    """Return numerator and denominator of G(s) in descending powers of s; both are 1 if it is ideal."""
     if simulator.model == "ideal":
         return np.ones(1), np.ones(1)
     if simulator.model == "transfer_function":
@@ -116,7 +129,10 @@ def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def evaluate_row(row: ResponseRow, state: list[float], start: float, end: float) -> float:
-    """Return one row times (state, command at the sampling interval's start, command at its end)."""
+    """Return the scalar product of `row` and (`state`, `start`, `end`).
+
+    `start` and `end` are the commands [m] at the start and the end of the sampling interval.
+    """
     total = row[-2] * start + row[-1] * end
     for weight, component in zip(row, state, strict=False):
         total += weight * component
@@ -124,15 +140,22 @@ def evaluate_row(row: ResponseRow, state: list[float], start: float, end: float)
 
 
 def _discretise_ideal(
-    period: float, hold: str, force_place: float, position_place: float
+    period: float, hold: str, force_fraction: float, position_fraction: float
 ) -> DiscreteSimulator:
     slope = (-1.0 / period, 1.0 / period) if hold == "linear" else (0.0, 0.0)
 
-    def place(at: float) -> MotionRows:
-        return MotionRows((1.0 - at, at), slope)
+    def motion(fraction: float) -> MotionRows:
+        return MotionRows((1.0 - fraction, fraction), slope)
 
-    measured = place(position_place).position
-    return DiscreteSimulator((), place(0.0), place(force_place), place(1.0), measured, (), ())
+    return DiscreteSimulator(
+        transition=(),
+        start=motion(0.0),
+        sample=motion(force_fraction),
+        end=motion(1.0),
+        measured=motion(position_fraction).position,
+        steady_command=(),
+        steady_step=(),
+    )
 
 
 def _as_row(values: np.ndarray) -> ResponseRow:

@@ -1,10 +1,11 @@
 """Real-time loop of the rig's process, with absolute deadlines and one packet per control period.
 
-At t_n the sensors' packet is sent to the controller's process. Its answer is in time within `ANSWER_SHARE` of
-the period; the rig needs the rest. A tick without an answer by then is missed: the rig continues with the
-newest command (`RigTask.advance`), and accepts the answer when it arrives. If the rig itself was delayed, it
-plays all due ticks at once, as missed ones. Only after a delay of more than `MAX_CATCH_UP_PERIODS` periods
-its clock is shifted, as if it had stopped.
+At the start of each period, the rig sends a packet with the sensor readings to the controller's process. The
+answer is in time if it arrives within the fraction `ANSWER_SHARE` of the period. The rig needs the rest of
+the period. A tick without an answer in time is a missed tick: the rig continues with the newest command
+(`RigTask.advance`), and accepts the late answer when it arrives. If the rig itself is late, it executes all
+due ticks at once and counts them as missed. If it is late by more than `MAX_CATCH_UP_PERIODS` periods, it
+shifts its clock by this delay instead.
 """
 
 import gc
@@ -24,15 +25,15 @@ from tuning.rig.udp_protocol import (
     encode_reading,
 )
 
-ANSWER_SHARE = 0.8  # share of a period within which the answer must arrive
-MAX_CATCH_UP_PERIODS = 10  # largest delay [periods] for which the rig catches up
-BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock without sleeping
-START_DELAY = 50_000_000  # time until the first tick [ns]
-TIME_AFTER_TRIP = 1.0  # time for which the rig continues after a trip [s]
+ANSWER_SHARE = 0.8  # longest time until an answer [periods]; the rig needs the rest of the period
+MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it still executes the due ticks
+BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
+START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
+TIME_AFTER_TRIP = 1.0  # time for which the rig continues after the controller has tripped [s]
 
 
 class RealTimeTask(Protocol):
-    """Rig's side of the loop without network and clock, such as `tuning.rig.rig_task.RigTask`."""
+    """Protocol of the work that `run_loop` does in each tick, such as `tuning.rig.rig_task.RigTask`."""
 
     @property
     def tripped(self) -> str: ...
@@ -42,7 +43,7 @@ class RealTimeTask(Protocol):
 
 
 class EmptyTask:
-    """Rig's side of an empty loop, which only exchanges packets."""
+    """Task that simulates no rig: it sends packets of zeros, to measure the loop alone."""
 
     tripped = ""
 
@@ -50,7 +51,7 @@ class EmptyTask:
         self._sequence = -1
 
     def reading(self) -> ReadingPacket:
-        """Return a packet of zeros."""
+        """Return a packet with sensor readings of zero."""
         self._sequence += 1
         return ReadingPacket(
             event=TICK,
@@ -65,19 +66,22 @@ class EmptyTask:
         )
 
     def take(self, answer: AnswerPacket) -> bool:
-        """Return whether it answers the last packet."""
+        """Return whether the answer belongs to the newest packet."""
         return bool(answer.flags & EMPTY_LOOP) and answer.sequence == self._sequence
 
     def advance(self) -> None:
-        """Do nothing, since nothing moves."""
+        """Do nothing, since there is no hardware to move."""
 
 
 class PacketTimes:
-    """Times of the packets, arrays by packet number.
+    """Measured times of all packets of a loop.
 
-    `late` is the delay of sending [ns], `round_trip` the time from sending to the answer [ns] (0 without an
-    answer), and `met` whether both were in time. `ticks` is the number of played ticks, `stood` the time by
-    which the rig's clock was shifted [ns].
+    Attributes:
+        late: delay of each packet after its due time [ns], (ticks,).
+        round_trip: time from each packet to its answer [ns], 0 without an answer, (ticks,).
+        answered_in_time: 1 if the packet and its answer were in time, else 0, (ticks,).
+        ticks: number of executed ticks.
+        clock_shift: total time by which the rig's clock was shifted [ns].
     """
 
     def __init__(self, ticks: int) -> None:
@@ -94,10 +98,17 @@ def run_loop(
     timing: PacketTimes,
     tell: Callable[[int], None],
 ) -> None:
-    """Play `len(timing.met)` ticks of `period` [s] in the given session, or until 1 s after a trip.
+    """Execute ticks in real time until `timing` is full, or until 1 s after the controller has tripped.
 
-    `tell` is called once a second with the number of completed ticks. After an interruption `timing` holds
-    the ticks played so far.
+    After an interruption, `timing` holds the ticks executed so far.
+
+    Args:
+        task: work of the rig in each tick.
+        network: connection to the controller's process.
+        session: number of the session.
+        period: control period [s].
+        timing: record of the packet times, which this function fills.
+        tell: callback, called once a second with the number of completed ticks.
     """
     step, total = round(1e9 * period), len(timing.answered_in_time)
     allowance, second = round(ANSWER_SHARE * step), max(1, round(1 / period))
@@ -106,19 +117,19 @@ def run_loop(
     gc.freeze()
     gc.disable()
     try:
-        began = time.monotonic_ns() + START_DELAY
-        left = array("q", bytes(8 * total))
+        start_time = time.monotonic_ns() + START_DELAY
+        send_times = array("q", bytes(8 * total))
         for number in range(total):
-            due = began + timing.clock_shift + number * step
+            due = start_time + timing.clock_shift + number * step
             _wait_until(network, due)
             packet = encode_reading(task.reading(), session)
-            left[number] = time.monotonic_ns()
+            send_times[number] = time.monotonic_ns()
             network.send(number, packet)
-            late = timing.late[number] = left[number] - due
+            late = timing.late[number] = send_times[number] - due
             if late > MAX_CATCH_UP_PERIODS * step:
                 timing.clock_shift += late
                 due += late
-            is_answered = _await_answer(task, network, session, due + allowance, left, timing)
+            is_answered = _await_answer(task, network, session, due + allowance, send_times, timing)
             timing.answered_in_time[number] = is_answered and late <= step
             task.advance()
             timing.ticks = number + 1
@@ -134,9 +145,9 @@ def run_loop(
 
 
 def _await_answer(
-    task: RealTimeTask, network: Network, session: int, deadline: int, left: array, timing: PacketTimes
+    task: RealTimeTask, network: Network, session: int, deadline: int, send_times: array, timing: PacketTimes
 ) -> bool:
-    """Receive packets until this tick's answer arrives or the deadline [ns] passes; return if it arrived."""
+    """Receive packets until this tick's answer arrives (True) or the `deadline` [ns] passes (False)."""
     while True:
         is_answered = False
         for arrived, packet in network.receive():
@@ -145,8 +156,8 @@ def _await_answer(
             except PacketError:
                 continue
             number = answer.sequence
-            if number < len(left) and left[number] and not timing.round_trip[number]:
-                timing.round_trip[number] = arrived - left[number]
+            if number < len(send_times) and send_times[number] and not timing.round_trip[number]:
+                timing.round_trip[number] = arrived - send_times[number]
             is_answered = task.take(answer) or is_answered
         if is_answered:
             return True
@@ -156,7 +167,7 @@ def _await_answer(
 
 
 def _wait_until(network: Network, due: int) -> None:
-    """Wait until `due` [ns] and send delayed packets, without sleep in the last `BUSY_WAIT_TIME` ns."""
+    """Wait until the time `due` [ns]; send delayed packets until `BUSY_WAIT_TIME` before it."""
     while time.monotonic_ns() < due - BUSY_WAIT_TIME:
         network.wait(due - BUSY_WAIT_TIME, for_arrivals=False)
     while time.monotonic_ns() < due:
@@ -164,7 +175,7 @@ def _wait_until(network: Network, due: int) -> None:
 
 
 def answered_packet_number(packet: bytes) -> int | None:
-    """Return the number of the packet that this one answers; None if it is no answer."""
+    """Return the number of the packet that `packet` answers; None if `packet` is not an answer."""
     try:
         return decode_answer(packet, None).sequence
     except PacketError:

@@ -1,7 +1,8 @@
-"""Simulated network card: a socket to the controller, with injected faults.
+"""Simulated network card: a socket to the controller's process, with injected faults.
 
-Each packet in either direction is lost with a probability; other packets are delayed by a constant and a
-random time, so that they may overtake one another. All draws come from one seed.
+Packets in both directions are lost with a given probability. All other packets are delayed by the sum of a
+constant and a random time, so that a packet may overtake an earlier one. All random numbers follow from one
+seed.
 """
 
 import heapq
@@ -13,28 +14,31 @@ from collections.abc import Callable
 from random import Random
 from typing import NamedTuple
 
-MAX_PACKET_BYTES = 512
+MAX_PACKET_BYTES = 512  # size of the receive buffer; above the largest packet of `udp_protocol`
 
 
 class Injection(NamedTuple):
-    """Faults injected into the network, per packet and direction."""
+    """Network faults that are injected into every packet in both directions."""
 
-    drops: float = 0.0  # probability of a loss [1]
-    jitter: float = 0.0  # upper end of a uniformly distributed delay from 0 [s]
+    drops: float = 0.0  # probability that a packet is lost [1]
+    jitter: float = 0.0  # largest random delay [s]; the random delay is uniform from 0 to this value
     delay: float = 0.0  # constant delay [s]
 
     @property
     def any(self) -> bool:
-        """Return whether there are any faults."""
+        """Return whether any fault is injected."""
         return self.drops > 0.0 or self.jitter > 0.0 or self.delay > 0.0
 
 
 class Network:
-    """Connection to one address with injected faults; times are those of `time.monotonic_ns`.
+    """UDP connection to one address, with injected faults. All times are those of `time.monotonic_ns`.
 
-    `number_of(answer)` returns the number of the packet that an answer belongs to, None if to none. The
-    injected faults are stored by packet number: `lost` is 1 if the packet or its answer was lost, `held_back`
-    is the total delay of both [ns].
+    The argument `number_of` is a function that returns the number of the packet that an answer belongs to, or
+    None if the received bytes are not an answer.
+
+    Attributes:
+        lost: 1 if injection lost the packet or its answer, else 0, (packets,).
+        injected_delay: total injected delay of the packet and its answer [ns], (packets,).
     """
 
     def __init__(
@@ -48,9 +52,9 @@ class Network:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(address)
         self._socket.setblocking(False)
-        self._injection, self._any, self._random = injection, injection.any, Random(seed)
-        self._going: list[tuple[int, int, bytes]] = []
-        self._coming: list[tuple[int, int, bytes]] = []
+        self._injection, self._has_faults, self._random = injection, injection.any, Random(seed)
+        self._outgoing: list[tuple[int, int, bytes]] = []
+        self._incoming: list[tuple[int, int, bytes]] = []
         self._count, self._number_of = 0, number_of
         self.lost = array("b", bytes(packets))
         self.injected_delay = array("q", bytes(8 * packets))
@@ -60,27 +64,27 @@ class Network:
         self._socket.close()
 
     def send(self, number: int, packet: bytes) -> None:
-        """Send packet `number` with the injected faults."""
+        """Send packet `number`, unless injection loses or delays it; `wait` sends a delayed packet."""
         delay = self._draw_delay(number)
         if delay is None:
             return
         if delay <= 0:
-            self.send_plainly(packet)
+            self.send_without_faults(packet)
         else:
             self._count += 1
-            heapq.heappush(self._going, (time.monotonic_ns() + delay, self._count, packet))
+            heapq.heappush(self._outgoing, (time.monotonic_ns() + delay, self._count, packet))
 
-    def send_plainly(self, packet: bytes) -> None:
+    def send_without_faults(self, packet: bytes) -> None:
         """Send a packet without injected faults."""
         try:
             self._socket.send(packet)
         except OSError:
-            # No process listens, so that the tick will be missed.
+            # No process listens; the tick will count as missed.
             pass
 
     def ask(self, packet: bytes, wait: float) -> bytes | None:
-        """Send a packet without faults; return the answer within `wait` [s], None if there is none."""
-        self.send_plainly(packet)
+        """Send a packet without injected faults; return the answer, or None after `wait` [s] without one."""
+        self.send_without_faults(packet)
         if not select.select([self._socket], [], [], wait)[0]:
             return None
         try:
@@ -89,23 +93,26 @@ class Network:
             return None
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return the packets that have arrived by now, each with its time of arrival [ns]."""
+        """Return the packets that have arrived since the last call, each with its arrival time [ns]."""
         self._drain()
         now, ready = time.monotonic_ns(), []
-        while self._coming and self._coming[0][0] <= now:
-            arrived, _, packet = heapq.heappop(self._coming)
+        while self._incoming and self._incoming[0][0] <= now:
+            arrived, _, packet = heapq.heappop(self._incoming)
             ready.append((arrived, packet))
         return ready
 
     def wait(self, until: int, for_arrivals: bool = True) -> None:
-        """Wait until a packet may have arrived, at most until `until` [ns]; send due delayed packets."""
+        """Send the delayed packets that are due, then wait for a packet, at most until the time `until` [ns].
+
+        With `for_arrivals`, the wait also ends when the injected delay of a received packet ends.
+        """
         now = time.monotonic_ns()
-        while self._going and self._going[0][0] <= now:
-            self.send_plainly(heapq.heappop(self._going)[2])
-        if self._going:
-            until = min(until, self._going[0][0])
-        if self._coming and for_arrivals:
-            until = min(until, self._coming[0][0])
+        while self._outgoing and self._outgoing[0][0] <= now:
+            self.send_without_faults(heapq.heappop(self._outgoing)[2])
+        if self._outgoing:
+            until = min(until, self._outgoing[0][0])
+        if self._incoming and for_arrivals:
+            until = min(until, self._incoming[0][0])
         if until > now and select.select([self._socket], [], [], (until - now) * 1e-9)[0]:
             self._drain()
 
@@ -118,16 +125,16 @@ class Network:
                 # There is no further packet, or no process listens yet.
                 return
             delay: int | None = 0
-            if self._any:
+            if self._has_faults:
                 number = self._number_of(packet)
                 delay = None if number is None else self._draw_delay(number)
             if delay is not None:
                 self._count += 1
-                heapq.heappush(self._coming, (time.monotonic_ns() + delay, self._count, packet))
+                heapq.heappush(self._incoming, (time.monotonic_ns() + delay, self._count, packet))
 
     def _draw_delay(self, number: int) -> int | None:
-        """Draw and record the delay [ns] of a packet; return None if it is lost."""
-        if not self._any:
+        """Draw and record the injected delay [ns] of packet `number`; return None if the packet is lost."""
+        if not self._has_faults:
             return 0
         drops, jitter, constant = self._injection
         in_range = 0 <= number < len(self.lost)

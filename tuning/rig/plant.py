@@ -1,12 +1,12 @@
 """Simulated hardware of a rig in plain floats: motion simulator, contact and sensors.
 
-    plant = Plant(mechanism, seed=0)
+    plant = RigHardware(mechanism, seed=0)
     plant.begin(position, velocity, command, number)  # begin a run in uniform motion towards contact `number`
     force, position = plant.read()                    # readings of the sensors at this tick
     plant.move(command)                               # apply the next position command for one period
 
-The physics are stages 1, 4 and 5 of `jaxhil.simulation.loop` without JAX, fast enough for real time. Linear
-parts are discretised exactly, and delays are exact fractions of a period (`tuning.rig.discretisation`).
+This module computes stages 1, 4 and 5 of `jaxhil.simulation.loop` without JAX, fast enough for real time.
+`tuning.rig.discretisation` discretises the linear parts and the delays exactly.
 """
 
 import math
@@ -24,46 +24,57 @@ from tuning.rig.discretisation import (
 )
 from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetration
 
-# Motion at the sample of the force, at the interval's start and at its end.
+# Motion of the mechanism when the force sensor samples, at the sampling interval's start and at its end.
 SamplingInterval = tuple[MotionState, MotionState | None, MotionState | None]
 
 
 class RigHardware:
-    """Hardware of the rig without the controller.
+    """Simulated hardware of the rig: motion simulator, contact and sensors.
 
-    `force` [N] is the newest sample of the real contact force at this tick, `shortfall` [m] the distance by
-    which rate limits keep the command from the wanted one.
+    Attributes:
+        force: newest sample of the real contact force [N].
+        shortfall: distance between the requested and the rate-limited position command [m].
     """
 
     def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
         rig = mechanism.rig
         simulator, period = rig.simulator, rig.control_period
-        force_intervals, force_place = split_delay(simulator.delay + rig.force_sensor.delay, period)
-        position_intervals, position_place = split_delay(simulator.delay + rig.position_sensor.delay, period)
+        force_delay, position_delay = rig.force_sensor.delay, rig.position_sensor.delay
+        force_intervals, force_fraction = split_delay(simulator.delay + force_delay, period)
+        position_intervals, position_fraction = split_delay(simulator.delay + position_delay, period)
         self._period, self._contact = period, mechanism.contact
         self._clearance, self._plane = mechanism.contact.clearance, rig.contact_plane
         self._hold, self._latency = rig.command_hold, rig.command_latency
         self._force_sensor, self._position_sensor = rig.force_sensor, rig.position_sensor
-        self._place, self._noise = force_place * period, Random(seed)
+        self._sample_time, self._noise = force_fraction * period, Random(seed)
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
-        self._limited = math.isfinite(min(self._limits))
-        self._rows = discretise_simulator(simulator, period, rig.command_hold, force_place, position_place)
-        # A sample is taken `_real` intervals after its command, and is read `_force_intervals` later.
-        self._real = math.ceil(simulator.delay / period + force_place - DELAY_ROUNDING_TOLERANCE) - 1
-        self._force_intervals, self._position_intervals = force_intervals - self._real, position_intervals
-        self._size = 1 << (max(self._force_intervals, position_intervals, self._real) + 2).bit_length()
+        self._has_rate_limits = math.isfinite(min(self._limits))
+        self._rows = discretise_simulator(
+            simulator, period, rig.command_hold, force_fraction, position_fraction
+        )
+        # The force is sampled `_contact_intervals` intervals after the command that causes it, and read
+        # `_force_intervals` intervals after the sample.
+        contact_delay = simulator.delay / period + force_fraction
+        self._contact_intervals = math.ceil(contact_delay - DELAY_ROUNDING_TOLERANCE) - 1
+        self._force_intervals = force_intervals - self._contact_intervals
+        self._position_intervals = position_intervals
+        longest = max(self._force_intervals, position_intervals, self._contact_intervals)
+        self._size = 1 << (longest + 2).bit_length()
         self.begin(-1.0, 0.0, -1.0, 0)
 
     def begin(self, position: float, velocity: float, command: float, number: int) -> None:
-        """Begin a run at its tick 0, in uniform motion towards contact `number` (from 0).
+        """Begin a run at tick 0, in the steady state of a uniform motion without contact.
 
-        The numerical model is at `position` [m] with `velocity` [m/s], and this tick's position command is
-        `command` [m]. Before the run, the motion was uniform for an infinite time, without a force.
+        Args:
+            position: position of the numerical model [m].
+            velocity: velocity of the numerical model [m/s].
+            command: position command of tick 0 [m].
+            number: index of the first contact in the mechanism's lists.
         """
-        self._law, self._number, self._wanted_number = _contact_law_of(self._contact, number), number, number
+        self._law, self._number, self._next_number = _contact_law_of(self._contact, number), number, number
         stride = self._period * velocity
         self._commands = [command - back * stride for back in range(self._latency + 1)]
-        self._wanted, self._step, self.shortfall = command, stride, 0.0
+        self._requested, self._step, self.shortfall = command, stride, 0.0
         rows, linear = self._rows, self._hold == "linear"
         drive = self._commands[-1] if linear else self._commands[-1] + stride
         before = [
@@ -77,14 +88,14 @@ class RigHardware:
         size = self._size
         self._forces = [0.0] * size
         self._intervals: list[SamplingInterval | None] = [None] * size
-        # Interval -1, the newest before the run, is at the end of the ring buffer.
+        # The last element of the ring buffer is interval -1, the newest interval before the run.
         self._positions = [first + (index - size + 1) * stride for index in range(size)]
         self._tick = 0
         self._lag = self.force = 0.0
         self._in_contact, self._deepest = False, 0.0
 
     def read(self) -> tuple[float, float]:
-        """Read force [N] and position [m] at this tick, just before its command acts; noise is drawn."""
+        """Return the measured force [N] and position [m] just before this tick's command acts."""
         last = self._size - 1
         sensor, noise = self._force_sensor, self._noise
         force = self._forces[(self._tick - 1 - self._force_intervals) & last] + sensor.bias
@@ -100,8 +111,8 @@ class RigHardware:
         return force, _quantise(position, self._position_sensor.quantum)
 
     def move(self, command: float) -> None:
-        """Advance by one control period with the position command [m] of the tick at its end."""
-        if self._limited:
+        """Advance by one control period; `command` [m] is the position command at the end of the period."""
+        if self._has_rate_limits:
             command = self._limit(command)
         commands = self._commands
         end = commands[self._latency - 1] if self._latency else command
@@ -109,9 +120,9 @@ class RigHardware:
         self._commands = [command, *commands[: self._latency]]
         rows, state, tick, last = self._rows, self._state, self._tick, self._size - 1
 
-        def motion(place: MotionRows) -> MotionState:
-            position = evaluate_row(place.position, state, start, end) - self._plane
-            return MotionState(position, evaluate_row(place.velocity, state, start, end))
+        def motion(motion_rows: MotionRows) -> MotionState:
+            position = evaluate_row(motion_rows.position, state, start, end) - self._plane
+            return MotionState(position, evaluate_row(motion_rows.velocity, state, start, end))
 
         if self._force_sensor.time_constant > 0.0 or self._law.loaded is not None:
             interval = motion(rows.sample), motion(rows.start), motion(rows.end)
@@ -120,27 +131,28 @@ class RigHardware:
         self._intervals[tick & last] = interval
         self._positions[tick & last] = evaluate_row(rows.measured, state, start, end)
         self._state = [evaluate_row(row, state, start, end) for row in rows.transition]
-        self._forces[tick & last] = self._contact_force(self._intervals[(tick - self._real) & last])
+        contact_interval = self._intervals[(tick - self._contact_intervals) & last]
+        self._forces[tick & last] = self._contact_force(contact_interval)
         self._tick = tick + 1
-        self.expect(self._wanted_number)
+        self.expect(self._next_number)
 
     def expect(self, number: int) -> None:
-        """Set the number (from 0) of the run's next contact, whose law applies once the mechanism is free."""
-        self._wanted_number = number
+        """Set the index of the next contact; its law applies as soon as the mechanism is not in contact."""
+        self._next_number = number
         if number != self._number and not self._in_contact:
             self._law, self._number = _contact_law_of(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
-        """Compute the contact in the interval whose motion arrives now; return the lagged force [N]."""
+        """Compute the contact during one sampling interval; return the sensor's force after its lag [N]."""
         if interval is None:
             return 0.0
         sample, start, end = interval
-        clearance, rest = self._clearance, self._period - self._place
+        clearance, rest = self._clearance, self._period - self._sample_time
         law, deepest = self._law, self._deepest
         if law.loaded is not None and start is not None and end is not None:
-            at_sample = self._deeper(deepest, start, sample, self._place)
+            at_sample = self._deepest_until(deepest, start, sample, self._sample_time)
             law = law.loaded(at_sample)
-            self._deepest = self._deeper(at_sample, sample, end, rest)
+            self._deepest = self._deepest_until(at_sample, sample, end, rest)
         else:
             at_sample = 0.0
         if sample.position > 0.0:
@@ -154,45 +166,45 @@ class RigHardware:
         if start is None or end is None or time_constant == 0.0:
             return self.force
         reading = apply_sensor_lag(
-            self._lag, self._law, clearance, start, sample, self._place, time_constant, deepest
+            self._lag, self._law, clearance, start, sample, self._sample_time, time_constant, deepest
         )
         self._lag = apply_sensor_lag(
             reading, self._law, clearance, sample, end, rest, time_constant, at_sample
         )
         return reading
 
-    def _deeper(self, deepest: float, start: MotionState, end: MotionState, duration: float) -> float:
-        """Return the deepest penetration [m] up to the end of a stretch; it is reset when contact is lost."""
+    def _deepest_until(self, deepest: float, start: MotionState, end: MotionState, duration: float) -> float:
+        """Return the deepest penetration [m] of the contact until `end`; 0 if it has ended by then."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
-        if duration <= 0.0:  # With delays of whole periods the second stretch is empty.
+        if duration <= 0.0:  # If the force delay is a whole number of periods, the second segment is empty.
             return deepest
         return max(deepest, deepest_penetration(start, end, duration, self._clearance))
 
-    def _limit(self, wanted: float) -> float:
-        """Apply the rate limits to a position command [m] (`jaxhil.simulation.rate_limits.limit_command`)."""
+    def _limit(self, requested: float) -> float:
+        """Limit the rates of a position command [m], as `jaxhil.simulation.rate_limits` does."""
         velocity_limit, acceleration_limit = self._limits
-        previous, before = self._commands[0], self._wanted
+        previous, before = self._commands[0], self._requested
         largest, change = velocity_limit * self._period, acceleration_limit * self._period**2
-        step = unlimited = wanted - previous
-        wanted_step = wanted - before
+        step = unlimited = requested - previous
+        requested_step = requested - before
         if math.isfinite(change):
             behind = before - previous
             more = math.floor((math.sqrt(1 + 8 * abs(behind) / change) - 1) / 2)
-            step = wanted_step + behind / (more + 1) + math.copysign(change * more / 2, behind)
+            step = requested_step + behind / (more + 1) + math.copysign(change * more / 2, behind)
             step = min(max(step, self._step - change), self._step + change)
         step = min(max(step, -largest), largest)
-        rounding = 2 * math.ulp(1.0) * (abs(wanted) + abs(previous) + abs(wanted_step))
+        rounding = 2 * math.ulp(1.0) * (abs(requested) + abs(previous) + abs(requested_step))
         if abs(step - unlimited) <= rounding:
-            command, step = wanted, unlimited
+            command, step = requested, unlimited
         else:
             command = previous + step
-        self._wanted, self._step, self.shortfall = wanted, step, abs(wanted - command)
+        self._requested, self._step, self.shortfall = requested, step, abs(requested - command)
         return command
 
 
 def _contact_law_of(contact: Contact, number: int) -> FloatLaw:
-    """Return the law of contact `number` (from 0); the last entry of every list repeats."""
+    """Return the law of contact `number`; the last entries of the stiffness and damping lists repeat."""
     stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
     damping = contact.damping[min(number, len(contact.damping) - 1)]
     return find_contact_law(contact.law).in_floats(contact, stiffness, damping)

@@ -1,9 +1,9 @@
-"""Rig's side of the loop: readings for every tick, and the effect of the answers on the hardware.
+"""Work of the rig's process in each tick: send sensor readings and move the simulated hardware.
 
-It simulates drives, contact and sensors in the rig's process, whose clock is `loop`. `RigTask` is independent
-of network and clock: `reading` returns the packet of a tick, `take` accepts an answer, in time or late, and
-`advance` ends the tick. Without an answer the newest command is extrapolated at its rate for up to
-`MAX_EXTRAPOLATED_PERIODS` periods, and then held.
+`RigTask` is independent of network and clock, which `loop` provides. `RigTask.reading` returns the packet of
+a tick, `RigTask.take` accepts an answer of the controller, and `RigTask.advance` ends the tick. In a tick
+without an answer, the newest position command is extrapolated at its rate. After `MAX_EXTRAPOLATED_PERIODS`
+periods without an answer, the command is held.
 """
 
 import math
@@ -24,35 +24,40 @@ from tuning.rig.udp_protocol import (
     ReadingPacket,
 )
 
-MAX_EXTRAPOLATED_PERIODS = 10  # periods for which a command is extrapolated at its rate
-MAX_COMMAND_AGE = 3  # age of a command [periods] beyond which its effects are not the controller's fault
-TRIPS_BY_OLD_COMMANDS = (
-    "tripped: restitution",
-    "tripped: missed_tick",
-)  # trips that an old command may cause
-PAUSE_TICKS = 5  # ticks between two runs
-STALLED = "stalled"  # status of a contact for which the machine delayed the commands too long
+MAX_EXTRAPOLATED_PERIODS = 10  # number of periods after which a command is held instead of extrapolated
+MAX_COMMAND_AGE = 3  # [periods]; if a command is older, its effects are not the controller's fault
+# Reasons of a trip that an old command can cause.
+TRIPS_BY_OLD_COMMANDS = ("tripped: restitution", "tripped: missed_tick")
+PAUSE_TICKS = 5  # number of ticks between two runs
+STALLED = "stalled"  # status of a contact in which the computer delayed the commands too long
 
 
 class CommandRange(NamedTuple):
-    """Range of the controller's commands."""
+    """Extreme values of the commands that the controller has sent."""
 
     lowest: float  # lowest position command [m]
     highest: float  # highest position command [m]
-    not_finite: int  # number of non-finite commands, which do not reach the drives
-    beyond_limits: int  # number of position commands beyond the drives' stroke, which are clipped
-    largest_force: float  # largest |F_c| [N]
+    not_finite: int  # number of answers with NaN or infinite commands, which do not reach the drives
+    beyond_limits: int  # number of position commands outside the drives' stroke, which are clipped
+    largest_force: float  # largest magnitude of the force command F_c [N]
 
 
 class RigTask:
-    """Endless series of runs of a mechanism's contacts, without network and clock.
+    """Endless series of runs of one mechanism, without network and clock.
 
-    With one surface every contact is a run at the nominal approach speed; between two surfaces a run has the
-    mechanism's number of contacts. The lists of stiffness and damping are repeated; after the first cycle
-    each run has a random phase. `stroke` is the lowest and highest position [m] of the drives. With `resets`,
-    a controller that trips by one of the faults `TRIPS_BY_OLD_COMMANDS` after a command was older than
-    `MAX_COMMAND_AGE` periods is reset, and the session continues. `tripped` is the reason of a trip, empty
-    without one.
+    If the mechanism has one surface, every run has one contact and starts at the nominal approach speed. If
+    the mechanism has two surfaces, every run has `approach.contacts` contacts. The runs cycle through the
+    lists of stiffness and damping. From the second cycle on, the phase of each run is random.
+
+    Args:
+        mechanism: mechanism and rig to simulate.
+        seed: seed of the sensor noise and of the phases.
+        stroke: lowest and highest position of the drives [m].
+        resets: whether to reset a controller that trips because of old commands. This applies if a command
+            was older than `MAX_COMMAND_AGE` periods and the reason is one of `TRIPS_BY_OLD_COMMANDS`.
+
+    Attributes:
+        tripped: reason of the controller's trip; empty if it has not tripped.
     """
 
     def __init__(
@@ -74,41 +79,41 @@ class RigTask:
         self._newest: AnswerPacket | None = None
         self._force = 0.0
         self.tripped, self._first, self._oldest = "", 0, 0
-        self._resets, self._forgiven, self._resetting = resets, [], False
+        self._resets, self._forgiven_trips, self._requests_reset = resets, [], False
         self._next_run(0)
 
     @property
     def contacts(self) -> tuple[RigContact, ...]:
-        """Return the contacts that have ended."""
+        """Return the contacts that have ended, in the order of time."""
         return tuple(self._contacts)
 
     @property
     def forgiven(self) -> tuple[str, ...]:
-        """Return the reasons of trips after which the controller was reset, since commands were old."""
-        return tuple(self._forgiven)
+        """Return the reasons of the trips that old commands caused; the controller was reset after each."""
+        return tuple(self._forgiven_trips)
 
     @property
     def commanded(self) -> CommandRange:
-        """Return the range of the commands so far."""
+        """Return the extreme values of the commands so far."""
         return CommandRange(self._lowest, self._highest, self._not_finite, self._beyond, self._largest)
 
     def reading(self) -> ReadingPacket:
-        """Return the next packet to send; each call has a new sequence number."""
+        """Read the sensors; return the packet to send, with a new sequence number."""
         self._sequence += 1
         self._force, position = self._plant.read()
         time = self._sequence * self._period
-        event = TICK if self._tick >= 0 else RESET if self._resetting else PREPARE
+        event = TICK if self._tick >= 0 else RESET if self._requests_reset else PREPARE
         tick = max(self._tick, 0)
         return ReadingPacket(
             event, self._sequence, self._run, tick, time, self._force, position, *self._start
         )
 
     def take(self, answer: AnswerPacket) -> bool:
-        """Accept an answer; return whether it belongs to this tick."""
+        """Accept an answer of the controller; return whether it answers the current tick's packet."""
         if answer.run != self._run:
             return False
         if answer.flags & TRIPPED:
-            self.tripped = answer.words or "tripped"
+            self.tripped = answer.trip_reason or "tripped"
         if self._tick < 0:
             if answer.flags & READY and math.isfinite(answer.position_command):
                 self._newest = answer._replace(tick=-1)
@@ -126,20 +131,20 @@ class RigTask:
         return answer.tick == self._tick
 
     def advance(self) -> None:
-        """End the tick and move the rig one period by its command or the extrapolated one."""
-        explained = self._resets and self.tripped.startswith(TRIPS_BY_OLD_COMMANDS)
-        if explained and self._last_oldest() > MAX_COMMAND_AGE:
+        """End the tick: move the hardware by one period with the newest or the extrapolated command."""
+        caused_by_old_command = self._resets and self.tripped.startswith(TRIPS_BY_OLD_COMMANDS)
+        if caused_by_old_command and self._largest_command_age() > MAX_COMMAND_AGE:
             self._reset()
         if self._tick < 0:
-            self._wait()
+            self._pause_or_begin()
             return
         newest = self._newest
         assert newest is not None
-        late = self._tick - newest.tick
-        self._oldest = max(self._oldest, late)
+        age = self._tick - newest.tick
+        self._oldest = max(self._oldest, age)
         command = newest.position_command
-        if late > 0:
-            command += min(late, MAX_EXTRAPOLATED_PERIODS) * self._period * newest.command_rate
+        if age > 0:
+            command += min(age, MAX_EXTRAPOLATED_PERIODS) * self._period * newest.command_rate
         command = min(max(command, self._stroke[0]), self._stroke[1])
         plant, watch = self._plant, self._watch
         if newest.tick >= 0:
@@ -150,36 +155,37 @@ class RigTask:
         plant.move(command)
         self._tick += 1
         if contact is not None:
-            self._ended(contact)
+            self._finish_contact(contact)
 
     def finish(self) -> None:
-        """End the session; the current contact is added to the contacts if the controller has tripped."""
+        """End the session; if the controller has tripped, store the current contact as "tripped"."""
         if self._tick >= 0 and self.tripped and all(c.status != "tripped" for c in self._contacts):
-            cut = self._watch.cut("tripped")
-            if cut is not None:
-                self._contacts.append(cut)
+            aborted_contact = self._watch.cut("tripped")
+            if aborted_contact is not None:
+                self._contacts.append(aborted_contact)
 
-    def _last_oldest(self) -> int:
-        """Return the age [periods] of the oldest command of the current or, between runs, last contact."""
+    def _largest_command_age(self) -> int:
+        """Return the largest command age [periods] in the current contact, or the last one between runs."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest
 
     def _reset(self) -> None:
-        """Start another run instead of this one, and request a reset of the controller."""
-        self._forgiven.append(self.tripped)
+        """Abort this run, prepare the next one, and request a reset of the controller."""
+        self._forgiven_trips.append(self.tripped)
         self.tripped = ""
         number = self._number
         if self._tick >= 0:
-            cut = self._watch.cut(STALLED)
-            if cut is not None:
-                self._store(cut)
-                number = 0 if self._two_sided else (cut.number + 1) % self._mechanism.approach.contacts
+            aborted_contact = self._watch.cut(STALLED)
+            if aborted_contact is not None:
+                self._store(aborted_contact)
+                following = (aborted_contact.number + 1) % self._mechanism.approach.contacts
+                number = 0 if self._two_sided else following
         self._next_run(number)
-        self._resetting = True
+        self._requests_reset = True
 
-    def _wait(self) -> None:
-        """Hold the mechanism at the start of the next run until the controller is ready."""
+    def _pause_or_begin(self) -> None:
+        """Count down the pause before a run; begin the run once the controller is ready."""
         self._pause -= 1
         newest = self._newest
         if newest is None or self._pause > 0 or self.tripped:
@@ -188,10 +194,10 @@ class RigTask:
         self._watch.begin(self._number)
         self._tick = 0
 
-    def _ended(self, contact: RigContact) -> None:
+    def _finish_contact(self, contact: RigContact) -> None:
         """Store a contact that has ended and prepare the next one."""
         if self.tripped:
-            # After a trip the rig continues, but the contact's result has no meaning.
+            # After a trip the rig keeps moving, but its contacts no longer evaluate the controller.
             if all(c.status != "tripped" for c in self._contacts):
                 self._store(contact._replace(status="tripped", restitution=math.nan))
             return
@@ -211,12 +217,12 @@ class RigTask:
     def _next_run(self, number: int) -> None:
         approach = self._mechanism.approach
         self._run += 1
-        first_round = self._run <= (1 if self._two_sided else approach.contacts)
-        phase = approach.phase if first_round else self._phases.random()
+        is_first_cycle = self._run <= (1 if self._two_sided else approach.contacts)
+        phase = approach.phase if is_first_cycle else self._phases.random()
         nearer = min(self._mechanism.rig.contact_plane, 0.0)
         position = nearer - approach.velocity * (APPROACH_TIME + phase * self._period)
         self._start, self._number = (position, approach.velocity), number
         self._tick, self._pause, self._newest = -1, PAUSE_TICKS, None
-        self._oldest, self._resetting = 0, False
-        # Before the run the mechanism is free and at rest.
+        self._oldest, self._requests_reset = 0, False
+        # During the pause before the run, the mechanism is free and at rest.
         self._plant.begin(position, 0.0, position, number)

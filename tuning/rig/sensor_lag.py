@@ -1,7 +1,8 @@
-"""Reading of a force sensor with a first-order lag, T_s y' = F - y, over stretches of smooth motion.
+"""Response of a force sensor with a first-order lag, T_s y' = F - y, during segments of smooth motion.
 
-Within a stretch the motion is the cubic Hermite polynomial through its exact ends. The contact begins and
-ends at roots of that cubic, and the force in between is interpolated by parabolas, whose lag is exact.
+Within a segment, a cubic Hermite polynomial through the exact positions and velocities at both ends
+interpolates the motion. The contact starts and ends at roots of this polynomial. In between, parabolas
+interpolate the force, and the response of the lag to each parabola is exact.
 """
 
 import math
@@ -10,19 +11,18 @@ from typing import NamedTuple
 
 from jaxhil.contact.float_law import FloatLaw
 
-FORCE_PARABOLAS = 2  # number of parabolas that interpolate the force of one stretch
-MAX_ROOT_STEPS = 50  # largest number of steps of false position
-ROOT_TOLERANCE = 1e-13  # tolerance of a root as a fraction of a stretch
-MIN_CLOSED_FORM_DURATION = (
-    1e-2  # duration of an arc [time constants] below which the closed form suffers from cancellation
-)
+FORCE_PARABOLAS = 2  # number of parabolas that interpolate the force in one segment
+MAX_ROOT_STEPS = 50  # largest number of iterations of the root finder
+ROOT_TOLERANCE = 1e-13  # largest error of a root [fraction of the segment]
+# Duration of a parabola [time constants]; below this, cancellation makes the closed form inaccurate.
+MIN_CLOSED_FORM_DURATION = 1e-2
 
 
 class MotionState(NamedTuple):
-    """Position [m] and velocity [m/s]."""
+    """Position and velocity of the mechanism relative to its surface."""
 
-    position: float
-    velocity: float
+    position: float  # [m]
+    velocity: float  # [m/s]
 
 
 def apply_sensor_lag(
@@ -35,32 +35,40 @@ def apply_sensor_lag(
     time_constant: float,
     deepest: float = 0.0,
 ) -> float:
-    """Return the lag's output [N] at the end of a stretch of `duration` [s], from `reading` [N] at its start.
+    """Return the output of the sensor's first-order lag [N] at the end of a segment of motion.
 
-    The surfaces are at 0 and, with the opposite direction, at -clearance [m], which may be infinite.
-    `deepest` [m] is the deepest penetration up to the start of the stretch, for laws with memory.
+    Args:
+        reading: output of the lag at the start of the segment [N].
+        law: contact law.
+        clearance: distance between the two surfaces [m], at 0 and -clearance; infinite for one surface.
+        start: motion at the start of the segment.
+        end: motion at the end of the segment.
+        duration: duration of the segment [s].
+        time_constant: time constant T_s of the lag [s].
+        deepest: deepest penetration before the segment [m], for contact laws with memory.
     """
     if duration <= 0.0:
         return reading
     side, surface = _reached_surface(start.position, end.position, clearance)
     if side == 0.0:
         return reading * math.exp(-duration / time_constant)
-    stretch = _ContactInterval(_CubicPath(start, end, duration), side, surface, law, deepest)
-    first, last, forces = stretch.pressed()
+    interval = _ContactInterval(_CubicPath(start, end, duration), side, surface, law, deepest)
+    first, last, forces = interval.forces()
     if not first < last:
         return reading * math.exp(-duration / time_constant)
     reading *= math.exp(-first * duration / time_constant)
     span = (last - first) * duration / FORCE_PARABOLAS / time_constant
-    decay, straight, bow = _parabola_weights(span)
+    decay, mean_decay, parabola_response = _parabola_weights(span)
     for i in range(0, 2 * FORCE_PARABOLAS, 2):
         begin, middle, finish = forces[i : i + 3]
         bend = middle - (begin + finish) / 2
-        reading = reading * decay + finish - begin * decay - (finish - begin) * straight + bend * bow
+        reading = reading * decay + finish - begin * decay - (finish - begin) * mean_decay
+        reading += bend * parabola_response
     return reading * math.exp(-(1.0 - last) * duration / time_constant)
 
 
 def deepest_penetration(start: MotionState, end: MotionState, duration: float, clearance: float) -> float:
-    """Return the deepest penetration [m] of either surface along a smooth stretch of motion; 0 if none."""
+    """Return the deepest penetration [m] during a segment of smooth motion; 0 without contact."""
     side, surface = _reached_surface(start.position, end.position, clearance)
     if side == 0.0:
         return 0.0
@@ -73,9 +81,9 @@ def deepest_penetration(start: MotionState, end: MotionState, duration: float, c
 
 
 class _ContactInterval:
-    """Contact force along one stretch of motion at one surface, as a function of its fraction s.
+    """Contact force during one segment of motion, as a function of the elapsed fraction s of the segment.
 
-    A law with memory uses the deepest penetration up to s.
+    A contact law with memory receives the deepest penetration up to s.
     """
 
     def __init__(
@@ -86,21 +94,24 @@ class _ContactInterval:
         self._before = max(deepest, self._depth(0.0))
         self._bottom = max(self._before, bottom)
 
-    def pressed(self) -> tuple[float, float, list[float]]:
-        """Return the interval of s with a force, and its values [N] at the ends and middles of the arcs."""
+    def forces(self) -> tuple[float, float, list[float]]:
+        """Return start and end of the interval of s with a force, and the force [N] at equidistant nodes.
+
+        Parabola i of `FORCE_PARABOLAS` passes through the nodes 2 i, 2 i + 1 and 2 i + 2.
+        """
         enters, leaves = _positive_interval(self._depth)
-        catches, lets_go = _positive_interval(self._hold)
-        first, last = max(enters, catches), min(leaves, lets_go)
+        force_starts, force_ends = _positive_interval(self._hold)
+        first, last = max(enters, force_starts), min(leaves, force_ends)
         if not first < last:
             return first, last, []
-        edges = {
-            0: enters > 0.0 and enters >= catches,
-            2 * FORCE_PARABOLAS: leaves < 1.0 and leaves <= lets_go,
+        is_at_surface = {
+            0: enters > 0.0 and enters >= force_starts,
+            2 * FORCE_PARABOLAS: leaves < 1.0 and leaves <= force_ends,
         }
         forces = []
         for i in range(2 * FORCE_PARABOLAS + 1):
             s = first + (last - first) * (i / (2 * FORCE_PARABOLAS))
-            forces.append(self._side * self._force(s, edges.get(i, False)))
+            forces.append(self._side * self._force(s, is_at_surface.get(i, False)))
         return first, last, forces
 
     def _depth(self, s: float) -> float:
@@ -117,14 +128,14 @@ class _ContactInterval:
     def _force(self, s: float, at_surface: bool) -> float:
         rate = self._side * self._path.velocity(s)
         if at_surface:
-            # At the surface the force is the limit from inside.
+            # At the surface, use the limit of the force from inside the contact.
             return self._law.edge(rate)
         penetration = self._depth(s)
         return self._law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
 
 
 def _reached_surface(start: float, end: float, clearance: float) -> tuple[float, float]:
-    """Return side (1, -1, or 0 for none) and position [m] of the surface that a stretch reaches."""
+    """Return direction (1, -1, or 0 for none) and position [m] of the surface that a segment penetrates."""
     for position in (start, end):
         if position > 0.0:
             return 1.0, 0.0
@@ -134,7 +145,10 @@ def _reached_surface(start: float, end: float, clearance: float) -> tuple[float,
 
 
 def _turning_point(path: "_CubicPath", depth: Callable[[float], float], side: float) -> tuple[float, float]:
-    """Return fraction and depth [m] of the turning point of a stretch; those of its end if there is none."""
+    """Return the fraction s at which the motion reverses inside the surface, and the penetration [m] there.
+
+    If the motion does not reverse, use the end of the segment, s = 1.
+    """
 
     def inward(s: float) -> float:
         return side * path.velocity(s)
@@ -145,7 +159,7 @@ def _turning_point(path: "_CubicPath", depth: Callable[[float], float], side: fl
 
 
 class _CubicPath:
-    """Cubic Hermite polynomial through both ends of a stretch, over its fraction s."""
+    """Motion during a segment, as a cubic Hermite polynomial of the elapsed fraction s of the segment."""
 
     __slots__ = ("_bend", "_duration", "_rate", "_start", "_twist")
 
@@ -163,7 +177,7 @@ class _CubicPath:
 
 
 def _positive_interval(function: Callable[[float], float]) -> tuple[float, float]:
-    """Return the interval of s in [0, 1] in which a function with at most one sign change is positive."""
+    """Return the interval of s in [0, 1] where `function` is positive; it changes its sign at most once."""
     at_0, at_1 = function(0.0), function(1.0)
     if at_0 <= 0.0 and at_1 <= 0.0:
         return 1.0, 0.0
@@ -174,7 +188,10 @@ def _positive_interval(function: Callable[[float], float]) -> tuple[float, float
 
 
 def _find_root(function: Callable[[float], float], at_0: float, at_1: float) -> float:
-    """Return the root of a function in [0, 1] by false position with the Illinois modification."""
+    """Return the root of `function` in [0, 1] by the Illinois variant of the false-position method.
+
+    `at_0` and `at_1` are the values of the function at 0 and 1, with opposite signs.
+    """
     low, high, last_side = 0.0, 1.0, 0
     s = 1.0
     for _ in range(MAX_ROOT_STEPS):
@@ -194,14 +211,15 @@ def _find_root(function: Callable[[float], float], at_0: float, at_1: float) -> 
 
 
 def _parabola_weights(span: float) -> tuple[float, float, float]:
-    """Return three weights of an arc of `span` time constants for the exact lag of a parabola.
+    """Return three coefficients of the lag's exact response to a parabola that lasts `span` time constants.
 
-    They are the decay of y, the mean of that decay, and the response to 4 s/span (1 - s/span).
+    The first is the decay exp(-span) of the initial value. The second is the mean of exp(-t) for t from 0 to
+    span. The third is the response at t = span to the input 4 (t/span) (1 - t/span).
     """
     decay = math.exp(-span)
     if span < MIN_CLOSED_FORM_DURATION:
         mean = -math.expm1(-span) / span if span > 0.0 else 1.0
-        bow = 4 * span * (1 / 6 - span * (1 / 12 - span * (1 / 40 - span / 180)))
-        return decay, mean, bow
+        parabola_response = 4 * span * (1 / 6 - span * (1 / 12 - span * (1 / 40 - span / 180)))
+        return decay, mean, parabola_response
     mean = -math.expm1(-span) / span
     return decay, mean, 4 * (mean - 2 * (mean - decay) / span)

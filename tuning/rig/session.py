@@ -1,10 +1,12 @@
-"""Session of a rehearsal: the controller's process, an empty loop for comparison, the run, and its faults.
+"""Session of a rehearsal: an empty loop for comparison, then a run of the controller on the simulated rig.
 
-The rig's process, which is this one, starts the controller's process, simulates the rig and stops it. The
-cause of each missed tick is determined afterwards. It is the controller if its process took more than
-`MAX_CPU_SHARE` of the period of CPU time for the tick, both live and in a replay of the packets, or if only
-missed ticks lie between such a tick and this one. Otherwise it is an injected fault, if one affected its
-packets; otherwise it is the machine: another process or virtual machine used the processor.
+This code runs in the rig's process. It starts the controller's process, simulates the rig, and stops the
+controller's process. After the session, it determines the cause of each missed tick:
+
+- the controller, if it used more CPU time than the fraction `MAX_CPU_SHARE` of the period, both in the
+  session and in a replay of the packets. Missed ticks that directly follow such a tick have the same cause;
+- an injected fault, if one affected the packets of this tick;
+- in all other cases the machine: the computer ran another process or virtual machine.
 """
 
 import json
@@ -38,10 +40,10 @@ from tuning.rig.udp_protocol import (
     encode_session_request,
 )
 
-START_TIMEOUT = 30.0  # limit on the time in which the controller's process must listen, and answer [s]
-REQUEST_INTERVAL = 0.1  # wait for an answer before the next request [s]
-END_TIMEOUT = 120.0  # limit on the time in which the process must end, its replay included [s]
-SILENCE_TIMEOUT = 2.0  # time without a packet after which the process ends by itself [s]
+START_TIMEOUT = 30.0  # longest time until the controller's process listens, then until it answers [s]
+REQUEST_INTERVAL = 0.1  # time between two requests for a session [s]
+END_TIMEOUT = 120.0  # longest time until the controller's process ends, including its replay [s]
+SILENCE_TIMEOUT = 2.0  # time without a packet after which the controller's process ends the session [s]
 
 SOURCE_FOLDER = Path(__file__).parent
 STOP_READING = ReadingPacket(
@@ -58,79 +60,84 @@ STOP_READING = ReadingPacket(
 
 
 class Quantiles(NamedTuple):
-    """Quantiles of a time [s]."""
+    """Median, 99.9th percentile and maximum of a measured time."""
 
-    median: float
-    p999: float  # 99.9th percentile
-    maximum: float
+    median: float  # [s]
+    p999: float  # 99.9th percentile [s]
+    maximum: float  # [s]
 
 
 class LoopMetrics(NamedTuple):
-    """Metrics of one loop."""
+    """Numbers of missed ticks, by cause, and times of one real-time loop."""
 
-    ticks: int  # number of played ticks
+    ticks: int  # number of executed ticks
     missed: int  # number of missed ticks
     missed_by_controller: int  # number of ticks missed because of the controller
     missed_by_injection: int  # number of ticks missed because of injected faults
-    missed_by_machine: int  # number of ticks missed because of the machine
+    missed_by_machine: int  # number of ticks missed because the computer was busy with other work
     stood_still: float  # time by which the rig's clock was shifted [s]
-    tick_time: Quantiles  # controller's time per tick [s]
-    tick_cpu: Quantiles  # controller's CPU time per tick [s]
+    tick_time: Quantiles  # time that the controller needs for a tick [s]
+    tick_cpu: Quantiles  # CPU time that the controller uses for a tick [s]
     round_trip: Quantiles  # time from a packet to its answer [s]
-    lateness: Quantiles  # delay with which packets were sent [s]
+    lateness: Quantiles  # delay of a packet after its due time [s]
 
 
 class LoopTimes(NamedTuple):
-    """Times behind `LoopMetrics`, for plots."""
+    """Measured times of all ticks of one real-time loop, for plots."""
 
-    tick_time: np.ndarray  # controller's time per tick [s]
-    round_trip: np.ndarray  # time from a packet to its answer [s]
+    tick_time: np.ndarray  # time that the controller needs for each tick [s], (recorded ticks,)
+    round_trip: np.ndarray  # time from each packet to its answer [s], (answered ticks,)
 
 
 class LoopReport(NamedTuple):
-    """Report of one loop."""
+    """Results of one real-time loop: metrics, times, and the causes of missed ticks."""
 
-    figures: LoopMetrics  # metrics
-    times: LoopTimes  # times for plots
-    causes: np.ndarray  # cause of each missed tick (`find_miss_causes`)
+    metrics: LoopMetrics  # numbers of missed ticks and quantiles of the times
+    times: LoopTimes  # times of all ticks, for plots
+    causes: np.ndarray  # cause of each missed tick, (ticks,); see `find_miss_causes`
     controller: dict[str, Any]  # record that the controller's process wrote at its end
 
 
 class SessionReport(NamedTuple):
-    """Report of a session."""
+    """Results of a session: both loops, the contacts, the commands and the trips."""
 
-    empty: LoopReport | None  # empty loop; None if it was not reached
-    run: LoopReport | None  # run against the rig; None if it was not reached
-    contacts: tuple[RigContact, ...]  # contacts that ended
-    commanded: CommandRange | None  # range of the commands
-    tripped: str  # reason of the controller's trip; empty without one
-    interrupted: bool  # whether the session was interrupted
-    # reasons of trips after which the controller was reset, since the machine had delayed its commands
+    empty: LoopReport | None  # loop without a rig; None if the session ended before it
+    run: LoopReport | None  # loop with the simulated rig; None if the session ended before it
+    contacts: tuple[RigContact, ...]  # contacts that have ended
+    commanded: CommandRange | None  # extreme values of the commands
+    tripped: str  # reason of the controller's trip; empty if it has not tripped
+    interrupted: bool  # whether the user interrupted the session
+    # reasons of the trips that late commands caused, and after which the controller was reset
     resets: tuple[str, ...] = ()
 
 
 class SessionSettings(NamedTuple):
-    """Settings of a session."""
+    """Settings of a session: controller, mechanism, durations, and injected faults."""
 
-    folder: Path  # folder of the controller's process: that of a bundle, or `SOURCE_FOLDER`
+    folder: Path  # folder that holds `udp_controller.py`: a bundle, or `SOURCE_FOLDER`
     gains: Path  # gain file of the controller
-    mechanism: Mechanism  # mechanism in the gain file
+    mechanism: Mechanism  # mechanism that the gain file contains
     stroke: tuple[float, float]  # lowest and highest position of the drives [m]
-    duration: float  # duration of the run [s]
-    empty_duration: float  # duration of the empty loop before it [s]
-    injection: Injection  # faults injected into the run
-    seed: int  # seed of all draws
+    duration: float  # duration of the run with the simulated rig [s]
+    empty_duration: float  # duration of the empty loop before the run [s]
+    injection: Injection  # network faults that are injected into the run
+    seed: int  # seed of all random numbers
     priority: bool = False  # whether to request a real-time priority for both processes
 
 
 def run_session(
     setup: SessionSettings, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
 ) -> SessionReport:
-    """Play an empty loop, then the rig.
+    """Execute an empty loop for comparison, then the loop with the simulated rig.
 
-    Records are written to the folder `scratch`. `say` is called with a description of each stage, `progress`
-    once a second with the completed and the total number of ticks. Raise InputError if the controller's
-    process does not start or does not write its record.
+    Args:
+        setup: settings of the session.
+        scratch: folder for the records that the controller's process writes.
+        say: callback, called with a description of each loop before it starts.
+        progress: callback, called once a second with the completed and the total number of ticks.
+
+    Raises:
+        InputError: if the controller's process does not start or does not write its record.
     """
     task = RigTask(setup.mechanism, setup.seed, setup.stroke, resets=not setup.injection.any)
     period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
@@ -160,7 +167,10 @@ def _run_controller_loop(
     scratch: Path,
     progress: Callable[[int, int], None],
 ) -> tuple[LoopReport, bool]:
-    """Play one loop against a new controller's process; return its report and whether it was interrupted."""
+    """Execute one loop with a new controller's process.
+
+    Return the report of the loop, and whether the user interrupted it.
+    """
     period = setup.mechanism.rig.control_period
     ticks, record = max(1, round(duration / period)), scratch / f"{type(task).__name__}.json"
     options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
@@ -178,16 +188,16 @@ def _run_controller_loop(
         except KeyboardInterrupt:
             interrupted = True
         finally:
-            # Stop packets are sent twice, since a full buffer may drop one.
+            # The stop packet is sent twice, because a full network buffer may drop a packet.
             for _ in range(2):
-                network.send_plainly(encode_reading(STOP_READING, session))
+                network.send_without_faults(encode_reading(STOP_READING, session))
             network.close()
         process.wait(END_TIMEOUT)
         document = json.loads(record.read_text(encoding="utf-8"))
     except (OSError, subprocess.TimeoutExpired, json.JSONDecodeError) as error:
         reason = to_one_line(str(error), 200)
         raise InputError(
-            f"udp_controller.py: found no good end ({reason}), expected a record of it"
+            f"udp_controller.py: the controller's process exited without writing its record ({reason})"
         ) from None
     finally:
         if process.poll() is None:
@@ -200,7 +210,10 @@ def _run_controller_loop(
 
 @contextmanager
 def real_time_priority(wanted: bool) -> Iterator[None]:
-    """Give this thread a real-time priority in the context, if `wanted`; raise OSError if refused."""
+    """Run this thread with a real-time priority within the context, if `wanted`.
+
+    Raise OSError if the operating system refuses the priority.
+    """
     if not wanted:
         yield
         return
@@ -213,8 +226,9 @@ def real_time_priority(wanted: bool) -> Iterator[None]:
 
 
 def start_controller(folder: Path, arguments: Sequence[str]) -> subprocess.Popen:
-    """Start the controller's process, isolated, in the folder that holds `udp_controller.py`."""
-    # In a new session, the process gets no keyboard interrupt; the rig's process stops it in order.
+    """Start the controller's process in an isolated interpreter; `folder` holds `udp_controller.py`."""
+    # The process gets its own process group, so that Ctrl-C reaches only the rig's process, which then sends
+    # the stop packet.
     return subprocess.Popen(
         [sys.executable, "-I", "udp_controller.py", *arguments],
         cwd=folder,
@@ -224,20 +238,25 @@ def start_controller(folder: Path, arguments: Sequence[str]) -> subprocess.Popen
 
 
 def read_listening_port(process: subprocess.Popen) -> int:
-    """Return the port that the process prints when it listens; raise InputError if it does not."""
+    """Return the UDP port that the controller's process prints when it listens.
+
+    Raise InputError if the process does not print a port within `START_TIMEOUT`.
+    """
     stream = process.stdout
     assert stream is not None
     ready = select.select([stream], [], [], START_TIMEOUT)[0]
     line = stream.readline().decode("ascii", "replace").split() if ready else []
     if len(line) != 2 or line[0] != "port":
-        raise InputError("udp_controller.py: found no process that listens, expected one that says its port")
+        raise InputError(
+            f"udp_controller.py: the process did not print its UDP port within {START_TIMEOUT:g} s"
+        )
     return int(line[1])
 
 
 def open_session(network: Network) -> int:
-    """Request a session from the controller's process until it answers; return the session's number.
+    """Request a session until the controller's process answers; return the session's number.
 
-    Raise InputError if it does not answer.
+    Raise InputError if there is no answer within `START_TIMEOUT`.
     """
     number = secrets.randbits(64)
     until = time.monotonic() + START_TIMEOUT
@@ -248,13 +267,15 @@ def open_session(network: Network) -> int:
         except PacketError:
             continue
     network.close()
-    raise InputError("udp_controller.py: found no answer, expected one to who asks for a session")
+    raise InputError(
+        f"udp_controller.py: the process did not answer a request for a session within {START_TIMEOUT:g} s"
+    )
 
 
 def build_loop_report(
     timing: PacketTimes, network: Network, controller: dict[str, Any], period: float
 ) -> LoopReport:
-    """Combine the records of the rig and of the controller's process."""
+    """Build the report of one loop from the records of the rig's and of the controller's process."""
     ticks = timing.ticks
     record = {name: np.array(values, np.int64) for name, values in controller.pop("ticks").items()}
     within = record["sequence"] < ticks
@@ -271,7 +292,7 @@ def build_loop_report(
     causes = find_miss_causes(in_time, overspent, round_trip, delay, lost, ANSWER_SHARE * period)
     late = 1e-9 * np.array(timing.late[:ticks], float)
     trips = round_trip[round_trip > 0]
-    figures = LoopMetrics(
+    metrics = LoopMetrics(
         ticks=ticks,
         missed=int(np.sum(~in_time)),
         missed_by_controller=int(np.sum(causes == CAUSE_CONTROLLER)),
@@ -283,37 +304,40 @@ def build_loop_report(
         round_trip=compute_quantiles(trips),
         lateness=compute_quantiles(late),
     )
-    return LoopReport(figures, LoopTimes(wall, trips), causes, controller)
+    return LoopReport(metrics, LoopTimes(wall, trips), causes, controller)
 
 
 NOT_MISSED, CAUSE_CONTROLLER, CAUSE_INJECTION, CAUSE_MACHINE = 0, 1, 2, 3
 
 
 def find_miss_causes(
-    met: np.ndarray,
+    in_time: np.ndarray,
     overspent: np.ndarray,
     round_trip: np.ndarray,
-    held: np.ndarray,
+    injected_delay: np.ndarray,
     lost: np.ndarray,
     allowance: float,
 ) -> np.ndarray:
-    """Return the cause of each missed tick, (ticks,), as one of `NOT_MISSED` and `CAUSE_...`.
+    """Return the cause of each missed tick.
 
-    Injection is the cause if it lost the packet, if the answer would have been in time without the delay, or
-    if a delayed packet was never answered, since a newer one overtook it.
+    Injection is the cause in three cases: it lost the packet or the answer; without the injected delay, the
+    answer would have been in time; or a delayed packet was never answered, because a newer one overtook it.
 
     Args:
-        met: whether the answer was in time.
-        overspent: whether the controller took more CPU time than its share.
-        round_trip: time to the answer [s], 0 without an answer.
-        held: injected delay [s].
-        lost: whether injection lost the packet or its answer.
-        allowance: time in which the answer must arrive [s].
+        in_time: whether the answer was in time, (ticks,).
+        overspent: whether the controller used more CPU time than `MAX_CPU_SHARE` allows, (ticks,).
+        round_trip: time from the packet to the answer [s], 0 without an answer, (ticks,).
+        injected_delay: injected delay of the packet and its answer [s], (ticks,).
+        lost: whether injection lost the packet or its answer, (ticks,).
+        allowance: longest time until an answer that is in time [s].
+
+    Returns:
+        `NOT_MISSED`, `CAUSE_CONTROLLER`, `CAUSE_INJECTION` or `CAUSE_MACHINE` for each tick, (ticks,).
     """
-    in_time_without_delay = np.where(round_trip > 0, round_trip - held <= allowance, True)
-    injected = lost | ((held > 0) & in_time_without_delay)
+    in_time_without_delay = np.where(round_trip > 0, round_trip - injected_delay <= allowance, True)
+    injected = lost | ((injected_delay > 0) & in_time_without_delay)
     causes = np.where(
-        met,
+        in_time,
         NOT_MISSED,
         np.where(overspent, CAUSE_CONTROLLER, np.where(injected, CAUSE_INJECTION, CAUSE_MACHINE)),
     )
@@ -326,7 +350,7 @@ def find_miss_causes(
 
 
 def compute_quantiles(values: np.ndarray) -> Quantiles:
-    """Return median, 99.9th percentile and maximum; NaN without values."""
+    """Return median, 99.9th percentile and maximum of times [s]; NaN if there are no values."""
     if not len(values):
         return Quantiles(math.nan, math.nan, math.nan)
     return Quantiles(*(float(value) for value in (*np.quantile(values, (0.5, 0.999)), np.max(values))))

@@ -1,4 +1,4 @@
-"""Report of a session: every contact compared with its ideal contact, and a verdict with reasons."""
+"""Report of a session: comparison of every contact with its ideal contact, and a verdict with reasons."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from tuning.rig.session import CAUSE_CONTROLLER, LoopReport, SessionReport, Sess
 
 
 def ideal_restitutions(mechanism: Mechanism, contacts: Sequence[RigContact]) -> list[float]:
-    """Return e* of the ideal contact of each contact, with the approach speed on the rig; imports JAX."""
+    """Return the ideal restitution e* of each contact at its approach speed; this imports JAX."""
     if not contacts:
         return []
     from jaxhil.simulation.jax_environment import prepare_jax
@@ -37,9 +37,11 @@ def ideal_restitutions(mechanism: Mechanism, contacts: Sequence[RigContact]) -> 
 
 
 def is_stalled(contact: RigContact, setup: SessionSettings, run: LoopReport | None) -> bool:
-    """Return whether only the machine caused commands older than `MAX_COMMAND_AGE` periods in a contact.
+    """Return whether the computer, and not the controller, delayed the commands during a contact.
 
-    Such a contact does not evaluate the controller. With injected faults the result is always False.
+    This is the case if a command was older than `MAX_COMMAND_AGE` periods and the controller did not cause
+    any missed tick of the contact. Such a contact says nothing about the controller. If faults are injected,
+    the result is always False.
     """
     if run is None or setup.injection.any or contact.oldest_command <= MAX_COMMAND_AGE:
         return False
@@ -54,7 +56,15 @@ def evaluate_session(
     limit: float,
     compensator: str,
 ) -> dict[str, Any]:
-    """Return the session as a document in SI units: loops, contacts, commands, verdict and reasons."""
+    """Evaluate a session: return its results, the verdict and the reasons as JSON data in SI units.
+
+    Args:
+        setup: settings of the session.
+        session: results of the session.
+        references: ideal restitution e* of each contact.
+        limit: largest permitted magnitude of the restitution error e - e* [1].
+        compensator: name of the compensator.
+    """
     contacts = [
         {
             **contact._asdict(),
@@ -66,9 +76,9 @@ def evaluate_session(
     ]
     errors = [contact["error"] for contact in contacts if contact["status"] == "ok"]
     reasons = _failure_reasons(setup, session, [contact["status"] for contact in contacts], errors, limit)
-    good = f"no missed tick is the controller's fault, every error is within {limit:g}."
+    good = f"the controller caused no missed tick, and every restitution error is within {limit:g}."
     if session.tripped:
-        good = "tripped with a cause under injected faults, every command finite and within its limits."
+        good = "the injected faults caused the trip, and every command was finite and within its limits."
     return {
         "mechanism": setup.mechanism.name,
         "compensator": compensator,
@@ -98,15 +108,15 @@ def evaluate_session(
 def _loop_document(loop: LoopReport | None) -> dict[str, Any] | None:
     if loop is None:
         return None
-    figures = loop.figures._asdict()
+    metrics = loop.metrics._asdict()
     for name in ("tick_time", "tick_cpu", "round_trip", "lateness"):
-        figures[name] = figures[name]._asdict()
+        metrics[name] = metrics[name]._asdict()
     record = {key: loop.controller[key] for key in ("ended", "status", "ignored", "stale", "made_up", "jax")}
-    # The process of an older bundle may not report quality flags ("doubts").
+    # The program in an older bundle may not report quality flags ("doubts").
     record["doubts"] = loop.controller.get("doubts", {})
     times = loop.controller["replayed"]["cpu"]
     return {
-        **figures,
+        **metrics,
         "controller": record,
         "replayed": len(times),
         "replayed_most": max(times, default=0) * 1e-9,
@@ -123,32 +133,34 @@ def _failure_reasons(
     reasons = []
     run, commanded = session.run, session.commanded
     if run is not None:
-        missed = run.figures.missed_by_controller
+        missed = run.metrics.missed_by_controller
         if missed:
-            reasons.append(f"{missed} missed tick{'s are' if missed > 1 else ' is'} the controller's fault.")
+            reasons.append(f"the controller caused {missed} missed tick{'s' if missed > 1 else ''}.")
         if run.controller["ended"] not in ("stopped",):
-            reasons.append(f"the controller's process ended {run.controller['ended']}, before the run did.")
+            reasons.append(
+                f"the controller's process ended before the run (reason: {run.controller['ended']})."
+            )
     wrong = [error for error in errors if not abs(error) <= limit]
     if wrong:
         worst = max(wrong, key=abs)
         kind = "divergence" if worst > 0 else "convergence"
         reasons.append(
-            f"{len(wrong)} of {len(errors)} contacts have an error beyond {limit:g}, the largest "
-            f"{worst:+.4f} ({kind})."
+            f"{len(wrong)} of {len(errors)} contacts have a restitution error beyond {limit:g}; the largest "
+            f"is {worst:+.4f} ({kind})."
         )
     failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
     if failed:
-        reasons.append(f"{len(failed)} contacts did not end well: {', '.join(sorted(set(failed)))}.")
+        reasons.append(f"{len(failed)} contacts have no valid result: {', '.join(sorted(set(failed)))}.")
     if "timeout" in failed:
-        reasons.append(f"timeout: not over after {MAX_CONTACT_DURATION:g} s, the limit of a contact.")
+        reasons.append(f"timeout: the contact lasted longer than {MAX_CONTACT_DURATION:g} s.")
     if session.tripped and not setup.injection.any:
-        reasons.append("it tripped though no faults were injected.")
+        reasons.append("the controller tripped although no faults were injected.")
     if commanded is not None and commanded.not_finite:
-        reasons.append(f"{commanded.not_finite} commands were not finite.")
+        reasons.append(f"{commanded.not_finite} commands were NaN or infinite.")
     if commanded is not None and commanded.beyond_limits:
         reasons.append(f"{commanded.beyond_limits} position commands were beyond their limits.")
     if not errors and not session.tripped and not session.interrupted:
-        reasons.append("no contact could be judged: the run was too short, or the machine too busy.")
+        reasons.append("no contact could be evaluated: the run was too short, or the computer too busy.")
     if math.isnan(sum(errors)):
-        reasons.append("an error is not a number.")
+        reasons.append("a restitution error is NaN.")
     return reasons

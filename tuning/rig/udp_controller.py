@@ -2,24 +2,24 @@
 
     python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
 
-It runs in a bundle's folder and needs only that bundle's `gains.json`, `jaxhil_runtime.py` and
-`udp_protocol.py`, which defines the packets. It prints `port NUMBER` to standard output when it listens. The
-rig requests a session (`ask_for_session`) until it gets an answer, then sends
+This program runs in a bundle's folder and needs only three files of the bundle: `gains.json`,
+`jaxhil_runtime.py` and `udp_protocol.py`, which defines the packets. When it listens, it prints `port NUMBER`
+to standard output. The rig requests a session until it gets an answer. Then the rig sends these packets:
 
-    PREPARE  the mechanism is free: tare, then prepare the start of a run; repeated until READY
-    RESET    as PREPARE, after a reset of a controller that has tripped
+    PREPARE  the mechanism is free: tare, then prepare the start of a run; repeated until the answer is READY
+    RESET    reset a controller that has tripped, then do the same as for PREPARE
     TICK     readings of the sensors at tick n = 0, 1, ... of the run; the answer is the command of tick n + 1
-    STOP     the end of the session
+    STOP     end the session
 
-The session also ends if the rig is silent (`--silence`). This process serves one session, with the address
-and port of its first packet. Packets from other addresses, or without the session's number, are ignored and
-counted; neither these nor old packets end the silence. A new session needs another process.
-This process holds the numerical model M x'' = -F_c, integrated once per period.
+The process also ends the session if the rig sends no valid packet for the time `--silence`. It serves one
+session, with the address and port of the first valid packet. It ignores and counts packets from other
+addresses or with another session number. A new session needs a new process. The process also integrates the
+numerical model M x'' = -F_c, once per period.
 
-The time per tick (from the return of recv to that of send) and its CPU time are stored in preallocated arrays
-and written at the end. If a tick took more CPU time than its share of the period, all packets are replayed at
-the end. The controller's work takes equally long again, whereas an interrupt or another virtual machine on
-the processor does not occur again. With `--empty` the process answers at once and computes nothing.
+The process records the time of each tick, from the arrival of the packet to the answer, and its CPU time. It
+writes both at the end. If a tick used too much CPU time (`MAX_CPU_SHARE`), the process replays all packets at
+the end. If the controller was the cause, the tick is slow again in the replay. If an interrupt or another
+virtual machine was the cause, it is not. With `--empty`, the process answers at once and computes nothing.
 """
 
 import argparse
@@ -37,10 +37,10 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 SCRIPT_FOLDER = Path(__file__).resolve().parent
-# An isolated interpreter (-I) does not search the script's folder.
+# An isolated interpreter (-I) does not search the script's folder for modules.
 if (SCRIPT_FOLDER / "jaxhil_runtime.py").is_file():
     sys.path.insert(0, str(SCRIPT_FOLDER))
-    # No files may be added to a bundle.
+    # Bytecode files would change the content of the bundle.
     sys.dont_write_bytecode = True
     import udp_protocol as udp  # pyright: ignore[reportMissingImports]
     from jaxhil_runtime import Controller  # pyright: ignore[reportMissingImports]
@@ -51,20 +51,20 @@ else:
     from jaxhil.rig import Controller
     from tuning.rig import udp_protocol as udp
 
-MAX_CPU_SHARE = 0.5  # share of the period that the controller may use as CPU time
-REPLAY_COUNT = 3  # number of replays, of which the least time counts
-REAL_TIME_PRIORITY = 20  # requested priority of the real-time class
+MAX_CPU_SHARE = 0.5  # largest CPU time of the controller for a tick [periods]
+REPLAY_COUNT = 3  # number of replays; the shortest CPU time of a tick counts
+REAL_TIME_PRIORITY = 20  # priority requested from the operating system, in the class SCHED_FIFO [1 to 99]
 
 
 class EmptyControllerTask:
-    """Task of an empty loop, which answers every packet and computes nothing."""
+    """Task for an empty loop: it answers every packet and computes nothing."""
 
-    stale = made_up = 0
+    stale = interpolated = 0
     status = "ok"
-    doubts: ClassVar[dict[str, int]] = {}
+    quality_flags: ClassVar[dict[str, int]] = {}
 
     def answer(self, reading: udp.ReadingPacket) -> udp.AnswerPacket:
-        """Return an answer with the reading's numbers and zeros."""
+        """Return an answer to the reading's packet, with commands of zero."""
         _, sequence, run, tick, *_ = reading
         return udp.AnswerPacket(
             udp.EMPTY_LOOP | udp.READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, ""
@@ -72,53 +72,65 @@ class EmptyControllerTask:
 
 
 class TickRecord:
-    """Record of every tick in preallocated memory: sequence number, time [ns], CPU time [ns] and packet.
+    """Preallocated record of the times of all ticks and of all packets.
 
-    Ticks and packets beyond the capacity are not recorded.
+    Args:
+        capacity: largest number of ticks and of packets; later ones are not recorded.
+
+    Attributes:
+        sequence: sequence number of each tick's packet.
+        wall: time from each packet to its answer [ns].
+        cpu: CPU time of each answer [ns].
+        count: number of recorded ticks.
+        packet_count: number of recorded packets.
     """
 
     def __init__(self, capacity: int) -> None:
         self.sequence, self.wall, self.cpu = (array("q", bytes(8 * capacity)) for _ in range(3))
         self._packets, self._size = bytearray(udp.READING_FORMAT.size * capacity), udp.READING_FORMAT.size
-        self.count = self.kept = 0
+        self.count = self.packet_count = 0
         self.capacity = capacity
 
-    def keep(self, packet: bytes | bytearray) -> None:
-        """Store a packet of any kind."""
-        count = self.kept
+    def store_packet(self, packet: bytes | bytearray) -> None:
+        """Store a packet from the rig, for a replay."""
+        count = self.packet_count
         if count < self.capacity:
             self._packets[count * self._size : (count + 1) * self._size] = packet
-            self.kept = count + 1
+            self.packet_count = count + 1
 
     def add(self, sequence: int, wall: int, cpu: int) -> None:
-        """Store the times of one tick."""
+        """Store the time and the CPU time [ns] of one tick."""
         count = self.count
         if count < self.capacity:
             self.sequence[count], self.wall[count], self.cpu[count] = sequence, wall, cpu
             self.count = count + 1
 
     def readings(self) -> Iterator[udp.ReadingPacket]:
-        """Yield the readings of the stored packets."""
-        for index in range(self.kept):
+        """Decode and yield the stored packets in the order of arrival."""
+        for index in range(self.packet_count):
             packet = self._packets[index * self._size : (index + 1) * self._size]
             yield udp.decode_reading(packet, None)
 
     def above(self, limit: float) -> dict[int, int]:
-        """Return the CPU time [ns] of the ticks above `limit` [ns] by sequence number."""
+        """Return the CPU times [ns] that exceed `limit` [ns], as a dictionary by sequence number."""
         return {self.sequence[i]: self.cpu[i] for i in range(self.count) if self.cpu[i] > limit}
 
     def document(self) -> dict[str, list[int]]:
-        """Return the times as JSON data."""
+        """Return sequence numbers and times of the ticks as JSON data."""
         return {name: list(getattr(self, name)[: self.count]) for name in ("sequence", "wall", "cpu")}
 
 
 def replay_slow_ticks(
-    make: Callable[[], udp.ControllerTask], record: TickRecord, limit: float
+    make_task: Callable[[], udp.ControllerTask], record: TickRecord, limit: float
 ) -> dict[int, int]:
-    """Return the least CPU time [ns] in live run and replays of the ticks above `limit` [ns] when live."""
+    """Replay all packets if a tick used more CPU time than `limit` [ns].
+
+    Return, by sequence number, the shortest CPU time [ns] of each such tick in the session and the replays.
+    `make_task` returns a new task of the same controller for each replay.
+    """
     times, cpu_now = record.above(limit), time.thread_time_ns
     for _ in range(REPLAY_COUNT if times else 0):
-        task = make()
+        task = make_task()
         for reading in record.readings():
             start = cpu_now()
             task.answer(reading)
@@ -129,10 +141,10 @@ def replay_slow_ticks(
 
 
 class SessionEnd(NamedTuple):
-    """End of a session."""
+    """Reason for the end of a session, and number of ignored packets."""
 
-    why: str  # "stopped", "silent" or "interrupted"
-    ignored: int  # number of ignored packets
+    reason: str  # "stopped", "silent" or "interrupted"
+    ignored: int  # number of packets from other senders or with another session number
 
 
 def serve(
@@ -142,23 +154,28 @@ def serve(
     wait: float,
     silence: float,
 ) -> SessionEnd:
-    """Answer the packets of one session until the rig stops it or is silent for `silence` [s].
+    """Answer the packets of one session until the rig stops it or sends nothing.
 
-    `wait` [s] is the longest time until the first packet.
+    Args:
+        receiver: socket that listens.
+        task: task that computes the answers.
+        record: record of times and packets, which this function fills.
+        wait: longest time until the first packet [s].
+        silence: longest time between two valid packets [s].
     """
     packet = bytearray(udp.READING_FORMAT.size + 1)
     now, cpu_now, clock = time.monotonic_ns, time.thread_time_ns, time.monotonic
     sessions, peer, session, ignored = udp.SessionNumbers(), None, 0, 0
     until = clock() + wait
     while True:
-        # Only packets of the session extend this deadline, since others can come from any process.
-        left = until - clock()
-        if left <= 0.0 or not select.select([receiver], [], [], left)[0]:
+        # Only valid packets of the session extend this deadline, because any process can send other packets.
+        remaining = until - clock()
+        if remaining <= 0.0 or not select.select([receiver], [], [], remaining)[0]:
             return SessionEnd("silent", ignored)
         try:
             size, sender = receiver.recvfrom_into(packet)
         except OSError:
-            # An earlier answer was refused, since its receiver no longer exists.
+            # The receiver of an earlier answer no longer exists, and the system reports this error only now.
             continue
         start, cpu_start = now(), cpu_now()
         if peer is None:
@@ -185,13 +202,13 @@ def serve(
             until = clock() + silence
             sent = _send(receiver, udp.encode_answer(answer, session), peer)
         wall, cpu = now() - start, cpu_now() - cpu_start
-        record.keep(packet[:size])
+        record.store_packet(packet[:size])
         if sent and reading.event == udp.TICK:
             record.add(reading.sequence, wall, cpu)
 
 
 def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
-    """Send a packet; return False if the rig does not listen or the network's buffer is full."""
+    """Send a packet; return whether the system accepted it (the rig listens and the buffer is not full)."""
     try:
         receiver.sendto(packet, peer)
     except OSError:
@@ -200,25 +217,31 @@ def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Parse the process's options."""
+    """Parse the command-line options."""
     parser = argparse.ArgumentParser(description="Answer a rig's sensor packets over UDP on loopback.")
     parser.add_argument(
-        "--gains", default=str(SCRIPT_FOLDER / "gains.json"), help="gain file; by default beside this"
+        "--gains",
+        default=str(SCRIPT_FOLDER / "gains.json"),
+        help="gain file; default: gains.json in this script's folder",
     )
-    parser.add_argument("--port", type=int, default=0, help="UDP port on 127.0.0.1; 0: any that is free")
-    parser.add_argument("--record", default=None, help="file for the time of every tick, as JSON")
-    parser.add_argument("--ticks", type=int, default=1_000_000, help="ticks to keep the time of")
-    parser.add_argument("--wait", type=float, default=30.0, help="s to wait for the first packet")
+    parser.add_argument("--port", type=int, default=0, help="UDP port on 127.0.0.1; 0: any free port")
+    parser.add_argument("--record", default=None, help="output file for the time of every tick, as JSON")
+    parser.add_argument("--ticks", type=int, default=1_000_000, help="largest number of recorded ticks")
+    parser.add_argument("--wait", type=float, default=30.0, help="longest time until the first packet [s]")
     parser.add_argument(
-        "--silence", type=float, default=2.0, help="s without a new packet that end the session"
+        "--silence", type=float, default=2.0, help="time without a new packet that ends the session [s]"
     )
-    parser.add_argument("--realtime", action="store_true", help="ask for a real-time priority")
-    parser.add_argument("--empty", action="store_true", help="answer at once, compute nothing")
+    parser.add_argument("--realtime", action="store_true", help="request a real-time priority")
+    parser.add_argument("--empty", action="store_true", help="answer at once and compute nothing")
     return parser.parse_args(arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Serve one session; return 0 if the rig stopped it, 2 for an invalid gain file or option, else 1."""
+    """Serve one session; return the exit code.
+
+    The exit code is 0 if the rig stopped the session, 2 if the gain file is invalid or the real-time priority
+    is refused, and 1 if the rig was silent or the user interrupted the session.
+    """
     options = parse(arguments)
     limit = math.inf
     try:
@@ -233,7 +256,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"udp_controller: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
     record = TickRecord(max(options.ticks, 0))
-    # Collections would delay ticks, and the loop creates no reference cycles.
+    # Garbage collection would delay ticks, and the loop creates no reference cycles.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -246,23 +269,26 @@ def main(arguments: list[str] | None = None) -> int:
             ended = SessionEnd("interrupted", 0)
     replay = replay_slow_ticks(lambda: load_task(options.gains), record, limit)
     document = {
-        "ended": ended.why,
+        "ended": ended.reason,
         "ignored": ended.ignored,
         "status": task.status,
         "stale": task.stale,
-        "made_up": task.made_up,
-        "doubts": task.doubts,
+        "made_up": task.interpolated,
+        "doubts": task.quality_flags,
         "jax": "jax" in sys.modules,
         "ticks": record.document(),
         "replayed": {"sequence": list(replay), "cpu": list(replay.values())},
     }
     if options.record is not None:
         Path(options.record).write_text(json.dumps(document), encoding="utf-8")
-    return 0 if ended.why == "stopped" else 1
+    return 0 if ended.reason == "stopped" else 1
 
 
 def load_task(path: str) -> udp.ControllerTask:
-    """Load the task of a gain file; raise ValueError, OSError, KeyError or TypeError if it is invalid."""
+    """Return the task for the controller and mechanism of a gain file.
+
+    Raise ValueError, OSError, KeyError, TypeError or AttributeError if the file is invalid.
+    """
     controller = Controller.from_file(path)
     document = json.loads(Path(path).read_text(encoding="utf-8"))
     limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
@@ -272,7 +298,7 @@ def load_task(path: str) -> udp.ControllerTask:
 
 
 def request_real_time_priority() -> None:
-    """Request a real-time priority; raise OSError if it is refused."""
+    """Request a real-time priority for this thread; raise OSError if the operating system refuses it."""
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("this system has no real-time priorities")
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))

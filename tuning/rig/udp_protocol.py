@@ -1,20 +1,20 @@
-"""UDP protocol between a rig and the controller's process, and the controller's side without a network.
+"""UDP protocol between a rig and the controller's process, and computation of the controller's answers.
 
-The rig sends a `ReadingPacket` with the sensors' readings at a tick; the controller's process returns an
-`AnswerPacket` with the command for the next tick. Both are packets of fixed size. `ControllerTask` computes
-the answer from the reading: it holds the controller and the numerical model of the docking, but no network or
+The rig sends a `ReadingPacket` with the sensor readings of a tick. The controller's process returns an
+`AnswerPacket` with the command for the next tick. Both packets have a fixed size. `ControllerTask` computes
+the answer to a reading, with the controller and the numerical model of the docking. It uses no network and no
 clock.
 
-First the rig requests a session with a random number until it gets an answer with that number and the
-session's number, which every later packet in either direction contains. Only a receiver at the rig's address
-and port can know the session's number. The session begins with the first packet from there with that number
-(`SessionNumbers`).
+First the rig requests a session: it sends a random number until it receives an answer with this number. The
+answer also contains the session number, which all later packets contain. Only a receiver at the rig's
+address and port can know the session number (`SessionNumbers`). The session starts with the first packet from
+this address that contains the session number.
 
-Packets may be lost, late or out of order. A packet that is not newer than the last one is dropped and counted
-(`SequenceFilter`). Missing ticks are computed when the next packet arrives, from linearly interpolated
-readings, and answered with the fault `missed_tick`. If more ticks are missing than the gain file's limit
-`missed_in_a_row` (by default `MAX_INTERPOLATED_TICKS`), they are not interpolated: the controller detects the
-gap in the rig's time, and the model continues under the last F_c, so that its time remains the rig's.
+Packets can be lost, late or out of order. A packet that is not newer than the previous one is dropped and
+counted (`SequenceFilter`). When a packet arrives after missing ticks, the controller executes these ticks
+with linearly interpolated readings. The answer reports the fault `missed_tick`. If more ticks are missing
+than the limit `missed_in_a_row` of the gain file (default `MAX_INTERPOLATED_TICKS`), the controller skips
+these ticks and detects the gap in the rig's time. The numerical model continues under the last force command.
 """
 
 import hmac
@@ -23,42 +23,44 @@ import secrets
 import struct
 from typing import Any, NamedTuple
 
-PREPARE, TICK, STOP, RESET = 1, 2, 3, 4  # kinds of packets from the rig
+PREPARE, TICK, STOP, RESET = 1, 2, 3, 4  # events, the kinds of packets from the rig
 EVENTS = (PREPARE, TICK, STOP, RESET)
-READY, TRIPPED, TARING, EMPTY_LOOP = 1, 2, 4, 8  # flags of an answer
+READY, TRIPPED, TARING, EMPTY_LOOP = 1, 2, 4, 8  # bits of an answer's flags
 FLAGS = READY | TRIPPED | TARING | EMPTY_LOOP
 
-# Little-endian: mark, version, kind, session, sequence, run, tick; time [s], force [N], position [m],
-# start [m, m/s].
+# Reading, little-endian: mark, version, event, session number, sequence number, run, tick, time [s],
+# force [N], position [m], start position [m], start velocity [m/s].
 READING_FORMAT = struct.Struct("<4sBBxxQIIIxxxx5d")
-# Mark, version, flags, session, sequence, run, tick; position command, rate, position, velocity, force;
-# faults; reason of a trip.
+# Answer, little-endian: mark, version, flags, session number, sequence number, run, tick,
+# position command [m], command rate [m/s], position [m], velocity [m/s], force command [N], faults,
+# reason of a trip.
 ANSWER_FORMAT = struct.Struct("<4sBBxxQIII4xdddddQ96s")
-# Mark, version, the rig's number, the session's number, which is 0 in the request.
+# Request and its answer, little-endian: mark, version, random number of the rig, session number (0 in the
+# request).
 OPENING_FORMAT = struct.Struct("<4sBxxxQQ")
 READING_MARK, ANSWER_MARK, VERSION = b"JHrd", b"JHan", 2
 REQUEST_MARK, OPENING_MARK = b"JHas", b"JHop"
 
-MAX_PACKET_NUMBER = 0xFFFFFFFF  # largest number of a packet, which is followed by 0
-MAX_SEQUENCE_STEP = 100  # largest step of the packet number that is accepted at once
-APPROACH_TIME = 0.02  # time of free approach before a contact [s]
-MAX_INTERPOLATED_TICKS = 10  # largest number of missing ticks in a row that are interpolated, by default
-MAX_COASTED_PERIODS = 10_000  # largest number of periods that the model continues under the last force
-MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # bits of the runtime's faults with these names
+MAX_PACKET_NUMBER = 0xFFFFFFFF  # largest sequence number; the next one is 0
+MAX_SEQUENCE_STEP = 100  # largest increase of the sequence number that one packet alone can cause
+APPROACH_TIME = 0.02  # time from the start of a run to the contact [s]
+MAX_INTERPOLATED_TICKS = 10  # default limit on the number of successive missing ticks that are interpolated
+MAX_COASTED_PERIODS = 10_000  # longest time that the model continues under the last force command [periods]
+MISSED_TICK, LAW_IN_DOUBT = 0x200, 0x200000  # bits of two of the controller's faults (`jaxhil.rig`)
 
 
 class PacketError(ValueError):
-    """Error for bytes that are no packet of this protocol."""
+    """Error that is raised if received bytes are not a valid packet of this protocol."""
 
 
 class ReadingPacket(NamedTuple):
-    """Packet from the rig at one tick."""
+    """Packet that the rig sends in every tick, with the sensor readings."""
 
     event: int  # kind of packet, one of `EVENTS`
-    sequence: int  # number of the packet in the session
-    run: int  # number of the run
-    tick: int  # tick of the run
-    time: float  # rig's time [s]
+    sequence: int  # sequence number of the packet in the session
+    run: int  # number of the run in the session
+    tick: int  # number of the tick in the run
+    time: float  # time of the rig's clock [s]
     force: float  # measured force [N]
     position: float  # measured position [m]
     start_position: float  # position of the numerical model at the run's tick 0 [m]
@@ -66,96 +68,104 @@ class ReadingPacket(NamedTuple):
 
 
 class AnswerPacket(NamedTuple):
-    """Packet to the rig in answer to one reading."""
+    """Packet that the controller's process sends to the rig, in answer to one reading."""
 
-    flags: int  # any of `FLAGS`
-    sequence: int  # number of the reading
+    flags: int  # bits READY, TRIPPED, TARING and EMPTY_LOOP
+    sequence: int  # sequence number of the reading
     run: int  # run of the reading
     tick: int  # tick of the reading
-    position_command: float  # position command of the next tick [m]; while preparing, of tick 0
+    position_command: float  # position command of the next tick, or of tick 0 before a run [m]
     command_rate: float  # rate of the position command [m/s]
     position: float  # position of the numerical model at this tick [m]
     velocity: float  # velocity of the numerical model at this tick [m/s]
-    force_command: float  # force F_c on the numerical model [N]
-    faults: int  # bits of the controller's faults
-    words: str  # reason of the controller's trip; empty without one
+    force_command: float  # force command F_c, which acts on the numerical model [N]
+    faults: int  # bits of the controller's faults at this tick
+    trip_reason: str  # reason of the controller's trip; empty if it has not tripped
 
 
 def encode_reading(reading: ReadingPacket, session: int) -> bytes:
-    """Return the packet of a reading."""
+    """Encode a reading as a packet of the given session."""
     return READING_FORMAT.pack(READING_MARK, VERSION, reading.event, session, *reading[1:])
 
 
 def decode_reading(packet: bytes | bytearray, session: int | None) -> ReadingPacket:
-    """Decode the reading in a packet of the session (None: any); sensor values may be NaN.
+    """Decode a packet from the rig; sensor readings may be NaN.
 
-    Raise PacketError for any other packet.
+    Raise PacketError if it is not a valid packet of the session with number `session`. With None, a packet of
+    any session is valid.
     """
     if len(packet) != READING_FORMAT.size:
         raise PacketError(f"{len(packet)} bytes, expected {READING_FORMAT.size}")
     mark, version, event, packet_session, *fields = READING_FORMAT.unpack(packet)
     reading = ReadingPacket(event, *fields)
     if mark != READING_MARK or version != VERSION or event not in EVENTS:
-        raise PacketError("not a packet from the rig of this version")
+        raise PacketError("not a reading packet of this protocol version")
     if session is not None and packet_session != session:
-        raise PacketError("a packet of another session")
+        raise PacketError("reading packet of another session")
     if not math.isfinite(reading.time):
-        raise PacketError("a time that is not finite")
+        raise PacketError("the rig's time is not finite")
     return reading
 
 
 def encode_answer(answer: AnswerPacket, session: int) -> bytes:
-    """Return the packet of an answer; its words are cut to 96 ASCII characters."""
-    words = answer.words.encode("ascii", "replace")
-    return ANSWER_FORMAT.pack(ANSWER_MARK, VERSION, answer.flags, session, *answer[1:-1], words)
+    """Encode an answer as a packet of the session; the reason of a trip is cut to 96 ASCII characters."""
+    trip_reason = answer.trip_reason.encode("ascii", "replace")
+    return ANSWER_FORMAT.pack(ANSWER_MARK, VERSION, answer.flags, session, *answer[1:-1], trip_reason)
 
 
 def decode_answer(packet: bytes, session: int | None) -> AnswerPacket:
-    """Decode the answer in a packet of the session (None: any); raise PacketError for any other packet."""
+    """Decode a packet from the controller's process.
+
+    Raise PacketError if it is not a valid packet of the session with number `session`. With None, a packet of
+    any session is valid.
+    """
     if len(packet) != ANSWER_FORMAT.size:
         raise PacketError(f"{len(packet)} bytes, expected {ANSWER_FORMAT.size}")
-    mark, version, flags, packet_session, *fields, words = ANSWER_FORMAT.unpack(packet)
+    mark, version, flags, packet_session, *fields, trip_reason = ANSWER_FORMAT.unpack(packet)
     if mark != ANSWER_MARK or version != VERSION or flags & ~FLAGS:
-        raise PacketError("not an answer of this version")
+        raise PacketError("not an answer packet of this protocol version")
     if session is not None and packet_session != session:
-        raise PacketError("an answer of another session")
-    text = words.rstrip(b"\0")
+        raise PacketError("answer packet of another session")
+    text = trip_reason.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
-        raise PacketError("words that are not printable")
+        raise PacketError("the reason of the trip has characters that are not printable")
     return AnswerPacket._make((flags, *fields, text.decode("ascii")))
 
 
 def encode_session_request(number: int) -> bytes:
-    """Return the rig's request for a session, with a random number of 64 bits."""
+    """Encode the rig's request for a session; `number` is a random number of 64 bits."""
     return OPENING_FORMAT.pack(REQUEST_MARK, VERSION, number, 0)
 
 
 def decode_session(packet: bytes, number: int) -> int:
-    """Decode the session's number in the answer to request `number`; raise PacketError if it is none."""
+    """Decode the session number from the answer to a request; `number` is the random number of the request.
+
+    Raise PacketError if the packet is not an answer to this request.
+    """
     if len(packet) == OPENING_FORMAT.size:
         mark, version, requested, session = OPENING_FORMAT.unpack(packet)
         if (mark, version, requested) == (OPENING_MARK, VERSION, number):
             return session
-    raise PacketError("not the answer to that question for a session")
+    raise PacketError("not an answer to this request for a session")
 
 
 class SessionNumbers:
-    """Session numbers, computed from address and port by a keyed hash.
+    """Generator of session numbers, computed from address and port by a keyed hash.
 
-    Requests need no memory, and an answer is not longer than the request. Only a receiver at an address can
-    know its number.
+    Only a receiver at an address can know the session number of this address. Requests need no memory, and
+    an answer is not longer than its request, so that forged requests cannot exhaust memory or network.
     """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(32)
 
     def number(self, sender: tuple[str, int]) -> int:
-        """Return the session's number of an address and port."""
+        """Return the session number of the address and port `sender`."""
         code = hmac.digest(self._secret, repr(sender).encode(), "sha256")
         return int.from_bytes(code[:8], "little")
 
     def answer(self, packet: bytes | bytearray, sender: tuple[str, int]) -> bytes | None:
-        """Return the answer to a request for a session; None for any other packet."""
+        """Return the answer packet to a request for a session, or None if `packet` is not a request."""
         if len(packet) != OPENING_FORMAT.size:
             return None
         mark, version, requested, _ = OPENING_FORMAT.unpack(packet)
@@ -165,10 +175,11 @@ class SessionNumbers:
 
 
 class SequenceFilter:
-    """Filter for packets that are newer than all before, by numbers of 32 bits (RFC 1982).
+    """Filter that accepts a packet only if it is newer than all previous packets.
 
-    One packet with a wrong number must not make all later packets old. So a number more than
-    `MAX_SEQUENCE_STEP` ahead counts only after a second packet that follows it (as in RFC 3550, A.1).
+    It compares sequence numbers of 32 bits, which wrap around (RFC 1982). One packet with a wrong number must
+    not make all later packets old. Therefore a jump by more than `MAX_SEQUENCE_STEP` is accepted only when a
+    second packet continues from the new number (RFC 3550, A.1).
     """
 
     __slots__ = ("_awaited", "_newest")
@@ -178,7 +189,7 @@ class SequenceFilter:
         self._awaited: int | None = None
 
     def is_newer(self, number: int) -> bool:
-        """Return whether a packet is newer; if so, it becomes the newest one."""
+        """Return whether the sequence number is newer than all previous ones; if so, store it."""
         ahead = number - self._newest & MAX_PACKET_NUMBER
         if not 0 < ahead <= MAX_PACKET_NUMBER // 2:
             return False
@@ -193,10 +204,17 @@ class SequenceFilter:
 
 
 class NumericalModel:
-    """Numerical model M x'' = -F_c of the relative motion of two free bodies, one step per control period.
+    """Numerical model M x'' = -F_c of the relative motion of two free bodies.
 
-    Mass [kg], period [s] and integrator are those of the gain file's mechanism, and so is the first `start`,
-    in uniform motion at x(0) = min(plane, 0) - v (0.02 s + phase T).
+    Mass, control period and integrator come from the gain file's mechanism. The model advances by one step in
+    each control period.
+
+    Attributes:
+        start: default position [m] and velocity v [m/s] at the start of a run. The position is
+            min(contact plane, 0) - v (0.02 s + phase T), where T is the control period.
+        position: relative position of the bodies [m].
+        velocity: relative velocity [m/s].
+        acceleration: relative acceleration in the last period [m/s^2].
     """
 
     __slots__ = ("_integrator", "_mass", "_period", "acceleration", "position", "start", "velocity")
@@ -216,11 +234,11 @@ class NumericalModel:
         self.place(*self.start)
 
     def place(self, position: float, velocity: float) -> None:
-        """Set a uniform motion with this position [m] and velocity [m/s]."""
+        """Set position [m] and velocity [m/s]; the acceleration becomes 0."""
         self.position, self.velocity, self.acceleration = position, velocity, 0.0
 
     def integrate(self, force: float) -> None:
-        """Integrate one period under the force F_c [N]."""
+        """Integrate the motion over one control period under the force command F_c [N]."""
         period, velocity = self._period, self.velocity
         acceleration = -force / self._mass
         self.velocity = velocity + period * acceleration
@@ -234,47 +252,55 @@ class NumericalModel:
 
 
 class ControllerTask:
-    """Controller and numerical model, which answer readings without a network.
+    """Controller and numerical model, which compute the answers to readings, independent of the network.
 
-    `bridged` is the largest number of missing ticks in a row that are interpolated, `period` the control
-    period [s]. `made_up` counts interpolated ticks, `stale` unusable packets, and `doubts`, by the law's
-    status, contacts with the fault `law_in_doubt`.
+    Args:
+        controller: controller of the gain file.
+        mechanism: mechanism of the gain file.
+        max_interpolated: largest number of successive missing ticks that are interpolated.
+
+    Attributes:
+        period: control period [s].
+        interpolated: number of interpolated ticks.
+        stale: number of packets that were dropped because they were old or their run was not prepared.
+        quality_flags: numbers of contacts with the fault `law_in_doubt`, by the compensator's status.
     """
 
     __slots__ = (
-        *("_bridged", "_command", "_controller", "_force", "_last", "_model", "_run"),
-        *("_sequence", "_tared", "_words", "_zeroed", "doubts", "made_up", "period", "stale"),
+        *("_command", "_controller", "_force", "_has_noise_or_bias", "_last", "_max_interpolated", "_model"),
+        *("_run", "_sequence", "_tared", "_trip_reason", "interpolated", "period", "quality_flags", "stale"),
     )
 
     def __init__(
-        self, controller: Any, mechanism: dict[str, Any], bridged: float = MAX_INTERPOLATED_TICKS
+        self, controller: Any, mechanism: dict[str, Any], max_interpolated: float = MAX_INTERPOLATED_TICKS
     ) -> None:
         self._controller = controller
-        self._model, self._bridged = NumericalModel(mechanism), min(bridged, MAX_INTERPOLATED_TICKS)
+        self._model = NumericalModel(mechanism)
+        self._max_interpolated = min(max_interpolated, MAX_INTERPOLATED_TICKS)
         self.period = float(mechanism["rig"]["control_period"])
         sensor = mechanism["rig"].get("force_sensor", {})
-        # Before tick 0 there is no force, although a noisy sensor reads one.
-        self._zeroed = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
+        # At tick 0 the mechanism is free. Noise or bias of the sensor must not act on the numerical model.
+        self._has_noise_or_bias = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
         self._sequence, self._run, self._tared = SequenceFilter(), -1, False
         self._command = self._force = 0.0
         self._last: ReadingPacket | None = None
-        self._words = ""
-        self.stale = self.made_up = 0
-        self.doubts: dict[str, int] = {}
+        self._trip_reason = ""
+        self.stale = self.interpolated = 0
+        self.quality_flags: dict[str, int] = {}
 
     @property
     def status(self) -> str:
-        """Return the status of the controller."""
+        """Return the controller's status, such as "ok" or "tripped: ..."."""
         return str(self._controller.status)
 
     def answer(self, reading: ReadingPacket) -> AnswerPacket | None:
-        """Return the answer to a reading; None if it is not newer than the last or its run is unprepared."""
+        """Return the answer to a reading, or None if the reading is old or its run was not prepared."""
         unprepared = reading.event == TICK and reading.run != self._run
         if unprepared or not self._sequence.is_newer(reading.sequence):
             self.stale += 1
             return None
         if reading.event == RESET and reading.run != self._run and self._controller.reset():
-            self._words = ""
+            self._trip_reason = ""
         return self._step(reading) if reading.event == TICK else self._prepare(reading)
 
     def _prepare(self, reading: ReadingPacket) -> AnswerPacket:
@@ -288,7 +314,7 @@ class ControllerTask:
         return self._reply(reading, READY, model.velocity, model.position, model.velocity, 0.0, faults)
 
     def _begin(self, reading: ReadingPacket) -> int:
-        """Begin a new run; return the faults at the end of the last one."""
+        """Begin a new run; return the faults that the controller reports at the end of the previous run."""
         model, faults = self._model, 0
         if math.isfinite(reading.start_position) and math.isfinite(reading.start_velocity):
             model.place(reading.start_position, reading.start_velocity)
@@ -302,11 +328,11 @@ class ControllerTask:
         return faults
 
     def _reported_faults(self) -> int:
-        """Return the controller's current faults; count a contact with the fault `law_in_doubt`."""
+        """Return the controller's current faults; count the contact if they include `law_in_doubt`."""
         controller = self._controller
         if controller.faults & LAW_IN_DOUBT:
             status = controller.last_contact.status
-            self.doubts[status] = self.doubts.get(status, 0) + 1
+            self.quality_flags[status] = self.quality_flags.get(status, 0) + 1
         return controller.faults
 
     def _step(self, reading: ReadingPacket) -> AnswerPacket:
@@ -315,38 +341,38 @@ class ControllerTask:
         faults = 0
         if missed > 0:
             faults = MISSED_TICK
-            if missed <= self._bridged:
-                faults |= self._make_up(missed, reading)
+            if missed <= self._max_interpolated:
+                faults |= self._interpolate(missed, reading)
             else:
                 for _ in range(min(missed, MAX_COASTED_PERIODS)):
                     model.integrate(self._force)
         position, velocity, before = model.position, model.velocity, self._command
         faults |= self._tick(reading.tick, reading.force, reading.position, reading.time)
         self._last = reading
-        # After a trip the position command does not follow the numerical model.
+        # After a trip, the position command no longer follows the numerical model.
         rate = (self._command - before) / self.period if self._controller.tripped else model.velocity
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
-    def _make_up(self, missed: int, reading: ReadingPacket) -> int:
-        """Compute the missing ticks from interpolated readings; return their faults."""
-        self.made_up += missed
+    def _interpolate(self, missed: int, reading: ReadingPacket) -> int:
+        """Execute the missing ticks with interpolated readings; return the controller's faults in them."""
+        self.interpolated += missed
         faults = 0
         last = self._last
         before = reading if last is None else last
         for number in range(missed):
-            share = (number + 1) / (missed + 1)
-            force = before.force + share * (reading.force - before.force)
-            position = before.position + share * (reading.position - before.position)
+            weight = (number + 1) / (missed + 1)
+            force = before.force + weight * (reading.force - before.force)
+            position = before.position + weight * (reading.position - before.position)
             tick = reading.tick - missed + number
             time = reading.time - (missed - number) * self.period
             faults |= self._tick(tick, force, position, time)
         return faults
 
     def _tick(self, tick: int, force: float, position: float, time: float) -> int:
-        """Advance controller and numerical model by one period; return the tick's faults."""
+        """Advance controller and numerical model by one period; return the controller's faults."""
         model, controller = self._model, self._controller
         force = controller.step(force, model.position, model.velocity, position, time)
-        if self._zeroed and tick == 0:
+        if self._has_noise_or_bias and tick == 0:
             force = 0.0
         self._force = force
         model.integrate(force)
@@ -365,8 +391,18 @@ class ControllerTask:
     ) -> AnswerPacket:
         if self._controller.tripped:
             flags |= TRIPPED
-            self._words = self._words or self.status[:96]
+            self._trip_reason = self._trip_reason or self.status[:96]
         _, sequence, run, tick, *_ = reading
         return AnswerPacket(
-            *(flags, sequence, run, tick, self._command, rate, position, velocity, force, faults), self._words
+            flags=flags,
+            sequence=sequence,
+            run=run,
+            tick=tick,
+            position_command=self._command,
+            command_rate=rate,
+            position=position,
+            velocity=velocity,
+            force_command=force,
+            faults=faults,
+            trip_reason=self._trip_reason,
         )
