@@ -52,9 +52,9 @@ def test_alarm_verdict_uses_rates_allowed_by_caller():
     ("missed", "words"),
     [
         # 183 runs decide if no alarm is missed; 40 of 2000 scenarios were evaluated.
-        ((0, 40), "at this rate a sweep of about 9200 scenarios tells"),
-        ((0, 0), "no such run among 1000: a sweep of at least 50000 scenarios tells"),
-        ((1, 50), "at this rate no sweep would tell"),
+        ((0, 40), "at this rate, a sweep of about 9200 scenarios would decide"),
+        ((0, 0), "1000 runs contain no such run: a sweep of 50000 scenarios may decide"),
+        ((1, 50), "at this rate, no sweep would decide"),
     ],
 )
 def test_unknown_alarm_verdict_states_sufficient_sweep_size(missed, words):

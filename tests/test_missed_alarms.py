@@ -113,7 +113,7 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
         _, low, high = binomial_interval(alarms, runs)
         return {"alarms": alarms, "runs": runs, "low": float(low), "high": float(high)}
 
-    one = {**rate(alarms, runs), "name": "force_delay", "meaning": "the force measured later than told"}
+    one = {**rate(alarms, runs), "name": "force_delay", "meaning": "an unmodelled delay of the force sensor"}
     rates = {
         "held_out_runs": 1000,
         "false_alarms": rate(0, 500),
@@ -126,7 +126,7 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
         and result["fault_runs"][0]["allowed"] == DEFAULT_ALLOWED_RATES.missed_alarms
     )
     if verdict == "unknown":
-        tells = "about 190 such runs tell, there are 182" if counted else "a sweep of at least "
+        tells = "about 190 such runs would decide; there are 182" if counted else "a sweep of "
         assert tells in result["unknown"][0]
     # If too many drawn runs are missed, the result is bad, whatever the injected runs give.
     missed = add_verdict({**rates, "missed_alarms": rate(50, 100)}, DEFAULT_ALLOWED_RATES, 2048)

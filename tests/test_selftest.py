@@ -241,7 +241,7 @@ def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
         ("gains.json", "[]", "found a list"),
         ("vectors.csv", "a,b\n", "unknown columns"),
         ("vectors.csv", selftest.VECTOR_COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
-        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event 0.0"),
+        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event: found 0.0"),
         ("vectors.csv", selftest.VECTOR_COLUMNS + "\n", "contains no ticks"),
     ]:
         for other, content in signed({**files, name: text.encode()}, document).items():
@@ -291,7 +291,8 @@ def test_selftest_compiles_and_runs_the_c_controller(files, folder, monkeypatch)
         good, out = run_selftest(folder, "--c")
         assert not good and re.search(reason, out), out
     (folder / "c99" / "jaxhil_controller.h").write_bytes(b"")
-    assert "FAIL  c99: is not compiled, because a file is missing or differs" in run_selftest(folder, "--c")[1]
+    expected = "FAIL  c99: is not compiled, because a file is missing or differs"
+    assert expected in run_selftest(folder, "--c")[1]
     for name, content in files.items():
         (folder / name).write_bytes(content)
     monkeypatch.setenv("PATH", "")

@@ -94,7 +94,7 @@ def test_summary_has_a_row_with_unit_for_every_gain(made, page):
 def test_summary_has_every_limit_or_states_its_absence(made, page):
     rows = {row[0]: row for row in page.rows if row}
     text = " ".join(page.texts)
-    unset = re.search(r"by the code alone: ([^.]*)\.", text)[1].split(", ")
+    unset = re.search(r"the widest limit holds: ([^.]*)\.", text)[1].split(", ")
     for name, one in made["limits"].items():
         if one["value"] is None:
             assert name in unset
@@ -172,6 +172,6 @@ def test_summary_does_not_invent_unknown_values():
     text = " ".join(Page(summary_html(bare)).texts)
     assert "None: the force command is the measured force." in text
     assert "None in the gain file: the controller's widest limits hold." in text
-    assert "holds no figures" in text
+    assert "contains no restitution errors" in text
     unknown = replace_limits(bare, {"force_limit": 1.0})
     assert "Rates of false and missed alarms are not known." in " ".join(Page(summary_html(unknown)).texts)

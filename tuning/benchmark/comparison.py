@@ -1,9 +1,9 @@
-"""Comparison of compensators, each with tuned gains, on the same scenarios and probes.
+"""Comparison of compensators, each with tuned gains, in the same scenarios and probes.
 
-Laws, and groups of mechanisms that share a program, are distributed to as many processes as there are cores,
-each with few devices, since most of the time is compilation, which uses one core per process. Results do not
-depend on the process. The result of a law on a group is cached at once, if there is a cache
-(`tuning.caches.checkpoints`).
+A task is one compensator and one group of mechanisms that share a compiled program. The tasks are distributed
+to as many processes as there are cores. Each process uses few JAX devices, because most of the time is
+compilation, which uses one core per process. Results do not depend on the process. If there is a cache, the
+result of each task is stored at once (`tuning.caches.checkpoints`).
 """
 
 import multiprocessing
@@ -26,52 +26,54 @@ from tuning.caches.worker import get_process_setting
 from tuning.statistics.intervals import Estimate
 
 LITERATURE_GAINS, TUNED_GAINS = "literature", "tuned"
-SEED_OFFSET = 0xFA1  # offset of the evaluation's seed, which differs from those of tuning and its validation
-MESSAGE_INTERVAL = 1.0  # least time between two messages of a process [s]
+SEED_OFFSET = 0xFA1  # added to the seed for the evaluation, so that tuning never used these scenarios
+MESSAGE_INTERVAL = 1.0  # shortest time between two progress messages of a process [s]
 
 ComparisonProgress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """Settings of a comparison."""
+    """Settings of a comparison of compensators."""
 
     scenarios: int = 32  # number of training scenarios
-    starts: int = 3  # starts of the solver
-    steps: int = 16  # largest number of solver steps per start
-    polish: int = 20  # evaluations without derivatives per gain
-    scanned: int = 64  # points of a scan for starts
+    starts: int = 3  # number of starting points of the optimisation
+    steps: int = 16  # largest number of optimisation steps from each starting point
+    polish: int = 20  # number of evaluations per gain in the derivative-free search after the optimisation
+    scanned: int = 64  # number of points that are scanned to find starting points
     judged: int = 256  # number of scenarios for the evaluation
-    limit: float = 0.01  # error beyond which a contact counts as a failure [1]
-    seed: int = 0  # seed of scenarios, starts and resampling
-    tuned: bool = True  # whether to tune
+    limit: float = 0.01  # restitution error above which a contact counts as a failure [1]
+    seed: int = 0  # seed of scenarios, starting points and bootstrap
+    tuned: bool = True  # whether to tune the gains
 
 
 class LawMetrics(NamedTuple):
-    """Metrics of one law on one mechanism.
+    """Metrics of one compensator on one mechanism, for each set of gains.
 
-    There are no tuned gains of a law that has no gains to tune, or that has settings for any mechanism.
+    The sets of gains are "literature", the named settings of the compensator, and "tuned". A compensator
+    without gains, or with settings that hold for all mechanisms, is not tuned.
     """
 
-    law: str
-    mechanism: str
-    gains: dict[str, dict[str, float]]  # by "literature", names of settings and "tuned"
-    figures: dict[str, dict[str, Estimate]]  # metrics under each of `gains` (`tuning.transparency.metrics`)
+    law: str  # name of the compensator
+    mechanism: str  # name of the mechanism
+    gains: dict[str, dict[str, float]]  # gains by name, for each set
+    figures: dict[str, dict[str, Estimate]]  # metrics by name (`tuning.transparency.metrics`), for each set
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Return the names of the evaluated settings."""
+        """Return the names of the evaluated settings: all sets but "literature" and "tuned"."""
         return tuple(which for which in self.figures if which not in (LITERATURE_GAINS, TUNED_GAINS))
 
 
 class LawFailure(NamedTuple):
-    """Failure of the evaluation of a law on a group of mechanisms, with its reason."""
+    """Error that prevented the evaluation of a compensator on a group of mechanisms."""
 
-    law: str
-    reason: str
+    law: str  # name of the compensator
+    reason: str  # description of the error
 
 
-GroupResult = tuple[list[Any], str, list[LawMetrics] | LawFailure]  # scenes of a group, law, result
+# Scenario sets of a group of mechanisms, name of the compensator, and result.
+GroupResult = tuple[list[Any], str, list[LawMetrics] | LawFailure]
 
 
 def compare_laws(
@@ -83,16 +85,23 @@ def compare_laws(
     pieces: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[LawMetrics | LawFailure]:
-    """Yield the metrics of each law on every mechanism, in the order in which they are complete.
+    """Evaluate every compensator on every mechanism; yield each result when it is complete.
 
-    They are computed in `processes` processes; with 0 processes, in this one, where an error ends the
-    comparison; or with a `scheduler`, by the workers of a cluster. `tell` is called with a description of the
-    current work, the number of results, with shares of unfinished ones, and the number of cached results.
+    Args:
+        mechanisms: mechanisms to simulate.
+        laws: names of the compensators.
+        settings: settings of the comparison.
+        processes: number of processes. With 0, this process computes all results, and an error ends the
+            comparison.
+        tell: callback, called with a description of the current work, the number of results (including
+            fractions of unfinished results), and the number of cached results.
+        pieces: cache of results.
+        scheduler: address of a cluster's scheduler, whose workers compute the results; None for no cluster.
     """
     cached = _read_cached_results(mechanisms, laws, settings, pieces) if pieces.is_resuming else []
     yield from cached
     complete = {(result.mechanism, result.law) for result in cached}
-    # Results of a group and a law are cached for all its mechanisms or for none.
+    # The results of a compensator and a group are cached together, for all mechanisms of the group.
     left = [m for m in mechanisms if any((m.name, law) not in complete for law in laws)]
     if not left:
         return
@@ -100,10 +109,13 @@ def compare_laws(
     def report(text: str, done: float) -> None:
         tell(text, len(cached) + done, len(cached))
 
-    report(f"{len(cached)} results as kept, contacts in space" if cached else "contacts in space", 0)
+    report(f"{len(cached)} cached results, ideal contacts" if cached else "ideal contacts", 0)
 
     def missing(scenes: list[list[Any]]) -> list[tuple[list[Any], str]]:
-        """Return the missing tasks, those with the longest compilation first, to balance the processes."""
+        """Return the tasks without a cached result, those with the longest compilation first.
+
+        This order balances the load of the processes.
+        """
         order = sorted(laws, key=_count_gains, reverse=True) if processes or scheduler else laws
         return [(g, law) for g in scenes for law in order if (g[0].mechanism.name, law) not in complete]
 
@@ -126,7 +138,7 @@ def compare_laws(
 def _read_cached_results(
     mechanisms: Sequence[Mechanism], laws: Sequence[str], settings: CompareSettings, pieces: Checkpoints
 ) -> list[LawMetrics]:
-    """Return the cached results of an earlier comparison."""
+    """Return the results that an earlier comparison with the same inputs has cached."""
     from tuning.gains.common_program import group_by_common_program
 
     groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]
@@ -139,7 +151,7 @@ def _read_cached_results(
 
 
 def _describe_checkpoint(group: list[Mechanism], law: str, settings: CompareSettings) -> tuple[str, Any]:
-    """Return name and inputs of the cached result of a law on mechanisms that share a program."""
+    """Return the name and the inputs under which the result of one task is cached."""
     return f"compare {law} {group[0].name}", ("compare", law, [to_plain_data(m) for m in group], settings)
 
 
@@ -164,7 +176,7 @@ def _evaluate_on_cluster(
         _describe_checkpoint([scene.mechanism for scene in group], law, settings) for group, law in tasks
     ]
     done, what = 0, f"compare-{compute_digest(inputs)[:16]}"
-    tell(f"{len(tasks)} pieces on the cluster", done)
+    tell(f"{len(tasks)} tasks on the cluster", done)
     for i, result in run_on_workers(scheduler, evaluate_law_or_failure, pieces, get_process_setting(), what):
         group, law = tasks[i]
         done += len(group)
@@ -175,7 +187,7 @@ def _evaluate_on_cluster(
 def evaluate_law_or_failure(
     group: list[Any], law: str, settings: CompareSettings
 ) -> list[LawMetrics] | LawFailure:
-    """Call `evaluate_law`; return the failure with its reason if it raises."""
+    """Call `evaluate_law`; if it raises an error, return the error as `LawFailure`."""
     try:
         return evaluate_law(group, law, settings)
     except Exception as error:
@@ -193,7 +205,7 @@ def _evaluate_in_processes(
     missing: Callable[[list[list[Any]]], list[tuple[list[Any], str]]],
     tell: ComparisonProgress,
 ) -> Iterator[GroupResult]:
-    # JAX does not work after a fork, so that each process needs a new interpreter.
+    # JAX does not work in a forked process, so that each process starts a new interpreter.
     context = multiprocessing.get_context("spawn")
     messages = context.SimpleQueue()
     with ProcessPoolExecutor(processes, context, _initialise_worker, (messages,)) as pool:
@@ -222,14 +234,17 @@ def _evaluate_in_processes(
 
 
 def _count_gains(law: str) -> int:
-    """Return the number of a law's gains, with which the time of its compilation increases."""
+    """Return the number of a compensator's gains, which determines the compilation time."""
     from jaxhil.rig import COMPENSATORS
 
     return len(COMPENSATORS[law].gains)
 
 
 def build_scenario_sets(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
-    """Build the scenes of all mechanisms (`tuning.benchmark.runs.Scene`), grouped by program."""
+    """Build the scenarios of all mechanisms, one `tuning.benchmark.runs.ScenarioSet` for each.
+
+    Mechanisms that share a compiled program are in the same inner list.
+    """
     from tuning.benchmark.runs import build_scenario_set
     from tuning.gains.common_program import group_by_common_program
 
@@ -246,9 +261,9 @@ def evaluate_law(
     settings: CompareSettings,
     tell: ComparisonProgress = lambda text, share: None,
 ) -> list[LawMetrics]:
-    """Tune one law for mechanisms of one program, and compute its metrics on each.
+    """Tune one compensator for mechanisms that share a program, and compute its metrics on each mechanism.
 
-    `tell` is called with a description of the current work and the share that is done.
+    `tell` is a callback, called with a description of the current work and the completed fraction.
     """
     from jaxhil.laws.compensators import COMPENSATORS, literature_gains
     from tuning.benchmark.runs import count_evaluated_lanes, evaluate_gains
@@ -266,7 +281,7 @@ def evaluate_law(
         {which or LITERATURE_GAINS: literature_gains(mechanism, law, which) for which in (None, *further)}
         for mechanism in mechanisms
     ]
-    # A law with settings for any mechanism is used without tuning.
+    # A compensator whose settings hold for all mechanisms is not tuned.
     tuned = settings.tuned and not COMPENSATORS[law].settings
     tuned = tuned and any(
         gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
@@ -290,7 +305,7 @@ def evaluate_law(
     for scene, by_name in zip(scenes, gains, strict=True):
         metrics = {}
         for which, values in by_name.items():
-            work.say(f"{scene.mechanism.name}: judging {which} gains")
+            work.say(f"{scene.mechanism.name}: evaluating {which} gains")
             metrics[which] = evaluate_gains(scene, law, values, settings.limit, settings.seed)
             work.report_runs(lanes[scene.mechanism.name])
         results.append(LawMetrics(law, scene.mechanism.name, by_name, metrics))
@@ -300,7 +315,7 @@ def evaluate_law(
 def _evaluate_in_worker(
     number: int, scenes: list[Any], law: str, settings: CompareSettings
 ) -> list[LawMetrics]:
-    """Call `evaluate_law` in a worker process, which reports its progress to the parent."""
+    """Call `evaluate_law` in a worker process, and send its progress to the parent process."""
     last = 0.0
 
     def tell(text: str, share: float) -> None:
@@ -312,14 +327,14 @@ def _evaluate_in_worker(
     return evaluate_law(scenes, law, settings, tell)
 
 
-_messages: Any = None  # queue to the parent, in a worker
+_messages: Any = None  # in a worker process, queue for progress messages to the parent process
 
 
 def _initialise_worker(messages: Any) -> None:
-    """Initialise a worker process with few devices, since there are as many workers as cores."""
+    """Initialise a worker process with few JAX devices, because every core has its own worker."""
     global _messages
     _messages = messages
-    # On an interrupt the parent ends the workers; if the parent is killed, they end themselves.
+    # After Ctrl-C the parent process ends the workers. If the parent is killed, each worker ends itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     flags = os.environ.get("XLA_FLAGS", "")
@@ -328,7 +343,7 @@ def _initialise_worker(messages: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended for any reason."""
+    """Wait until the parent process has ended, then end this process."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,6 +1,7 @@
-"""Runs of one mechanism under one law for the comparison: plain, pushed and damped ones.
+"""Runs of one compensator on one mechanism for the comparison, with and without perturbations.
 
-All mechanisms that share a `CommonProgram` run in one compiled program per law.
+The perturbations are pushes and additional damping. All mechanisms that share a `CommonProgram` use the same
+compiled program of a compensator.
 """
 
 from collections.abc import Mapping
@@ -31,26 +32,26 @@ from tuning.transparency.pushes import (
 
 
 class ScenarioSet(NamedTuple):
-    """Scenarios of one mechanism on which every law is evaluated, as NumPy arrays."""
+    """Scenarios of one mechanism in which every compensator is evaluated, as NumPy arrays."""
 
-    mechanism: Mechanism
-    common: CommonProgram  # program that the mechanism shares with others
-    plain: Scenario  # scenarios without perturbation
-    twins: Scenario  # scenarios with damping added (`tuning.transparency.damping_perturbations`)
-    space: IdealContacts  # ideal first contacts of the scenarios
+    mechanism: Mechanism  # mechanism with its uncertainty
+    common: CommonProgram  # program that the mechanism shares with other mechanisms
+    plain: Scenario  # scenarios without a perturbation
+    damped: Scenario  # the same scenarios with additional damping
+    ideal_contacts: IdealContacts  # first ideal contact of each scenario
 
 
 def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> ScenarioSet:
-    """Draw the scenarios of a mechanism and compute their ideal contacts."""
+    """Draw the scenarios of a mechanism, add damping to copies of them, and compute the ideal contacts."""
     draws = draw(mechanism, scenarios, seed)
-    twin, twin_draws = perturb_damping(mechanism, draws)
+    damped_mechanism, damped_draws = perturb_damping(mechanism, draws)
     plain = common.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
-    twins = common.scenarios(twin, build_scenarios(twin, twin_draws, seed))
+    damped = common.scenarios(damped_mechanism, build_scenarios(damped_mechanism, damped_draws, seed))
     return ScenarioSet(
         mechanism,
         common,
         plain,
-        twins,
+        damped,
         compute_ideal_contacts(common.law(beforehand=False), plain, _broadcast_velocity(plain), 1),
     )
 
@@ -58,20 +59,24 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
 def evaluate_gains(
     scene: ScenarioSet, law: str, gains: Mapping[str, float], limit: float, seed: int
 ) -> dict[str, Estimate]:
-    """Compute all metrics of a law under these gains; `limit` and `seed` as in `figures.judge`."""
-    contacts, space = scene.mechanism.approach.contacts, scene.space
-    runs = _run_scenarios(scene, law, gains, space)
+    """Simulate a compensator with the given gains in all scenarios, and compute its metrics by name.
+
+    `limit` [1] is the limit of the restitution error, `seed` the seed of the bootstrap.
+    """
+    contacts, ideal_contacts = scene.mechanism.approach.contacts, scene.ideal_contacts
+    runs = _run_scenarios(scene, law, gains, ideal_contacts)
     if contacts > 1:
-        # The approach speeds of later contacts depend on the law, and so do their ideal contacts.
+        # The approach speeds of later contacts depend on the compensator, and so do their ideal contacts.
         plain: Any = runs.plain
         velocity = np.where(plain.good, plain.metrics.approach_velocity, _broadcast_velocity(scene.plain))
-        space = compute_ideal_contacts(scene.common.law(beforehand=False), scene.plain, velocity, contacts)
-        runs = _run_scenarios(scene, law, gains, space)
+        contact_law = scene.common.law(beforehand=False)
+        ideal_contacts = compute_ideal_contacts(contact_law, scene.plain, velocity, contacts)
+        runs = _run_scenarios(scene, law, gains, ideal_contacts)
     return compute_metrics(
         runs,
-        (space.early, space.late),
-        space.restitution[0],
-        np.max(space.depth, axis=1),
+        (ideal_contacts.early, ideal_contacts.late),
+        ideal_contacts.restitution[0],
+        np.max(ideal_contacts.depth, axis=1),
         _compute_amplification(scene, law, gains),
         limit,
         seed,
@@ -79,7 +84,7 @@ def evaluate_gains(
 
 
 def count_evaluated_lanes(scene: ScenarioSet) -> int:
-    """Return the number of lanes that `evaluate_gains` runs."""
+    """Return the number of lanes that `evaluate_gains` simulates, for progress messages."""
     return (
         len(PerturbedOutcomes._fields)
         * len(scene.plain.velocity)
@@ -88,11 +93,13 @@ def count_evaluated_lanes(scene: ScenarioSet) -> int:
 
 
 def _run_scenarios(
-    scene: ScenarioSet, law: str, gains: Mapping[str, float], space: IdealContacts
+    scene: ScenarioSet, law: str, gains: Mapping[str, float], ideal_contacts: IdealContacts
 ) -> PerturbedOutcomes:
-    """Run all scenarios of the metrics as one batch; `space` holds their ideal contacts."""
-    pushed = [add_probe(scene.plain, space, share) for share in (EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE)]
-    scenarios = join_batches([add_probe(scene.plain, space), *pushed, add_probe(scene.twins, space)])
+    """Simulate the scenarios without perturbation, with both pushes and with damping, as one batch."""
+    plain, damped = (add_probe(scenarios, ideal_contacts) for scenarios in (scene.plain, scene.damped))
+    early = add_probe(scene.plain, ideal_contacts, EARLY_PUSH_CENTRE)
+    late = add_probe(scene.plain, ideal_contacts, LATE_PUSH_CENTRE)
+    scenarios = join_batches([plain, early, late, damped])
     loop = scene.common.loop(build_loop(scene.mechanism, law, scenarios))
     values = {name: np.full(len(scenarios.velocity), value) for name, value in gains.items()}
     return PerturbedOutcomes(*split_batch(evaluate(loop, values, scenarios), len(scene.plain.velocity)))
@@ -103,7 +110,7 @@ def _broadcast_velocity(scenarios: Scenario) -> Any:
 
 
 def _compute_amplification(scene: ScenarioSet, law: str, gains: Mapping[str, float]) -> float:
-    """Return the noise amplification [1], averaged over the scenarios' control periods."""
+    """Return the compensator's amplification of white force noise [1], averaged over the scenarios."""
     period, clearance = jnp.asarray(scene.plain.control_period), jnp.asarray(scene.plain.clearance)
     values = {name: jnp.full_like(period, value) for name, value in gains.items()}
     return float(jnp.mean(COMPENSATORS[law].noise_amplification(values, KnownConstants(period, clearance))))

@@ -1,4 +1,4 @@
-"""Tables of a comparison: one per mechanism, and the leaderboard of all."""
+"""Tables of a comparison: one table for each mechanism, and a leaderboard of all mechanisms."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,61 +25,67 @@ METRIC_HEADINGS = {
     "noise": "noise",
 }
 UNLIMITED_WIDTH = 10_000  # console width [characters] that does not limit a table
-WINNER_MARK = "*"  # marks a metric whose interval is better than those of all other laws
+WINNER_MARK = "*"  # marks the metric of a compensator that is significantly better than all others
 
 
-def find_winners(found: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
-    """Return the best law for every metric on one mechanism, each with its `choose_best_metrics` gains."""
-    by_law = {result.law: choose_best_metrics(result, which) for result in found}
+def find_winners(results: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
+    """Return for each metric the compensator that is significantly the best on one mechanism, or None.
+
+    Each compensator is compared with the gains `which` or, without them, with the gains of the literature.
+    """
+    by_law = {result.law: choose_best_metrics(result, which) for result in results}
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
 
 
-def choose_best_metrics(found: LawMetrics, which: str = TUNED_GAINS) -> dict[str, Estimate]:
-    """Return the metrics with tuned gains or, if there are none, with the literature's."""
-    return found.figures.get(which) or found.figures[LITERATURE_GAINS]
+def choose_best_metrics(result: LawMetrics, which: str = TUNED_GAINS) -> dict[str, Estimate]:
+    """Return the metrics for the gains `which` or, without them, for the gains of the literature."""
+    return result.figures.get(which) or result.figures[LITERATURE_GAINS]
 
 
-def build_mechanism_table(name: str, found: Sequence[LawMetrics]) -> Table:
-    """Return the table of every law with the literature's gains, settings and tuned gains."""
-    winning = find_winners(found)
+def build_mechanism_table(name: str, results: Sequence[LawMetrics]) -> Table:
+    """Build the table of one mechanism: one row for each compensator and set of gains."""
+    winners = find_winners(results)
     rows = []
-    for result in found:
+    for result in results:
         for which, metrics in result.figures.items():
             is_best = metrics is choose_best_metrics(result)
             rows.append(
                 [
                     result.law if which == LITERATURE_GAINS else f"  {which}",
                     *(
-                        format_metric(key, metrics[key], is_best and winning[key] == result.law)
+                        format_metric(key, metrics[key], is_best and winners[key] == result.law)
                         for key in METRIC_HEADINGS
                     ),
                 ]
             )
-    tuned = ", then tuned, but for those with settings" * _has_tuned_gains(found)
+    tuned = ", then tuned, but for those with settings" * _has_tuned_gains(results)
     title = f"{name}: each law with the literature's gains{tuned}"
     return _set_compact_style(terminal.build_table(title, ["law", *METRIC_HEADINGS.values()], rows))
 
 
-def build_leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> Table:
-    """Return the table of rms errors [%] of every law and setting (columns) on every mechanism (rows)."""
-    results = [result for name in names for result in found[name]]
-    laws = list(dict.fromkeys(result.law for result in results))
-    columns = dict.fromkeys((result.law, which) for result in results for which in ("", *result.settings))
+def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> Table:
+    """Build the table of rms restitution errors [%], with a row for each mechanism.
+
+    The columns are the compensators, and their named settings.
+    """
+    flat = [result for name in names for result in results[name]]
+    laws = list(dict.fromkeys(result.law for result in flat))
+    columns = dict.fromkeys((result.law, which) for result in flat for which in ("", *result.settings))
     columns = sorted(columns, key=lambda column: laws.index(column[0]))
-    winning = {name: find_winners(found[name])["rms"] for name in names}
+    winners = {name: find_winners(results[name])["rms"] for name in names}
     rows = []
     for name in names:
         cells = []
-        by_law = {result.law: result for result in found[name]}
+        by_law = {result.law: result for result in results[name]}
         for law, which in columns:
             result = by_law.get(law)
             metrics = result and (result.figures.get(which) if which else choose_best_metrics(result))
             cells.append(
-                format_metric("rms", metrics["rms"], winning[name] == law and not which) if metrics else "-"
+                format_metric("rms", metrics["rms"], winners[name] == law and not which) if metrics else "-"
             )
         rows.append([name.removeprefix("suite-"), *cells])
     headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
-    tuned = any(map(_has_tuned_gains, found.values()))
+    tuned = any(map(_has_tuned_gains, results.values()))
     how = "each law tuned, but for those with settings" if tuned else "each law with the literature's gains"
     table = _set_compact_style(
         terminal.build_table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows)
@@ -89,31 +95,35 @@ def build_leaderboard(names: Sequence[str], found: Mapping[str, Sequence[LawMetr
     return table
 
 
-def describe_least_errors(names: Sequence[str], found: Mapping[str, Sequence[LawMetrics]]) -> str:
-    """Return a sentence with the law of least rms error per mechanism, regardless of the intervals."""
-    led: dict[str, list[str]] = {}
+def describe_least_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> str:
+    """Return a sentence that names the compensator with the smallest rms error on each mechanism.
+
+    The sentence ignores the intervals, so that a difference may not be significant.
+    """
+    leading: dict[str, list[str]] = {}
     for name in names:
-        errors = {result.law: choose_best_metrics(result)["rms"].value for result in found[name]}
+        errors = {result.law: choose_best_metrics(result)["rms"].value for result in results[name]}
         finite = {law: value for law, value in errors.items() if np.isfinite(value)}
         if len(finite) > 1:
-            led.setdefault(min(finite, key=lambda law: finite[law]), []).append(name.removeprefix("suite-"))
-    ordered = sorted(led.items(), key=lambda item: -len(item[1]))
+            best = min(finite, key=lambda law: finite[law])
+            leading.setdefault(best, []).append(name.removeprefix("suite-"))
+    ordered = sorted(leading.items(), key=lambda item: -len(item[1]))
     texts = (f"{law} ({', '.join(names)})" for law, names in ordered)
-    return f"Least rms error: {'; '.join(texts)}." if led else ""
+    return f"Least rms error: {'; '.join(texts)}." if leading else ""
 
 
-def _has_tuned_gains(found: Sequence[LawMetrics]) -> bool:
-    return any(TUNED_GAINS in result.figures for result in found)
+def _has_tuned_gains(results: Sequence[LawMetrics]) -> bool:
+    return any(TUNED_GAINS in result.figures for result in results)
 
 
 def _set_compact_style(table: Table) -> Table:
-    """Keep names of a table on one line and its columns close together."""
+    """Set the style of a table: names on one line, columns close together."""
     table.columns[0].no_wrap = True
     table.padding = (0, 1, 0, 0)
     return table
 
 
-def format_metric(key: str, figure: Estimate, wins: bool = False) -> str:
-    """Return a metric with three digits, and with a mark if it wins."""
-    value = 100 * figure.value if key in PERCENT_METRICS else figure.value
+def format_metric(key: str, metric: Estimate, wins: bool = False) -> str:
+    """Return a metric as text with three digits, followed by `WINNER_MARK` if it `wins`."""
+    value = 100 * metric.value if key in PERCENT_METRICS else metric.value
     return terminal.format_number(value, 3) + WINNER_MARK * wins

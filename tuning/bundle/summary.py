@@ -203,7 +203,7 @@ def _describe_missed_faults(runs: Mapping[str, Any]) -> str:
         return f"{runs['meaning']}, {most}: not counted, {usable}"
     interval = f"95 %: {_format_number(runs['low'], 2)} to {_format_number(runs['high'], 2)}"
     interval += f", limit {_format_number(runs['allowed'], 2)}"
-    size = f"by {_format_number(runs['size'], 2)}{unit}, error {_format_number(runs['error'], 2)}"
+    size = f"size {_format_number(runs['size'], 2)}{unit}, error {_format_number(runs['error'], 2)}"
     return (
         f"missed alarms {runs['alarms']} of {runs['runs']} runs with {runs['meaning']}, {size} ({interval})"
     )

@@ -1,4 +1,4 @@
-"""Bootstrap confidence intervals of the rms error and the 99th percentile of a batch of scenarios."""
+"""Bootstrap confidence intervals of the rms and the 99th percentile of restitution errors."""
 
 from typing import NamedTuple
 
@@ -6,28 +6,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 
-BOOTSTRAP_RESAMPLES = 1999
+BOOTSTRAP_RESAMPLES = 1999  # number of bootstrap resamples
 CONFIDENCE_LEVEL = 0.95
-MAX_BCA_SCENARIOS = (
-    4096  # number of scenarios above which the BCa correction is negligible and its jackknife is slow
-)
+# Largest number of scenarios with the BCa correction. With more, the correction is negligible and slow.
+MAX_BCA_SCENARIOS = 4096
 
 
 class Interval(NamedTuple):
-    """Confidence interval."""
+    """Confidence interval, in the unit of the estimated quantity."""
 
-    low: float
-    high: float
+    low: float  # lower bound
+    high: float  # upper bound
 
 
 class ErrorIntervals(NamedTuple):
-    """Intervals of the rms and the 99th percentile of |e - e*|; NaN if fewer than two scenarios count."""
+    """Confidence intervals of restitution errors |e - e*|; NaN with fewer than two usable scenarios."""
 
-    rms: Interval
-    p99: Interval
+    rms: Interval  # interval of the rms error [1]
+    p99: Interval  # interval of the 99th percentile [1]
 
     def plain(self) -> dict[str, dict[str, float]]:
-        """Return the intervals as plain data for files."""
+        """Return the intervals as JSON data."""
         return {name: interval._asdict() for name, interval in self._asdict().items()}
 
 
@@ -39,25 +38,32 @@ def compute_error_intervals(
     level: float = CONFIDENCE_LEVEL,
     seed: int = 0,
 ) -> ErrorIntervals:
-    """Return bootstrap confidence intervals of the rms and 99th percentile of |e - e*| over `good` contacts.
+    """Compute bootstrap confidence intervals of the rms and the 99th percentile of restitution errors.
 
-    Whole scenarios are resampled, because the contacts of a scenario depend on each other. The rms, a ratio
-    of two means over scenarios, has the BCa interval (bias-corrected and accelerated), or with more than
-    `MAX_BCA_SCENARIOS` scenarios the percentile interval. The 99th percentile, which is not smooth enough for
-    an acceleration, has the percentile interval.
+    The bootstrap resamples whole scenarios, because the contacts of a scenario are not independent. The
+    interval of the rms is the BCa interval (bias-corrected and accelerated). With more than
+    `MAX_BCA_SCENARIOS` scenarios it is the percentile interval. The interval of the 99th percentile is always
+    the percentile interval, because a percentile is not a smooth function of the data, as BCa requires.
 
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 13 and 14.
+
+    Args:
+        errors: restitution error e - e* of each contact [1].
+        good: whether each contact has ended; the others are ignored.
+        resamples: number of bootstrap resamples.
+        level: confidence level, between 0 and 1.
+        seed: seed of the resamples.
     """
-    size = np.where(good, np.abs(errors), 0)
+    magnitudes = np.where(good, np.abs(errors), 0)
     counts = np.sum(good, axis=0)
     has_good = counts > 0
-    size, good, counts = size[:, has_good], good[:, has_good], counts[has_good]
+    magnitudes, good, counts = magnitudes[:, has_good], good[:, has_good], counts[has_good]
     if np.sum(has_good) < 2:
         unknown = Interval(float("nan"), float("nan"))
         return ErrorIntervals(unknown, unknown)
-    squares = np.sum(size**2, axis=0)
+    squares = np.sum(magnitudes**2, axis=0)
     if np.ptp(squares / counts) <= 1e-12 * np.max(squares / counts):
-        return ErrorIntervals(*[Interval(float(np.max(size)), float(np.max(size)))] * 2)
+        return ErrorIntervals(*[Interval(float(np.max(magnitudes)), float(np.max(magnitudes)))] * 2)
 
     def root_mean_square(squares, counts, axis):
         return np.sqrt(np.sum(squares, axis=axis) / np.sum(counts, axis=axis))
@@ -74,26 +80,27 @@ def compute_error_intervals(
         rng=np.random.default_rng(seed),
     ).confidence_interval
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
-    percentiles = _resample_percentile(size, good, 0.99, resamples, np.random.default_rng(seed))
+    percentiles = _resample_percentile(magnitudes, good, 0.99, resamples, np.random.default_rng(seed))
     return ErrorIntervals(
         Interval(float(rms.low), float(rms.high)),
         Interval(*map(float, np.quantile(percentiles, tails))),
     )
 
 
-def _resample_percentile(size, good, share, resamples, generator):
-    """Return the quantile of order `share` of `size` (slots, scenarios) at `good`, for each of the resamples.
+def _resample_percentile(magnitudes, good, share, resamples, generator):
+    """Return the quantile of order `share` of the good contacts' magnitudes in each resample, (resamples,).
 
-    A resample is a count per scenario. Its quantile is among the largest contacts, so that only these are
-    used.
+    A resample counts how often each scenario was drawn. Only the largest magnitudes are used, because the
+    quantile lies among them.
     """
-    slots, scenarios = size.shape
+    slots, scenarios = magnitudes.shape
     contacts = np.flatnonzero(good)
-    contacts = contacts[np.argsort(-size.reshape(-1)[contacts], kind="stable")]
-    # Five standard deviations more than the expected number are far more than a resample can need.
+    contacts = contacts[np.argsort(-magnitudes.reshape(-1)[contacts], kind="stable")]
+    # The number of contacts above the quantile exceeds its mean by five standard deviations practically
+    # never.
     expected = (1 - share) * len(contacts)
     largest = contacts[: int(np.ceil(expected + 5 * slots * np.sqrt(expected) + 5 * slots))]
-    values = size.reshape(-1)[largest]
+    values = magnitudes.reshape(-1)[largest]
     counts = np.sum(good, axis=0)
     quantiles = np.empty(resamples)
     batch = max(1, 2_000_000 // scenarios)
@@ -103,7 +110,7 @@ def _resample_percentile(size, good, share, resamples, generator):
         drawn += scenarios * np.arange(number)[:, None]
         weights = np.bincount(drawn.reshape(-1), minlength=number * scenarios).reshape(number, scenarios)
         above = np.cumsum(weights[:, largest % scenarios], axis=1)
-        # Linear interpolation as in `np.quantile`, with ranks counted from the largest value.
+        # Interpolate linearly as `np.quantile` does, with ranks counted from the largest value.
         rank = (1 - share) * (weights @ counts - 1)
         near, far = (
             values[np.argmax(above > index[:, None], axis=1)]

@@ -1,11 +1,11 @@
 """Distribution-free confidence intervals of quantiles of |error|, in constant memory.
 
-The number of n independent values below the quantile of order q has a binomial distribution. The order
-statistics at bounds of this number therefore enclose the quantile, for any distribution. The values need not
-be stored: `count_in_bins` counts them in bins whose edges increase by 1 %. Counts of several batches add up,
-    and
-give the order statistics to within a bin, rounded outward. `replicate_quantile` does the same for scramblings
-of a Sobol sequence, for whose points no binomial distribution applies.
+Among n independent values, the number below the quantile of order q has a binomial distribution. Bounds of
+this number are the ranks of two order statistics, which enclose the quantile for any distribution of the
+values. The values need not be stored: `count_in_bins` counts them in bins whose edges increase by 1 %. The
+counts of several batches can be added. They determine the order statistics to within one bin, rounded
+outward. `replicate_quantile` computes the interval for scramblings of a Sobol sequence, whose points are not
+independent.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from scipy import special
 
 from tuning.statistics.intervals import BETA_PRIOR, CONFIDENCE_LEVEL, Estimate, replicate_interval
 
-BIN_RESOLUTION = 0.01  # relative distance of neighbouring edges
-_DECADES = -9, 3  # powers of 10 of the first edge and about the last one
-# Two further bins reach from 0 to the first edge, and from the last edge to infinity.
+BIN_RESOLUTION = 0.01  # relative distance between successive edges of bins [1]
+_DECADES = -9, 3  # the first edge is 1e-9, and the last edge is about 1e3
+# Two more bins extend from 0 to the first edge, and from the last edge to infinity.
 BIN_EDGES = 10.0 ** _DECADES[0] * (1.0 + BIN_RESOLUTION) ** np.arange(
     int(np.ceil((_DECADES[1] - _DECADES[0]) * np.log(10.0) / np.log1p(BIN_RESOLUTION))) + 1
 )
@@ -26,24 +26,39 @@ BIN_COUNT = len(BIN_EDGES) + 1
 def compute_order_ranks(
     number: int, order: float, level: float = CONFIDENCE_LEVEL, sequential: bool = False
 ) -> tuple[int, int]:
-    """Return the ranks of the order statistics that enclose a quantile.
+    """Return the ranks of the two order statistics that enclose a quantile with the confidence `level`.
 
-    Rank 1 is the least value; 0 and `number` + 1 mean no bound. The quantile of order q lies between X_(low)
-    and X_(high), ends included, with at least probability `level`, also with ties (David and Nagaraja 2003,
-    section 7.1). For a fixed number, low and high - 1 are the quantiles (1 -+ level) / 2 of the binomial
-    distribution of n and q. If `sequential`, they are the extreme counts k for which the martingale of
-    `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 - level), so that the interval
-    covers at any stopping rule (Howard and Ramdas 2022, "Sequential estimation of quantiles"). Raise
-    ValueError unless number >= 0, 0 < order < 1 and 0 < level < 1.
+    Rank 1 is the smallest of the values. The ranks 0 and `number` + 1 mean that there is no bound. The
+    interval includes both order statistics, and is also valid if values are equal (David and Nagaraja 2003,
+    section 7.1).
+
+    If n = `number` is fixed, low and high - 1 are the quantiles of order (1 -+ level) / 2 of the binomial
+    distribution with n and q = `order`. If `sequential`, they are the smallest and the largest count for
+    which the martingale of `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 -
+    level). The interval is then valid for every stopping rule (Howard and Ramdas 2022, "Sequential estimation
+    of quantiles").
+
+    Args:
+        number: number of independent values.
+        order: order q of the quantile, between 0 and 1.
+        level: confidence level, between 0 and 1.
+        sequential: whether the number depends on the values, by a stopping rule.
+
+    Returns:
+        Ranks low and high.
+
+    Raises:
+        ValueError: If an argument is out of its range.
     """
     if number < 0 or not (0 < order < 1 and 0 < level < 1):
         raise ValueError(
-            f"number, order, level: found {number}, {order}, {level}, expected 0 or more, 0 to 1, 0 to 1"
+            f"number, order, level: found {number}, {order}, {level}, expected number >= 0, order and level "
+            "between 0 and 1"
         )
     if number == 0:
         return 0, 1
     if not sequential:
-        # The import takes most of a second, and only this branch needs it.
+        # This import takes most of a second, and only this branch needs it.
         from scipy import stats
 
         tail = (1.0 - level) / 2.0
@@ -62,27 +77,28 @@ def compute_order_ranks(
 
 
 def count_in_bins(values: ArrayLike) -> np.ndarray:
-    """Count |values| in each bin, (BINS,) of int64; counts of several batches may be added.
+    """Count the magnitudes of values in each bin, (`BIN_COUNT`,) of int64.
 
-    Bin 0 is [0, EDGES[0]), bin i is [EDGES[i - 1], EDGES[i]), and the last one reaches from EDGES[-1] to
-    infinity. Values that are not finite count in the last bin.
+    Bin 0 is [0, `BIN_EDGES[0]`), bin i is [`BIN_EDGES[i - 1]`, `BIN_EDGES[i]`), and the last bin extends from
+    the last edge to infinity. Values that are not finite are counted in the last bin. The counts of several
+    batches can be added.
     """
-    size = np.abs(np.asarray(values, float)).ravel()
-    size = np.sort(np.where(np.isfinite(size), size, np.inf))
-    # Searching the edges among the values is faster than the reverse, since there are more values.
-    return np.diff(np.searchsorted(size, BIN_EDGES), prepend=0, append=len(size)).astype(np.int64)
+    magnitudes = np.abs(np.asarray(values, float)).ravel()
+    magnitudes = np.sort(np.where(np.isfinite(magnitudes), magnitudes, np.inf))
+    # There are more values than edges, so that it is faster to search the edges among the values.
+    return np.diff(np.searchsorted(magnitudes, BIN_EDGES), prepend=0, append=len(magnitudes)).astype(np.int64)
 
 
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL, sequential: bool = False
 ) -> Estimate:
-    """Return the quantile of order `order` of |values| with its interval, from their `count_in_bins`.
+    """Return a quantile of the magnitudes of values with its interval, from the counts of `count_in_bins`.
 
-    The interval's ends are the order statistics of `compute_order_ranks`, or 0 and infinity without a bound.
-    Each is rounded outward to the edge of its bin, with a relative error below `BIN_RESOLUTION` between the
-    first and the last edge. The estimate, the order statistic of rank ceil(order n), is the geometric middle
-    of its bin, with half that error; it is 0 in the first bin and infinite in the last. Raise ValueError as
-    `compute_order_ranks` does.
+    The bounds are the order statistics of `compute_order_ranks`, rounded outward to the edges of their bins.
+    This changes them by less than `BIN_RESOLUTION` between the first and the last edge. Without such an order
+    statistic, the bounds are 0 and infinity. The estimate is the geometric mean of the edges of the bin that
+    contains rank ceil(order n); in the first bin it is 0, and in the last bin infinity. The other arguments
+    are those of `compute_order_ranks`. Raise ValueError if an argument is out of its range.
     """
     number = int(np.sum(counted))
     below = np.cumsum(counted)
@@ -94,7 +110,10 @@ def binned_quantile(
 
 
 def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
-    """Return the estimate (...) of `binned_quantile` from `count_in_bins` (..., BINS); nan without values."""
+    """Return the estimate of `binned_quantile` without its interval, (...); NaN without values.
+
+    `counted` contains counts of `count_in_bins`, (..., `BIN_COUNT`).
+    """
     below = np.cumsum(counted, axis=-1)
     number = below[..., -1]
     index = np.argmax(below >= _compute_rank(number, order)[..., None], axis=-1)
@@ -103,14 +122,21 @@ def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
 
 
 def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL) -> Estimate:
-    """Return the quantile with its interval from independent scramblings of a Sobol sequence.
+    """Return a quantile with its interval from independent scramblings of a Sobol sequence.
 
-    `counted` holds the `count_in_bins` (replicates, BINS), with an equal number of points in each replicate.
-    The share of |values| below an edge has the interval of `tuning.statistics.intervals.replicate_interval`.
-    The quantile's interval begins at the edge before the first one where this interval's upper end reaches
-    `order`, and ends at the edge after the last one where its lower end is at most `order`. It misses the
-    quantile only if the share's interval fails at one of the two edges around the quantile. Raise ValueError
-    as `compute_order_ranks` and `replicate_interval` do, and for unequal numbers of points.
+    For each edge of a bin, `tuning.statistics.intervals.replicate_interval` yields an interval of the
+    fraction of values below this edge. The lower bound of the quantile is the edge before the first edge
+    whose upper bound reaches `order`. The upper bound of the quantile is the edge after the last edge whose
+    lower bound is at most `order`. The interval misses the quantile only if the interval of the fraction
+    fails at one of the two edges next to the quantile.
+
+    Args:
+        counted: counts of `count_in_bins` for each replicate, (replicates, `BIN_COUNT`).
+        order: order of the quantile, between 0 and 1.
+        level: confidence level, between 0 and 1.
+
+    Raises:
+        ValueError: If the replicates have different numbers of points, or if an argument is out of its range.
     """
     counted = np.asarray(counted)
     numbers = np.sum(counted, axis=-1)
@@ -118,7 +144,7 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDE
         raise ValueError(f"counted: found {numbers.tolist()} values per replicate, expected equal numbers")
     estimate = binned_estimate(np.sum(counted, axis=0), order)
     bounds = np.concatenate([[0.0], BIN_EDGES, [np.inf]])
-    # Bin i ends at bounds[i + 1].
+    # The upper edge of bin i is bounds[i + 1].
     _, low, high = replicate_interval(np.cumsum(counted, axis=-1).T, int(numbers[0]), level)
     first = int(np.argmax(high >= order))
     last = int(np.max(np.nonzero(low[:-1] <= order)[0], initial=-1))
@@ -127,13 +153,13 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDE
 
 def _compute_rank(number: ArrayLike, order: float) -> np.ndarray:
     """Return the rank ceil(order n), at least 1 and at most n."""
-    # The factor prevents that rounding lifts an exact product to the next rank.
+    # Without this factor, a rounding error could increase an exact product to the next rank.
     rank = np.ceil(order * np.asarray(number) * (1.0 - 1e-14))
     return np.clip(rank, 1, np.maximum(number, 1)).astype(np.int64)
 
 
 def _bisect_last(inside, within: int, beyond: int) -> int:
-    """Return by bisection the last integer from `within` towards `beyond` for which `inside` holds."""
+    """Find by bisection the last integer from `within` towards `beyond` for which `inside` is true."""
     while abs(beyond - within) > 1:
         middle = (within + beyond) // 2
         within, beyond = (middle, beyond) if inside(middle) else (within, middle)

@@ -1,27 +1,27 @@
 """Subset simulation of rare failures, with probabilities down to 1e-6 and confidence intervals.
 
-A probability of 1e-6 is a product of six conditional probabilities of 0.1, one for each of a sequence of
-levels with increasing thresholds. The scenarios of a level come from Markov chains that start at the worst
-scenarios of the previous level and stay above its threshold (Au and Beck 2001, "Estimation of small failure
-probabilities in high dimensions by subset simulation"). A chain moves by conditional sampling in
-standard-normal space,
+A probability of 1e-6 is the product of six conditional probabilities of 0.1. Each belongs to a level, and the
+levels have increasing thresholds of the performance. The scenarios of a level come from Markov chains. These
+start at the worst scenarios of the previous level and stay above its threshold (Au and Beck 2001, "Estimation
+of small failure probabilities in high dimensions by subset simulation"). In standard-normal space, a chain
+proposes the step from u to
 
-    v = sqrt(1 - sigma^2) u + sigma z,    z standard normal,
+    v = sqrt(1 - sigma^2) u + sigma z,    z standard normal.
 
-which is accepted if the performance stays above the threshold; sigma is adapted to an acceptance rate of 0.44
-(Papaioannou, Betz, Zwirglmaier, Straub 2015, "MCMC algorithms for subset simulation").
+The step is accepted if the performance stays above the threshold. sigma is adapted to an acceptance rate of
+0.44 (Papaioannou, Betz, Zwirglmaier, Straub 2015, "MCMC algorithms for subset simulation").
 
-The whole algorithm runs `replicates` times, independently and in one batch. The interval comes from the
-spread of their estimates. The usual formula for the coefficient of variation of one run includes the
-correlation along the chains (the factors gamma), but assumes that chains and levels are independent. They are
-not, since they descend from the same few scenarios. The formula is 10 to 20 % too small for a plane limit
-state, and far too small if a run can lose one of several failure regions. A single run cannot detect such a
-loss; replicates can, unless nearly all lose the region.
+The whole algorithm runs several times, as independent replicates in one batch. The interval follows from the
+spread of the replicates' estimates. The usual formula for the coefficient of variation of a single run
+includes the correlation along the chains, but assumes that chains and levels are independent. They are not,
+because all chains start from the same few scenarios. Therefore the formula is 10 to 20 % too small for a
+plane limit state, and far too small if a run can lose one of several failure regions. A single run cannot
+detect such a loss. Replicates can detect it, unless nearly all of them lose the region.
 
-The estimates are skewed, nearly lognormal, and their mean is the probability with a bias of the order of
-1 / samples (with 1000 samples, 3 % at 1e-4 and 6 % at 1e-6). The interval is therefore that of the mean of a
-lognormal distribution. Its spread is at least that of the formula, because a few replicates may agree by
-chance.
+The distribution of the estimates is skewed, nearly lognormal. Its mean is the probability, with a relative
+bias of the order of 1 / samples (with 1000 samples, 3 % at 1e-4 and 6 % at 1e-6). The interval is therefore
+that of the mean of a lognormal distribution. Its variance is at least that of the formula, because the
+estimates of a few replicates may agree by chance.
 """
 
 from collections.abc import Callable
@@ -34,48 +34,53 @@ from tuning.statistics.intervals import CONFIDENCE_LEVEL, binomial_interval, log
 
 PerformanceFunction = Callable[[np.ndarray], np.ndarray]
 
-LEVEL_PROBABILITY = 0.1  # conditional probability of each level; the optimum is flat between 0.1 and 0.3
-CHAIN_LENGTH = round(1.0 / LEVEL_PROBABILITY)  # scenarios of each chain, with its start
-TARGET_ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted
-INITIAL_SIGMA, MIN_SIGMA = 0.6, 1e-4
-MAX_LEVELS = 12  # default limit on the number of levels
-MAX_WORST_SCENARIOS = 10  # number of worst scenarios in the result
+LEVEL_PROBABILITY = 0.1  # conditional probability of each level [1]; 0.1 to 0.3 are about equally efficient
+CHAIN_LENGTH = round(1.0 / LEVEL_PROBABILITY)  # number of scenarios in each Markov chain, including its start
+TARGET_ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted (Papaioannou et al. 2015) [1]
+INITIAL_SIGMA, MIN_SIGMA = 0.6, 1e-4  # initial and smallest step size sigma of the Markov chains [1]
+MAX_LEVELS = 12  # default limit on the number of levels; the smallest probability is about 1e-12
+MAX_WORST_SCENARIOS = 10  # largest number of worst scenarios in the result
 
 
 class SubsetSimulation(NamedTuple):
-    """Result of a subset simulation."""
+    """Probability of failure with its interval, and the worst scenarios, from a subset simulation."""
 
     probability: float  # estimated probability of failure
-    low: float  # lower end of its interval
-    high: float  # upper end of its interval
-    coefficient_of_variation: float  # that of `probability`, from the spread of the replicates' estimates
-    formula_coefficient_of_variation: float  # the same by the formula for single runs
-    estimates: np.ndarray  # estimate of each replicate, (replicates,)
-    formula_coefficients: np.ndarray  # coefficient of variation of each by the formula, (replicates,)
-    thresholds: np.ndarray  # (levels, replicates); the last is the limit, nan for levels that were not needed
-    evaluations: int  # number of evaluations of the performance
-    worst_points: np.ndarray  # standard normals of the worst distinct scenarios, worst first, (worst, inputs)
-    worst_values: np.ndarray  # their performance, infinite if not finite, (worst,)
+    low: float  # lower bound of the probability
+    high: float  # upper bound of the probability
+    # coefficient of variation of `probability`, from the spread of the replicates' estimates
+    coefficient_of_variation: float
+    # coefficient of variation of `probability`, from the formula for single runs
+    formula_coefficient_of_variation: float
+    estimates: np.ndarray  # estimated probability of each replicate, (replicates,)
+    # coefficient of variation of each replicate's estimate, from the formula for single runs, (replicates,)
+    formula_coefficients: np.ndarray
+    # threshold of each level, (levels, replicates); the last is the limit; NaN for levels that were not
+    # needed
+    thresholds: np.ndarray
+    evaluations: int  # number of evaluated scenarios
+    worst_points: np.ndarray  # standard normals of the worst scenarios, worst first, (worst, inputs)
+    worst_values: np.ndarray  # performance of the worst scenarios, infinite if not finite, (worst,)
 
 
 class _SubsetState(NamedTuple):
-    """State of all replicates at one level."""
+    """State of all replicates of a subset simulation at one level."""
 
-    points: np.ndarray  # (steps, replicates, chains, inputs), above the replicate's last threshold
-    values: np.ndarray  # their performance, (steps, replicates, chains)
-    reached: np.ndarray  # probability of the last threshold, (replicates,)
-    log_sigma: np.ndarray  # log(sigma) of the proposals, (replicates,)
-    variance: np.ndarray  # sum of squared coefficients of variation so far, (replicates,)
-    open: np.ndarray  # whether a further level is needed, (replicates,)
-    estimates: np.ndarray  # estimate of the replicates that are not `open`, (replicates,)
+    points: np.ndarray  # standard normals of the level's scenarios, (steps, replicates, chains, inputs)
+    values: np.ndarray  # performance of these scenarios, (steps, replicates, chains)
+    reached: np.ndarray  # probability that the performance is above the last threshold, (replicates,)
+    log_sigma: np.ndarray  # logarithm of the step size sigma, (replicates,)
+    variance: np.ndarray  # squared coefficient of variation from the formula for single runs, (replicates,)
+    open: np.ndarray  # whether the replicate needs another level, (replicates,)
+    estimates: np.ndarray  # estimated probability of the replicates that have ended, (replicates,)
 
 
 class _WorstScenarios(NamedTuple):
-    """Worst distinct scenarios so far."""
+    """Worst scenarios that have been evaluated so far, worst first."""
 
-    points: np.ndarray  # (worst, inputs)
-    values: np.ndarray  # (worst,)
-    evaluations: int  # number of evaluations so far
+    points: np.ndarray  # standard normals of the scenarios, (worst, inputs)
+    values: np.ndarray  # performance of the scenarios, (worst,)
+    evaluations: int  # number of scenarios that have been evaluated
 
 
 def subset_simulation(
@@ -88,32 +93,38 @@ def subset_simulation(
     level: float = CONFIDENCE_LEVEL,
     levels: int = MAX_LEVELS,
 ) -> SubsetSimulation:
-    """Estimate the probability that performance(u) > limit, for `inputs` independent standard normals u.
+    """Estimate by subset simulation the probability that performance(u) > limit, for standard normals u.
 
-    Subset simulation fails if the performance does not show how close a scenario is to failure (plateaus,
-    islands of failure without a slope towards them). If a second failure region becomes relevant only beyond
-    the thresholds that lead to the first (Breitung 2019, "The geometry of limit state function graphs and
-    subset simulation: counterexamples"), most replicates miss it: the interval then covers less than stated,
-    and more samples help. A coefficient of variation far above the formula's indicates this. If a replicate
-    ends without a failure, the interval reaches from 0 to a bound with the probability that it reached.
+    The method fails if the performance does not show how close a scenario is to failure. Examples are
+    plateaus, and regions of failure to which no slope leads. A second region of failure may become relevant
+    only above the thresholds that lead to the first region (Breitung 2019, "The geometry of limit state
+    function graphs and subset simulation: counterexamples"). Most replicates then miss the second region, and
+    the interval is too narrow. A sign of this is a coefficient of variation far above that of the formula for
+    single runs. More samples help. If a replicate ends without a failure, the lower bound of the interval is
+    0, and the upper bound uses the probability that this replicate has reached.
 
     Args:
-        performance: function from (batch, inputs) to (batch,), called with replicates * samples / 10 points;
-            a value that is not finite counts as a failure.
-        inputs: number of standard normals, 1 or more.
-        limit: limit of the performance, finite.
-        seed: seed of the random numbers, 0 or more; the same seed gives the same result.
-        samples: number of scenarios per level and replicate, a multiple of 10.
-        replicates: number of independent runs, 2 or more.
+        performance: function that returns the performance of scenarios, from standard normals (batch, inputs)
+        to
+            (batch,). Each call has replicates * samples / 10 scenarios. A value that is not finite counts as
+            a failure.
+        inputs: number of standard normals in a scenario, 1 or more.
+        limit: limit of the performance, finite; a larger performance is a failure.
+        seed: seed of the random numbers, 0 or more.
+        samples: number of scenarios for each level and replicate, a multiple of 10.
+        replicates: number of independent replicates, 2 or more.
         level: confidence level, between 0 and 1.
         levels: largest number of levels; the smallest probability is about 10^-levels.
 
+    Returns:
+        Probability of failure with its interval, and the worst scenarios.
+
     Raises:
-        ValueError: if an argument is out of its range.
+        ValueError: If an argument is out of its range.
     """
     _check_arguments(inputs, limit, seed, samples, replicates, level, levels)
     rng = np.random.default_rng(seed)
-    # A scenario fails if it reaches the next number above the limit.
+    # A scenario fails if its performance is at least the next floating-point number above the limit.
     failing = float(np.nextafter(limit, np.inf))
     worst = _WorstScenarios(np.empty((0, inputs)), np.empty(0), 0)
 
@@ -138,23 +149,23 @@ def subset_simulation(
 
 
 def convert_to_uniform(normals: np.ndarray) -> np.ndarray:
-    """Convert standard normals to uniform numbers above 0 and below 1, for the inputs' quantile functions."""
+    """Convert standard normals to uniform random numbers above 0 and below 1."""
     return np.clip(special.ndtr(normals), np.finfo(float).tiny, 1.0 - 2.0**-53)
 
 
 def _build_result(
     state: _SubsetState, thresholds: list[np.ndarray], worst: _WorstScenarios, failing: float, level: float
 ) -> SubsetSimulation:
-    """Return the result of all replicates after their last level."""
+    """Combine the estimates of all replicates into the result."""
     formula = np.sqrt(state.variance)
     if len(thresholds) == 1:
-        # All scenarios are independent, so that the exact interval applies.
+        # With one level, all scenarios are independent, and the exact interval applies.
         _, low, high = binomial_interval(np.sum(state.values >= failing), state.values.size, level)
     else:
         low, high = lognormal_interval(state.estimates, state.reached, formula, level)
     mean = np.mean(state.estimates)
     spread = np.std(state.estimates, ddof=1) / np.sqrt(len(formula))
-    # Without a failure the formula is infinite and the estimate is 0.
+    # In a replicate without a failure, the formula is infinite and the estimate is 0.
     weighted = state.estimates * np.where(state.estimates > 0.0, formula, 0.0)
     combined = np.sqrt(np.sum(weighted**2)) / len(formula)
     return SubsetSimulation(
@@ -175,11 +186,12 @@ def _build_result(
 def _choose_level(
     state: _SubsetState, failing: float, independent: bool, last: bool
 ) -> tuple[np.ndarray, _SubsetState]:
-    """Return the next threshold of each replicate, (replicates,), and the state with its probability.
+    """Choose the next threshold of each replicate, (replicates,), and update the state with its probability.
 
-    The threshold is the value that a tenth of the points reach, or `failing` if more than a tenth reach that,
-    or the second least value if fewer than a tenth exceed the least one, so that plateaus are passed. Without
-    a second value, or at the last level, the replicate ends with its current failures.
+    The threshold is the performance that a tenth of the scenarios reach. If more than a tenth fail, the
+    threshold is `failing`. If fewer than a tenth exceed the smallest performance (a plateau), the threshold
+    is the second smallest performance. If all scenarios have the same performance, or at the last level, the
+    replicate ends.
     """
     steps, replicates, chains = state.values.shape
     flat = np.sort(np.moveaxis(state.values, 1, 0).reshape(replicates, -1), axis=1)
@@ -196,7 +208,7 @@ def _choose_level(
     ends = state.open & (threshold >= failing)
     estimates = np.where(ends, state.reached * share, state.estimates)
     return threshold, state._replace(
-        # A replicate without a failure keeps `reached` as the upper bound of its probability.
+        # In a replicate without a failure, `reached` remains as an upper bound of its probability.
         reached=np.where(state.open & (share > 0.0), state.reached * share, state.reached),
         variance=np.where(state.open, state.variance + squared, state.variance),
         open=state.open & ~ends,
@@ -205,10 +217,11 @@ def _choose_level(
 
 
 def _compute_chain_correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return gamma of Au and Beck 2001, eq. 27-29, the increase of the variance by correlation along chains.
+    """Return the relative increase of the variance by the correlation along the chains, (replicates,).
 
-    It is 2 sum_k (1 - k / steps) rho(k) over the lags k, with the autocorrelation rho of the indicator
-    `exceeds`, (steps, replicates, chains).
+    This is gamma of Au and Beck 2001, eq. 27-29: the sum over the lags k of 2 (1 - k / steps) rho(k). rho is
+    the autocorrelation along the chains of `exceeds`, (steps, replicates, chains), which is 1 above the
+    threshold.
     """
     steps = exceeds.shape[0]
     centred = exceeds - share[:, None]
@@ -228,8 +241,8 @@ def _run_chains(
 ) -> tuple[_SubsetState, _WorstScenarios]:
     """Run the Markov chains of the next level, which stay above the threshold of their replicate.
 
-    sigma adapts to the acceptance rate of all chains of its replicate, with decreasing steps, as in
-    Papaioannou et al. 2015. The chains of replicates that have ended also run, without effect.
+    The step size sigma of a replicate is adapted to the acceptance rate of its chains, as in Papaioannou et
+    al. 2015. The chains of replicates that have ended also run, but have no effect.
     """
     steps, replicates, _, inputs = state.points.shape
     seeds = np.stack([_choose_chain_starts(state.values[:, r], threshold[r], rng) for r in range(replicates)])
@@ -255,14 +268,15 @@ def _run_chains(
 
 
 def _choose_chain_starts(values: np.ndarray, threshold: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the indices of the points (steps, chains) at which a replicate's chains start, in random order.
+    """Return the indices of the scenarios at which the chains of a replicate start, (chains,).
 
-    Each point that reaches the threshold is used once, or several times if there are fewer than chains.
+    The scenarios that reach the threshold are used in random order, and repeatedly if there are too few. The
+    indices refer to the flattened `values`, (steps, chains).
     """
     reaching = np.nonzero(values.ravel() >= threshold)[0]
     chains = values.shape[1]
     if not len(reaching):
-        # The replicate has ended without a failure, so that any points will do.
+        # The replicate has ended without a failure, so that the choice has no effect.
         return np.arange(chains)
     return rng.permutation(np.resize(rng.permutation(reaching), chains))
 
@@ -270,9 +284,11 @@ def _choose_chain_starts(values: np.ndarray, threshold: float, rng: np.random.Ge
 def _evaluate_points(
     performance: PerformanceFunction, points: np.ndarray, worst: _WorstScenarios
 ) -> tuple[np.ndarray, _WorstScenarios]:
-    """Evaluate points (replicates, chains, inputs), infinite if not finite, and update the worst scenarios.
+    """Evaluate scenarios, (replicates, chains, inputs), and update the worst scenarios.
 
-    Among equally bad scenarios, the one nearest to the origin ranks as the worst, since it is the likeliest.
+    Return the performance, (replicates, chains), and the worst scenarios. A performance that is not finite
+    becomes infinity. Among equally bad scenarios, the one nearest to the origin is the worst, because it is
+    the most probable.
     """
     batch = points.reshape(-1, points.shape[-1])
     values = np.asarray(performance(batch), float)
@@ -298,7 +314,7 @@ def _check_arguments(inputs, limit, seed, samples, replicates, level, levels) ->
             f"a multiple of {CHAIN_LENGTH} above 0",
         ),
         "replicates": (replicates, replicates >= 2, "2 or more"),
-        "level": (level, 0.0 < level < 1.0, "between 0 and 1"),
+        "level": (level, 0.0 < level < 1.0, "a number between 0 and 1"),
         "levels": (levels, levels >= 1, "1 or more"),
     }
     for name, (found, good, words) in allowed.items():

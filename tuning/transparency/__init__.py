@@ -1,4 +1,4 @@
-"""Transparency of a compensator: whether its runs still test the hardware.
+"""Transparency of a compensator: how much its results depend on the hardware, and not on expectations.
 
-It is measured with pushes on the hardware and damping perturbations.
+Two perturbations measure the transparency: pushes on the hardware, and additional damping of the mechanism.
 """

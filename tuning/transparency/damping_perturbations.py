@@ -1,9 +1,10 @@
-"""Damping perturbations: the same mechanism with additional dissipation.
+"""Damping perturbations: scenarios of the same mechanism with additional damping.
 
-The slope of e against e* measures the response of a compensator to dissipation that it was not tuned for. An
-elastic mechanism alone, with e* = 1 always, does not show it. The perturbation of scenario i dissipates like
-an oscillator with e* = exp(-pi zeta_i), whose damping ratios zeta_i cover [0, `MAX_DAMPING_RATIO`] evenly, in
-terms of the mechanism's contact law (`ContactLaw.perturb_damping`).
+The slope of e over e* measures how a compensator responds to damping for which it was not tuned. An elastic
+mechanism alone cannot show this, because its e* is always 1. The additional damping of scenario i dissipates
+as much energy as an oscillator with the damping ratio zeta_i, which has e* = exp(-pi zeta_i). The values
+zeta_i are spread evenly from 0 to `MAX_DAMPING_RATIO`. `ContactLaw.perturb_damping` converts them to
+parameters of the contact law.
 """
 
 from collections.abc import Mapping
@@ -15,18 +16,19 @@ from jaxtyping import Float
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Mechanism, value_at
 
-MAX_DAMPING_RATIO = 0.15  # damping ratio: e* = 0.62
+MAX_DAMPING_RATIO = 0.15  # largest additional damping ratio [1]; an elastic mechanism then has e* = 0.62
 
 
 def perturb_damping(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray]
 ) -> tuple[Mechanism, dict[str, np.ndarray]]:
-    """Return the mechanism and its draws with an additional damping ratio for each draw.
+    """Add damping to a mechanism, with another damping ratio for each draw.
 
-    Raise `InputError` if the contact law does not define its dissipation.
+    Return the mechanism, whose contact law has damping, and the draws with the additional damping. Raise
+    `InputError` if the contact law does not define how to add damping.
     """
     number = len(next(iter(draws.values())))
-    # Multiples of the golden ratio keep the damping ratio uncorrelated with the order of the draws.
+    # With multiples of the golden ratio, the damping ratios do not correlate with the order of the draws.
     ratio = MAX_DAMPING_RATIO * ((np.arange(number) * 0.6180339887498949) % 1)[:, None]
     contact, law = mechanism.contact, find_contact_law(mechanism.contact.law)
     mass = _compute_masses(mechanism, draws)[:, None]
@@ -45,9 +47,9 @@ def perturb_damping(
         return _repeat_last_entry(values, entries) * law.damped if key == "damping" else np.asarray(values)
 
     key, values = law.perturb_damping(drawn, ratio, mass, velocity)
-    # The list gets as many entries as the draws have.
-    listed = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
-    changed = {"law": law.damped_as or law.name, "damping": listed} if key == "damping" else {}
+    # The draws have one value per entry, so that the nominal list needs the same number of entries.
+    damping_list = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
+    changed = {"law": law.damped_as or law.name, "damping": damping_list} if key == "damping" else {}
     perturbed = msgspec.structs.replace(mechanism, contact=msgspec.structs.replace(contact, **changed))
     return perturbed, {**draws, f"contact.{key}": values}
 
@@ -66,5 +68,5 @@ def _compute_masses(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Fl
 
 
 def _repeat_last_entry(values: np.ndarray, entries: int) -> np.ndarray:
-    """Return (draws, entries), the last entry repeated."""
+    """Extend the values of each draw to `entries` columns by repeating the last column."""
     return values[:, np.minimum(np.arange(entries), values.shape[1] - 1)]

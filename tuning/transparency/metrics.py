@@ -1,18 +1,18 @@
-"""Metrics of a compensator on one mechanism's scenarios, with 95 % intervals.
+"""Metrics of a compensator in the scenarios of one mechanism, with 95 % intervals.
 
-    rms, p99, worst      restitution error |e - e*| over all contacts
-    failures             share of scenarios with a contact that does not end, exceeds the limit, or is unlike
-                         the ideal contact
-    early, late          transparency to a push at a quarter and three quarters of the contact; 1 is perfect
-    slope                slope of e against e* over damping perturbations; 1 is perfect
-    peak                 99th percentile of the command's peak over the ideal contact's peak force
-    peak_force_ratio     99th percentile of the real peak force over the ideal contact's
-    duration_ratio       99th percentile of the contact's duration over the ideal contact's
-    trajectory           rms difference of x_d from the ideal contact, over the ideal contact's depth
-    noise                amplification of white noise on the force, from the gains alone, without an interval
+    rms, p99, worst      rms, 99th percentile and maximum of the restitution error |e - e*| of all contacts
+    failures             fraction of scenarios with a contact that does not end, has an error above the limit,
+                         or violates the bounds on real peak force and duration
+    early, late          transparency to a push at 25 % and at 75 % of the contact; the best value is 1
+    slope                slope of e over e* in scenarios with damping perturbations; the best value is 1
+    peak                 99th percentile of (peak of the force command) / (peak force of the ideal contact)
+    peak_force_ratio     99th percentile of (real peak force) / (peak force of the ideal contact)
+    duration_ratio       99th percentile of (duration of the contact) / (duration of the ideal contact)
+    trajectory           rms of (difference between x_d and the ideal contact) / (depth of the ideal contact)
+    noise                amplification of white force noise, computed from the gains, without an interval
 
-Intervals are bootstrap intervals over scenarios, each with all its contacts; a share has a Clopper-Pearson
-interval.
+Most intervals are bootstrap intervals. They resample whole scenarios, because the contacts of a scenario are
+not independent. The interval of `failures` is a Clopper-Pearson interval.
 """
 
 from collections.abc import Callable
@@ -26,52 +26,60 @@ from jaxhil.simulation.outcome import Outcome
 from tuning.statistics.bootstrap import ErrorIntervals, Interval, compute_error_intervals
 from tuning.statistics.intervals import Estimate
 
-METRIC_RESAMPLES = 999
+METRIC_RESAMPLES = 999  # number of bootstrap resamples
 CONFIDENCE_LEVEL = 0.95
 UNDEFINED_INTERVAL = Interval(np.nan, np.nan)
-# The best value of these metrics is 1; for the others, less is better.
+# The best value of these metrics is 1. All other metrics are better if they are smaller.
 BEST_AT_ONE = ("early", "late", "slope")
 
 
 class PerturbedOutcomes(NamedTuple):
-    """Outcomes of one law with one set of gains, (slots, scenarios)."""
+    """Outcomes of one compensator with one set of gains, each (slots, scenarios)."""
 
-    plain: Outcome  # scenarios without perturbation
-    early: Outcome  # first contact with an early push
-    late: Outcome  # first contact with a late push
-    twins: Outcome  # scenarios with damping perturbations
+    plain: Outcome  # scenarios without a perturbation
+    early: Outcome  # the same scenarios with an early push on the first contact
+    late: Outcome  # the same scenarios with a late push on the first contact
+    damped: Outcome  # the same scenarios with additional damping
 
 
 def compute_metrics(
-    judged: PerturbedOutcomes,
+    outcomes: PerturbedOutcomes,
     pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
-    in_space: Float[np.ndarray, "scenarios"],
+    unpushed: Float[np.ndarray, "scenarios"],
     depth: Float[np.ndarray, "slots scenarios"],
     amplification: float,
     limit: float,
     seed: int,
 ) -> dict[str, Estimate]:
-    """Compute all metrics.
+    """Compute all metrics of a compensator, by name (see the module's list).
 
-    `pushed` is e* with the early and the late push, `in_space` that without a push, by the same integration.
-    `depth` [m] is the largest penetration of each ideal contact.
+    Args:
+        outcomes: outcomes of the scenarios, with and without perturbations.
+        pushed: restitution e* of the first ideal contacts with the early push, and with the late push.
+        unpushed: restitution e* of the first ideal contacts without a push, from the same numerical
+        integration.
+        depth: largest penetration of each ideal contact [m].
+        amplification: amplification of white force noise by the compensator [1].
+        limit: limit of the restitution error [1].
+        seed: seed of the bootstrap.
     """
-    plain: Any = judged.plain
+    plain: Any = outcomes.plain
     good = plain.good
-    size = np.abs(plain.error[good])
+    magnitudes = np.abs(plain.error[good])
     ends = compute_error_intervals(plain.error, good, seed=seed)
     if np.any(plain.wanted & ~good):
-        # Errors of some of the contacts are not comparable with a law under which all contacts end.
+        # Some contacts did not end. The errors of the others cannot be compared with those of a compensator
+        # with which all contacts end.
         ends = ErrorIntervals(UNDEFINED_INTERVAL, UNDEFINED_INTERVAL)
     beyond = good & ((np.abs(plain.error) > limit) | plain.unlike)
-    wrong = np.any((plain.wanted & ~good) | beyond, axis=0)
+    has_failed = np.any((plain.wanted & ~good) | beyond, axis=0)
     metrics = {
-        "rms": Estimate(_compute_rms(size), *ends.rms),
-        "p99": Estimate(_compute_percentile(size, 99), *ends.p99),
-        "worst": Estimate(float(np.max(size)) if len(size) else np.nan, np.nan, np.nan),
-        "failures": estimate_share(wrong),
+        "rms": Estimate(_compute_rms(magnitudes), *ends.rms),
+        "p99": Estimate(_compute_percentile(magnitudes, 99), *ends.p99),
+        "worst": Estimate(float(np.max(magnitudes)) if len(magnitudes) else np.nan, np.nan, np.nan),
+        "failures": estimate_share(has_failed),
     }
-    metrics |= compute_transparency_metrics(judged, pushed, in_space, seed)
+    metrics |= compute_transparency_metrics(outcomes, pushed, unpushed, seed)
     metrics["peak_force_ratio"] = bootstrap_metric(
         _compute_99th_percentile, seed, good, plain.peak_force_ratio
     )
@@ -84,23 +92,23 @@ def compute_metrics(
 
 
 def compute_transparency_metrics(
-    judged: PerturbedOutcomes,
+    outcomes: PerturbedOutcomes,
     pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
-    in_space: Float[np.ndarray, "scenarios"],
+    unpushed: Float[np.ndarray, "scenarios"],
     seed: int,
 ) -> dict[str, Estimate]:
-    """Compute the metrics of transparency: early, late, slope and peak."""
-    plain: Any = judged.plain
-    twin: Any = judged.twins
+    """Compute the metrics `early`, `late`, `slope` and `peak`, with the arguments of `compute_metrics`."""
+    plain: Any = outcomes.plain
+    damped: Any = outcomes.damped
     metrics = {}
-    for name, runs, e in zip(("early", "late"), (judged.early, judged.late), pushed, strict=True):
+    for name, runs, e in zip(("early", "late"), (outcomes.early, outcomes.late), pushed, strict=True):
         ended = plain.good[0] & runs.good[0]
         change = runs.metrics.restitution[0] - plain.metrics.restitution[0]
         metrics[name] = bootstrap_metric(
-            fit_transmission, seed, ended[None], change[None], (e - in_space)[None]
+            fit_transmission, seed, ended[None], change[None], (e - unpushed)[None]
         )
     metrics["slope"] = bootstrap_metric(
-        fit_slope, seed, twin.good, twin.metrics.restitution, twin.reference_restitution
+        fit_slope, seed, damped.good, damped.metrics.restitution, damped.reference_restitution
     )
     metrics["peak"] = bootstrap_metric(_compute_99th_percentile, seed, plain.good, plain.peak_ratio)
     return metrics
@@ -109,7 +117,11 @@ def compute_transparency_metrics(
 def fit_transmission(
     change: Float[np.ndarray, "*resamples contacts"], true: Float[np.ndarray, "*resamples contacts"]
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the least-squares slope of the change of e on its true change, through 0; NaN are ignored."""
+    """Return the slope of a least-squares line through 0, fitted to `change` over `true`.
+
+    `change` is the change of e on the rig caused by a push, `true` that of the ideal contact. NaN are
+    ignored.
+    """
     return np.nansum(change * true, axis=-1) / np.nansum(true**2, axis=-1)
 
 
@@ -117,13 +129,13 @@ def fit_slope(
     restitution: Float[np.ndarray, "*resamples contacts"],
     reference: Float[np.ndarray, "*resamples contacts"],
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the least-squares slope of e on e*, with an intercept; NaN are ignored."""
+    """Return the slope of a least-squares line with an intercept, fitted to e over e*; NaN are ignored."""
     centred = reference - np.nanmean(reference, axis=-1, keepdims=True)
     return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 
 
 def estimate_share(yes: Bool[np.ndarray, "scenarios"]) -> Estimate:
-    """Return the share of true values with its Clopper-Pearson interval."""
+    """Return the fraction of true values, with its Clopper-Pearson interval."""
     ends = binomtest(int(np.sum(yes)), len(yes)).proportion_ci(CONFIDENCE_LEVEL, method="exact")
     return Estimate(float(np.mean(yes)), float(ends.low), float(ends.high))
 
@@ -134,27 +146,32 @@ def bootstrap_metric(
     good: Bool[np.ndarray, "slots scenarios"],
     *data: Float[np.ndarray, "slots scenarios"],
 ) -> Estimate:
-    """Return a function of paired data along their last axis, with its percentile bootstrap interval.
+    """Compute a metric of contacts with its percentile bootstrap interval.
 
-    The function gets all contacts in a row, NaN for those that are not `good`. Scenarios are resampled with
-    all their contacts, since contacts of a scenario are dependent.
+    The bootstrap resamples whole scenarios, because the contacts of a scenario are not independent.
 
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 13.
+
+    Args:
+        function: metric of arrays (..., contacts), one for each array in `data`; it must ignore NaN.
+        seed: seed of the bootstrap.
+        good: whether each contact has ended; the others become NaN.
+        *data: values of each contact.
     """
     slots, scenarios = np.any(good, axis=1), np.any(good, axis=0)
     if np.sum(scenarios) < 2:
         return Estimate(np.nan, np.nan, np.nan)
     samples = [np.where(good, values, np.nan)[slots][:, scenarios] for values in data]
 
-    def of_contacts(*resamples: np.ndarray, axis: int) -> np.ndarray:
+    def evaluate_contacts(*resamples: np.ndarray, axis: int) -> np.ndarray:
         rows = (np.moveaxis(values, 0, -2) for values in resamples)
         return function(*(row.reshape(*row.shape[:-2], -1) for row in rows))
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        value = of_contacts(*samples, axis=-1)
+        value = evaluate_contacts(*samples, axis=-1)
         ends = bootstrap(
             samples,
-            of_contacts,
+            evaluate_contacts,
             paired=True,
             vectorized=True,
             axis=-1,
@@ -166,17 +183,24 @@ def bootstrap_metric(
     return Estimate(float(value), float(ends.low), float(ends.high))
 
 
-def compute_distance_from_best(name: str, figure: Estimate) -> Estimate:
-    """Return a metric's distance from its best: itself, or its distance from 1; NaN if without interval."""
+def compute_distance_from_best(name: str, metric: Estimate) -> Estimate:
+    """Return the distance of a metric from its best value, which is 1 for `BEST_AT_ONE` and otherwise 0.
+
+    The bounds of the distance are NaN if the metric has no interval.
+    """
     if name not in BEST_AT_ONE:
-        return figure
-    ends = sorted((abs(figure.low - 1), abs(figure.high - 1)))
-    straddles = figure.low <= 1 <= figure.high
-    return Estimate(abs(figure.value - 1), 0.0 if straddles else ends[0], ends[1])
+        return metric
+    ends = sorted((abs(metric.low - 1), abs(metric.high - 1)))
+    straddles = metric.low <= 1 <= metric.high
+    return Estimate(abs(metric.value - 1), 0.0 if straddles else ends[0], ends[1])
 
 
 def find_winner(name: str, figures: dict[str, Estimate]) -> str | None:
-    """Return the law whose interval lies below those of all other laws, None if there is none."""
+    """Return the compensator whose metric is significantly the best, or None.
+
+    Its interval must not overlap with the interval of any other compensator. `figures` contains the metric
+    `name` of each compensator.
+    """
     distances = {law: compute_distance_from_best(name, metric) for law, metric in figures.items()}
     finite = {law: d for law, d in distances.items() if np.isfinite(d.value) and np.isfinite(d.high)}
     if len(finite) < 2:

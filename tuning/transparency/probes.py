@@ -1,18 +1,18 @@
 """Transparency probes: copies of each scenario with an early push, with a late push, and with more damping.
 
-A law that anticipates the contact can be tuned to ignore the hardware, which is most accurate if all contacts
-are alike. So each scenario has three probes whose restitution the law cannot predict:
+A compensator that predicts the contact could be tuned to ignore the hardware. This would be the most accurate
+choice if all contacts were alike. Therefore each scenario has three probes whose restitution the compensator
+cannot predict:
 
-    early, late   with a push on the hardware that is in no model (`tuning.transparency.pushes`)
-    damped        with more dissipation (`tuning.transparency.damping_perturbations`)
+    early, late   a push acts on the hardware, which no model contains (`tuning.transparency.pushes`)
+    damped        the contact dissipates more energy (`tuning.transparency.damping_perturbations`)
 
-Each has its own true restitution e*, that of the pushed or damped ideal contact. A law that ignores the push,
-or returns energy that the contact dissipated, has an error e - e* as in any other contact. Transparency and
-slope are thus restitution errors, which are differentiable and have the same unit as all others. The push's
-time counts from the first touch, on the rig and in the ideal contact. It acts on the first contact, after
-which a probe ends.
+Each probe has its own e*, the restitution of the ideal contact with the same push or damping. A compensator
+that ignores the push or the damping therefore has a restitution error e - e*, which tuning reduces like any
+other error. The push acts on the first contact, at a fixed time after the first touch, on the rig and in the
+ideal contact. A probe ends after this contact.
 
-Scenario i and its probes are lanes 4 i to 4 i + 3, so that any first lanes include some of each.
+Scenario i and its probes are the lanes 4 i to 4 i + 3, so that the first lanes of a batch contain all kinds.
 """
 
 from collections.abc import Mapping
@@ -32,79 +32,85 @@ from tuning.transparency.damping_perturbations import perturb_damping
 from tuning.transparency.metrics import PerturbedOutcomes, compute_transparency_metrics
 from tuning.transparency.pushes import EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE, add_probe, compute_ideal_contacts
 
-LANES_PER_SCENARIO = 4  # lanes of a scenario: plain, early, late, damped
-# Default weights of the objective of a law that anticipates.
+LANES_PER_SCENARIO = 4  # number of lanes of a scenario: without a probe, early, late, damped
+# Default weights of the objective for a compensator that predicts the contact.
 ANTICIPATING_WEIGHTS = {"transparency_weight": 1.0, "command_weight": 0.3}
 
 
 class ProbedScenarios(NamedTuple):
-    """Batch of scenarios with their transparency probes."""
+    """Batch of scenarios with their transparency probes, and the restitution e* of their ideal contacts."""
 
-    scenarios: Scenario  # (..., scenarios * `LANES_PER_SCENARIO`)
-    plain: Any  # restitution e* of the ideal contact without a push (scenarios,)
-    early: Any  # e* with an early push, by the same integration (scenarios,)
-    late: Any  # e* with a late push, by the same integration (scenarios,)
+    scenarios: Scenario  # scenarios and probes, (..., scenarios * `LANES_PER_SCENARIO`)
+    plain: Any  # restitution e* of the first ideal contact without a push [1], (scenarios,)
+    early: Any  # restitution e* of the first ideal contact with an early push [1], (scenarios,)
+    late: Any  # restitution e* of the first ideal contact with a late push [1], (scenarios,)
 
 
 def choose_default_weights(compensator: str, axes: int = 1) -> dict[str, float]:
     """Return the default weights of `tuning.gains.objective.Objective` for a compensator, by name.
 
-    For a law that anticipates, errors of probes count as much as those of scenarios, and excess force is
-    penalised, since such a law can correct a late response by a short, large force, which the error alone
-    rewards. For a law that only passes on the measured force, neither counts.
+    If the compensator predicts the contact, the errors of probes have the same weight as those of scenarios.
+    Excess force is penalised, because such a compensator can correct a late response by a short, large force,
+    which the restitution error alone would reward. For other compensators the dictionary is empty.
     """
     return dict(ANTICIPATING_WEIGHTS) if get_compensator(compensator, axes).anticipates else {}
 
 
 def mask_probes(lanes: int) -> np.ndarray:
-    """Return which of the lanes of probed scenarios are probes, (lanes,) of bool."""
+    """Return whether each of the first `lanes` lanes of `ProbedScenarios` is a probe, (lanes,) of bool."""
     return np.arange(lanes) % LANES_PER_SCENARIO > 0
 
 
 def build_probed_scenarios(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> ProbedScenarios:
-    """Build the scenarios of `jaxhil.simulation.scenario.build_scenarios`, each with its probes."""
+    """Build scenarios as `jaxhil.simulation.scenario.build_scenarios` does, and add the probes of each."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
     perturbed, damped = perturb_damping(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
     slots = plain.phase.shape[0]
     velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
-    space = compute_ideal_contacts(find_contact_law(mechanism.contact.law).simulated, plain, velocity, 1)
-    twins = build_scenarios(perturbed, damped, seed)
+    law = find_contact_law(mechanism.contact.law).simulated
+    ideal_contacts = compute_ideal_contacts(law, plain, velocity, 1)
+    damped_scenarios = build_scenarios(perturbed, damped, seed)
     pushes = [
-        _add_push(plain, space, share, e)
-        for share, e in ((EARLY_PUSH_CENTRE, space.early), (LATE_PUSH_CENTRE, space.late))
+        _add_push(plain, ideal_contacts, centre, e)
+        for centre, e in ((EARLY_PUSH_CENTRE, ideal_contacts.early), (LATE_PUSH_CENTRE, ideal_contacts.late))
     ]
-    batches = [_add_push(plain, space), *pushes, _add_push(twins, space)]
+    batches = [_add_push(plain, ideal_contacts), *pushes, _add_push(damped_scenarios, ideal_contacts)]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *batches)
-    side_by_side = jax.tree.map(
+    interleaved = jax.tree.map(
         lambda leaf: leaf.reshape(*leaf.shape[:-2], LANES_PER_SCENARIO * number), stacked
     )
-    return ProbedScenarios(side_by_side, space.restitution[0], space.early, space.late)
+    return ProbedScenarios(
+        scenarios=interleaved,
+        plain=ideal_contacts.restitution[0],
+        early=ideal_contacts.early,
+        late=ideal_contacts.late,
+    )
 
 
 def _add_push(
-    scenarios: Scenario, space: Any, share: float | None = None, restitution: Any = None
+    scenarios: Scenario, ideal_contacts: Any, centre: float | None = None, restitution: Any = None
 ) -> Scenario:
-    """Return the scenarios with a push at a `share` of the first ideal contact's duration, if one is given.
+    """Add a push on the first contact, centred at the fraction `centre` of the ideal contact's duration.
 
-    `restitution` is that of the ideal contact with the push.
+    `restitution` is the restitution e* of the ideal contact with the push. With `centre` None, add no push.
     """
-    values = np.full((3, *space.peak_force.shape), np.nan)
-    if share is not None:
-        values[:, 0] = restitution, space.peak_force[0], space.duration[0]
+    values = np.full((3, *ideal_contacts.peak_force.shape), np.nan)
+    if centre is not None:
+        values[:, 0] = restitution, ideal_contacts.peak_force[0], ideal_contacts.duration[0]
         scenarios = scenarios._replace(contacts=np.minimum(scenarios.contacts, 1))
-    # The trajectory error of probes is not used, so that the two ends of the ideal motion suffice.
-    pushed = add_probe(scenarios, space._replace(depth=space.depth[:, [0, -1]]), share)
+    # The trajectory error of probes is not used. Two samples of the ideal motion, its ends, are sufficient.
+    pushed = add_probe(scenarios, ideal_contacts._replace(depth=ideal_contacts.depth[:, [0, -1]]), centre)
     reference: Any = IdealContact(*values)
     return pushed._replace(reference=reference)
 
 
 def compute_probe_metrics(probed: ProbedScenarios, outcome: Outcome, seed: int = 0) -> dict[str, Estimate]:
-    """Return early, late, slope and peak of `tuning.transparency.metrics` for `add_probe` scenarios.
+    """Compute the metrics `early`, `late`, `slope` and `peak` from the outcome of probed scenarios.
 
-    `outcome` has leaves (slots, scenarios, `LANES_PER_SCENARIO`).
+    The leaves of `outcome` have the shape (slots, scenarios, `LANES_PER_SCENARIO`).
     """
     plain, early, late, damped = (
         jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], outcome) for i in range(LANES_PER_SCENARIO)

@@ -1,11 +1,13 @@
 """Pushes on the hardware for the measurement of transparency, and the ideal contacts with the same pushes.
 
-A push is a half-sine of duration `PUSH_DURATION` that is in no model, with `PUSH_SIZE` of the ideal contact's
-peak force. It is centred at a quarter or at three quarters of the ideal contact's duration after the first
-touch, on the hardware and in the ideal contact. Transparency is the change of e on the hardware over that of
-the ideal contact: 1 for a test of the hardware, 0 for a law that replays what it expects.
+A push is a force that no model contains. Its shape is a half-sine with the duration `PUSH_DURATION`, and its
+amplitude is `PUSH_SIZE` times the ideal contact's peak force. The push is centred at 25 % (early) or 75 %
+(late) of the ideal contact's duration after the first touch, on the hardware and in the ideal contact.
+Transparency is the change of e on the rig, divided by the change of e of the ideal contact. It is 1 if the
+compensator reacts to the push correctly, and 0 if the compensator only reproduces the contact that it
+expects.
 
-The push acts on the first contact only, since later contacts already differ by their approach speed.
+The push acts only on the first contact, because later contacts differ anyway by their approach speeds.
 """
 
 from functools import partial
@@ -23,26 +25,26 @@ from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import Scenario
 from tuning.batches import join_batches
 
-PUSH_SIZE, PUSH_DURATION = 0.2, 0.02  # share of the peak force [1]; duration [s]
-EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE = 0.25, 0.75  # centre as share of the contact's duration [1]
-# Definition of `early` and `late` in written files, by which other definitions are recognised.
+PUSH_SIZE, PUSH_DURATION = 0.2, 0.02  # amplitude / peak force of the ideal contact [1]; duration [s]
+EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE = 0.25, 0.75  # time of the centre / duration of the ideal contact [1]
+# Files contain this definition of `early` and `late`, so that other definitions can be recognised.
 PUSH_DEFINITION = (
     f"a push on the hardware at {100 * EARLY_PUSH_CENTRE:g} and {100 * LATE_PUSH_CENTRE:g} % "
     "of the contact's duration in space"
 )
-MOTION_SAMPLES = 129  # samples of an ideal contact's motion
-LANES_PER_CALL = 256  # lanes integrated in one call
+MOTION_SAMPLES = 129  # number of samples of the motion of an ideal contact
+LANES_PER_CALL = 256  # number of contacts that are integrated in one call, to limit the memory
 
 
 class IdealContacts(NamedTuple):
-    """Ideal contacts."""
+    """Ideal contacts of many scenarios, with and without pushes."""
 
-    restitution: Float[np.ndarray, "slots scenarios"]  # e* [1]
-    peak_force: Float[np.ndarray, "slots scenarios"]  # [N]
-    duration: Float[np.ndarray, "slots scenarios"]  # [s]
-    depth: Float[np.ndarray, "slots samples scenarios"]  # penetration [m] at `MOTION_SAMPLES` times
-    early: Float[np.ndarray, "scenarios"]  # restitution of the first contact with an early push [1]
-    late: Float[np.ndarray, "scenarios"]  # restitution of the first contact with a late push [1]
+    restitution: Float[np.ndarray, "slots scenarios"]  # restitution e* without a push [1]
+    peak_force: Float[np.ndarray, "slots scenarios"]  # peak force without a push [N]
+    duration: Float[np.ndarray, "slots scenarios"]  # duration without a push [s]
+    depth: Float[np.ndarray, "slots samples scenarios"]  # penetration at `MOTION_SAMPLES` times [m]
+    early: Float[np.ndarray, "scenarios"]  # restitution e* of the first contact with an early push [1]
+    late: Float[np.ndarray, "scenarios"]  # restitution e* of the first contact with a late push [1]
 
 
 def compute_ideal_contacts(
@@ -51,9 +53,9 @@ def compute_ideal_contacts(
     velocity: Float[np.ndarray, "slots scenarios"],
     contacts: int,
 ) -> IdealContacts:
-    """Compute the first `contacts` ideal contacts of every scenario, with approach speeds `velocity` [m/s].
+    """Compute the first `contacts` ideal contacts of every scenario, with and without pushes.
 
-    Further slots repeat the last contact.
+    `velocity` contains the approach speeds [m/s]. Slots beyond the last computed contact repeat it.
     """
     slots, number = velocity.shape
     contact = jax.tree.map(lambda leaf: np.asarray(leaf)[:contacts], scenarios.contact)
@@ -61,7 +63,7 @@ def compute_ideal_contacts(
     mass = np.broadcast_to(scenarios.equivalent_mass, (contacts, number))
 
     def integrate(parameters, mass, velocity, size, centre) -> Any:
-        """Integrate the contacts of all lanes, `LANES_PER_CALL` at a time."""
+        """Integrate all contacts, `LANES_PER_CALL` in each call."""
         leaves = parameters, mass, velocity, size, centre
         lanes = mass.size
         flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes), leaves)
@@ -81,7 +83,7 @@ def compute_ideal_contacts(
     plain = integrate(contact, mass, speed, zero, zero)
     first = jax.tree.map(lambda leaf: leaf[..., :1, :], contact), mass[:1], speed[:1]
     size = PUSH_SIZE * plain.peak_force[:1]
-    # With the same integration as for `plain`, its error cancels in the difference.
+    # The integration error cancels in the difference from `plain`, which uses the same integration.
     early, late = (
         integrate(*first, size, share * plain.duration[:1]).restitution[0]
         for share in (EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE)
@@ -101,9 +103,9 @@ def compute_ideal_contacts(
 
 
 def add_probe(scenarios: Scenario, space: Any, share: float | None = None) -> Scenario:
-    """Return the scenarios with the ideal motion of each contact and, with a `share`, a push.
+    """Add the motion of the ideal contacts to scenarios and, if `share` is given, a push.
 
-    The push is centred at that share of the first ideal contact's duration.
+    The push is centred at the fraction `share` of the first ideal contact's duration.
     """
     size: Any = np.zeros_like(space.peak_force)
     centre: Any = np.zeros_like(space.peak_force)
@@ -115,12 +117,12 @@ def add_probe(scenarios: Scenario, space: Any, share: float | None = None) -> Sc
 
 
 class _IdealMotion(NamedTuple):
-    """Batch of ideal contacts, with the position at `MOTION_SAMPLES` times."""
+    """Batch of integrated ideal contacts."""
 
-    restitution: Array
-    peak_force: Array
-    duration: Array
-    position: Array
+    restitution: Array  # restitution e* with the push [1], (lanes,)
+    peak_force: Array  # peak force with the push [N], (lanes,)
+    duration: Array  # duration without a push [s], (lanes,)
+    position: Array  # penetration at `MOTION_SAMPLES` times [m], (samples, lanes)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,1 +1,1 @@
-"""Verification of the rig's controller against the simulation, by replay and in closed loop."""
+"""Verification that the rig's controller behaves like the simulated one, by replay and in closed loop."""

@@ -1,7 +1,7 @@
-"""Closed loop of the rig runtime's controller with the simulation: contacts of one scenario.
+"""Closed-loop simulation of one scenario with the rig's controller instead of the simulated one.
 
-Sensors, motion simulator and contact are those of the simulation, in JAX. Its controller is replaced by that
-of `jaxhil.rig`, in plain Python, which is called at every tick.
+JAX simulates sensors, motion simulator and contact. The controller of `jaxhil.rig`, in plain Python, computes
+the commands in every tick.
 """
 
 import dataclasses
@@ -39,19 +39,20 @@ from tuning.verification.stops import ControllerStop, RecordingController
 def run_closed_loop(
     loaded: LoadedGains, gain_file: GainFile, batch: Scenario
 ) -> tuple[Metrics, ControllerStop | None]:
-    """Run the batch's first lane with the runtime's controller built from `gain_file`.
+    """Simulate the first scenario of `batch` with the rig's controller, built from `gain_file`.
 
-    Return its metrics (slots, 1), and the first stop by the controller's guards or its watchdog, if any.
+    Return the metrics of its contacts, (slots, 1), and the first stop by a guard or the watchdog (None if the
+    controller does not stop).
     """
     loop = build_loop(loaded.mechanism, loaded.compensator, batch)
     gains = convert_gains(loaded.gains)
-    # The run begins with the JAX controller in the loop, whose program is compiled already.
+    # The JAX controller starts the run, because its program is already compiled.
     rig, run = _select_first_lane(start_batch(loop, gains, batch))
     program = _compile_loop(dataclasses.replace(loop, compensator=ExternalController(loop.compensator)))
     zeroed = loop.has_force_noise or loop.has_force_bias
     controller = RecordingController(gain_file)
     started = False
-    # A tripped controller commands no force, so that no contact would end.
+    # A tripped controller commands no force, so that its contact would never end.
     while np.any(run.active) and not controller.controller.tripped:
         for _ in range(segment_length(loop)):
             signals, plant_signals = program.sense(rig, run)
@@ -59,7 +60,7 @@ def run_closed_loop(
             if age == 0 and started:
                 controller.next_contact()
             if age == 0:
-                # The first position command tells the controller that the model is moving already.
+                # The first position command tells the controller that the numerical model already moves.
                 controller.start(position, velocity)
             command = controller.step(force, position, velocity, measured)
             if age == 0 and zeroed:
@@ -70,16 +71,17 @@ def run_closed_loop(
             run = program.advance(rig, gains, run, signals, plant_signals, force_command, np.array([sent]))
             started = True
         run = program.turn_over(rig, gains, run)
-    # Announcing a further contact makes the watchdog audit the last one.
+    # The watchdog audits the last contact when the next contact is announced.
     controller.next_contact()
     return jax.device_get(run.metrics), controller.stop()
 
 
 class ExternalController(Compensator):
-    """Placeholder in the loop for a controller that runs outside it.
+    """Placeholder in the simulated loop for a controller that runs outside JAX.
 
-    The law itself commands the history before a run's first tick, and its initial state does not change.
-    Afterwards the commands come from outside, as `SentCommand`.
+    Before a run's first tick, the simulated compensator `law` commands the history. From then on,
+    `SentCommand` contains the position commands of the external controller. The state of the compensator does
+    not change.
     """
 
     law: Compensator
@@ -103,10 +105,10 @@ class ExternalController(Compensator):
 
 
 class SentCommand(NamedTuple):
-    """Position command [m] from outside, and the unchanged state of the law."""
+    """Position command of the external controller."""
 
-    position: Array
-    state: Any
+    position: Array  # position command [m]
+    state: Any  # unchanged state of the simulated compensator
 
 
 @jax.jit
@@ -115,12 +117,12 @@ def _select_first_lane(started: tuple[RigConstants, RunState]) -> tuple[RigConst
 
 
 class _LoopProgram(NamedTuple):
-    """Steps of one loop, which are compiled at the first call."""
+    """Compiled functions for the parts of a tick; each is compiled at its first call."""
 
-    sense: Callable[..., tuple[Signals, PlantSignals]]
-    integrate: Callable[..., ModelState]
-    advance: Callable[..., RunState]
-    turn_over: Callable[..., RunState]
+    sense: Callable[..., tuple[Signals, PlantSignals]]  # read the sensors
+    integrate: Callable[..., ModelState]  # advance the numerical model
+    advance: Callable[..., RunState]  # advance the rig by one tick
+    turn_over: Callable[..., RunState]  # begin the next contacts at the end of a segment
 
 
 @lru_cache(maxsize=32)
@@ -149,7 +151,7 @@ def _advance(
     command: Array,
     sent: Array,
 ) -> RunState:
-    """Compute stages 3 to 6 of a tick with the force command and the position sent to the drives."""
+    """Compute stages 3 to 6 of a tick from the force command [N] and the position command `sent` [m]."""
     state, now = run.state, run.tick
     model = integrate(loop, rig, state, command)
     actuated = actuate(loop, rig, gains, state, now, model, SentCommand(sent, state.controller))

@@ -1,14 +1,14 @@
 """Verification that the rig's runtime behaves like the simulation with which gains were tuned.
 
-There are two comparisons with the gains of a gain file. *Replay*: the loop is recorded in JAX for the nominal
-mechanism and some draws of its uncertainty. The runtime's controller gets the recorded readings at every
-tick, and the force and position commands of both are compared. *Closed loop*: the nominal contacts are run
-with the runtime instead of the JAX controller, and each contact's restitution is compared.
+Two comparisons use the gains of a gain file. *Replay*: JAX simulates and records the nominal run and some
+random draws. The runtime's controller receives the recorded readings, and its force and position commands are
+compared with the recorded commands. *Closed loop*: the nominal contacts are simulated with the runtime
+instead of the JAX controller, and the restitution of each contact is compared.
 
-The order of operations differs, so that both agree within rounding, a small fraction of the command's range.
-The exception is a decision (in contact or not, force above the contact threshold or not) so close to its
-threshold that rounding decides. Such ticks are counted and compared separately; if the decisions differ, the
-comparison of that lane ends.
+Runtime and simulation compute in a different order. Therefore their commands differ by rounding errors, which
+are a small fraction of the commands' range. There is one exception: a value can be so close to a threshold
+(the surface, or the contact threshold of the force) that a rounding error decides on which side it lies. Such
+ticks are counted and compared separately. If the decisions differ, the comparison of this run ends.
 """
 
 import math
@@ -32,55 +32,55 @@ from jaxhil.simulation.recording import LaneRecord, nominal_and_draws, record_la
 from tuning.verification.closed_loop import run_closed_loop
 from tuning.verification.stops import ControllerStop
 
-REPLAY_LIMIT = 1e-11  # largest difference of commands over their range [1]
-CLOSED_LOOP_LIMIT = 1e-9  # largest difference of restitution [1]
-THRESHOLD_TOLERANCE = 1e-9  # relative distance from a threshold within which rounding may decide
-ESTIMATE_TOLERANCE = 1e-6  # relative difference of identified parameters that shows a different decision
-MIN_COMPARED_SHARE = 0.5  # least share of compared ticks for a positive verdict
-DEFAULT_REPLAYED_RUNS = 6  # default number of replayed runs
+REPLAY_LIMIT = 1e-11  # largest difference of commands, divided by the commands' range [1]
+CLOSED_LOOP_LIMIT = 1e-9  # largest difference of a contact's restitution [1]
+THRESHOLD_TOLERANCE = 1e-9  # relative distance from a threshold within which a rounding error can decide [1]
+ESTIMATE_TOLERANCE = 1e-6  # relative difference of identified values that proves a different decision [1]
+MIN_COMPARED_SHARE = 0.5  # smallest fraction of ticks that must be compared for a positive verdict [1]
+DEFAULT_REPLAYED_RUNS = 6  # default number of replayed runs: the nominal run and five draws
 
 
 class LaneReplay(msgspec.Struct, frozen=True):
-    """Comparison of one recorded lane with its replay in the runtime."""
+    """Comparison of one recorded run with its replay in the runtime."""
 
     ticks: int  # number of recorded ticks
     compared: int  # number of compared ticks
-    near: int  # number of recorded ticks near a threshold
-    command_range: float  # range of the force command, 0 included [N]
-    difference: float  # largest difference away from thresholds over that range [1]
-    near_difference: float  # largest difference near thresholds over that range [1]
-    worst_tick: int  # tick of `difference`
-    found: float  # runtime's command at the worst tick [N]
-    expected: float  # simulated command at the worst tick [N]
-    # tick at which a decision at a threshold differs, where the comparison ends; None if there is none
+    near: int  # number of recorded ticks in which a value is near a threshold
+    command_range: float  # range of the recorded force command, including 0 [N]
+    difference: float  # largest difference of force commands not near a threshold / `command_range` [1]
+    near_difference: float  # largest difference of force commands near a threshold / `command_range` [1]
+    worst_tick: int  # tick with the largest `difference`
+    found: float  # force command of the runtime in this tick [N]
+    expected: float  # recorded force command in this tick [N]
+    # tick in which a decision at a threshold differs, so that the comparison ends; None if no decision
+    # differs
     parted: int | None
-    status: str  # status of the runtime's controller
-    position_difference: float = 0.0  # largest difference of position commands over their range [1]
+    status: str  # status of the runtime's controller at the end of the run
+    position_difference: float = 0.0  # largest difference of position commands, divided by their range [1]
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """Comparison of one nominal contact in closed loop with the simulation."""
+    """Comparison of one nominal contact with the runtime and with the JAX controller in the loop."""
 
-    restitution: float | None  # with the runtime in the loop [1]
-    simulated_restitution: float | None  # with the JAX controller [1]
-    status: str
-    simulated_status: str
-    # with the runtime in the loop, peak real force and duration over those of the ideal contact [1]
-    peak_force_ratio: float | None = None
-    duration_ratio: float | None = None
+    restitution: float | None  # restitution with the runtime [1]; None if the contact does not end
+    simulated_restitution: float | None  # restitution with the JAX controller [1]; None likewise
+    status: str  # status of the contact with the runtime, as in `jaxhil.simulation.metrics`
+    simulated_status: str  # status of the contact with the JAX controller
+    peak_force_ratio: float | None = None  # peak force with the runtime / peak force of the ideal contact [1]
+    duration_ratio: float | None = None  # duration with the runtime / duration of the ideal contact [1]
 
 
 class VerificationReport(msgspec.Struct, frozen=True):
-    """Verdict of a verification and the comparisons that it follows from."""
+    """Verdict of a verification, with all comparisons of runtime and simulation."""
 
-    verdict: bool  # whether all comparisons agree
-    reasons: tuple[str, ...]  # reasons of a negative verdict
+    verdict: bool  # whether runtime and simulation agree in all comparisons
+    reasons: tuple[str, ...]  # reasons for a negative verdict; empty if it is positive
     compensator: str  # name of the compensator
-    replay_limit: float  # allowed difference of commands over their range [1]
-    closed_loop_limit: float  # allowed difference of restitution [1]
-    replay: tuple[LaneReplay, ...]  # one per lane
-    closed_loop: tuple[ContactComparison, ...]  # one per contact
-    stop: ControllerStop | None = None  # first stop by the gain file's limits in closed loop, if any
+    replay_limit: float  # largest accepted difference of commands, divided by their range [1]
+    closed_loop_limit: float  # largest accepted difference of restitution [1]
+    replay: tuple[LaneReplay, ...]  # one comparison for each replayed run
+    closed_loop: tuple[ContactComparison, ...]  # one comparison for each nominal contact
+    stop: ControllerStop | None = None  # first stop in closed loop by a limit; None if no limit stops it
 
 
 def verify(
@@ -89,18 +89,28 @@ def verify(
     seed: int = 0,
     progress: Callable[[str], None] = lambda message: None,
 ) -> VerificationReport:
-    """Replay `scenarios` runs (the nominal one and draws) and run the nominal contacts in closed loop.
+    """Verify that the rig's runtime behaves like the simulation with the gains of a gain file.
 
-    `progress` is called with a description of each stage. Raise RuntimeError unless JAX computes in float64.
+    Args:
+        loaded: gain file.
+        scenarios: number of replayed runs: the nominal run and random draws.
+        seed: seed of the draws.
+        progress: callback, called with a description of each stage.
+
+    Returns:
+        The verdict, and the comparisons by replay and in closed loop.
+
+    Raises:
+        RuntimeError: If JAX does not compute in float64.
     """
     if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError("verification compares to 1e-11: switch jax_enable_x64 on first")
+        raise RuntimeError("jax_enable_x64: found False, expected True: verification compares to 1e-11")
     gain_file = check_gain_document(loaded.document)
     progress(f"recording {scenarios} runs")
     batch = nominal_and_draws(loaded.mechanism, scenarios, seed)
     metrics, lanes = record_lanes(loaded, batch)
-    # The controller knows the drawn period and clearance. Limits are removed, since only the law is compared,
-    # and the limits may rightly stop some draw.
+    # The controller knows the drawn period and clearance. The replay compares the compensators alone, so
+    # remove the limits, which may rightly stop some draws.
     gain_files = [
         gain_file._replace(control_period=float(period), clearance=float(clearance), limits=NO_LIMITS)
         for period, clearance in zip(batch.control_period, batch.clearance, strict=True)
@@ -116,8 +126,9 @@ def verify(
     comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
     stopped = [] if stop is None else [f"closed loop: {stop.text}"]
     unlike = [
-        f"closed loop, contact {number}: real peak force {contact.peak_force_ratio:.3g} times, duration "
-        f"{contact.duration_ratio:.3g} times the ideal contact's, expected {CONTACT_BOUNDS_SHORT_TEXT}"
+        f"closed loop, contact {number}: found a real peak force of {contact.peak_force_ratio:.3g} times and "
+        f"a duration of {contact.duration_ratio:.3g} times the ideal contact's, expected "
+        f"{CONTACT_BOUNDS_SHORT_TEXT}"
         for number, contact in enumerate(comparisons, start=1)
         if outcome.unlike[number - 1, 0]
     ]
@@ -140,21 +151,21 @@ def verify(
 
 
 def replay_lane(lane: LaneRecord, gain_file: GainFile) -> LaneReplay:
-    """Replay a lane's signals in the runtime and compare its commands with the recorded ones."""
+    """Replay the recorded signals of a run in the runtime; compare its commands with the recorded ones."""
     controller = Controller(gain_file)
     commands, positions, stiffness, damping = compute_runtime_commands(controller, lane)
     near = find_threshold_ticks(lane.signals, gain_file)
     error, span = compute_relative_difference(commands, np.asarray(lane.command))
     parted = find_divergence_tick(error, (stiffness, damping), lane.identified, near)
     compared = len(commands) if parted is None else parted
-    clear = np.where(near, 0.0, error)[:compared]
-    worst = int(np.argmax(clear)) if compared else 0
+    regular_error = np.where(near, 0.0, error)[:compared]
+    worst = int(np.argmax(regular_error)) if compared else 0
     return LaneReplay(
         ticks=len(commands),
         compared=compared,
         near=int(np.sum(near)),
         command_range=span,
-        difference=float(np.max(clear, initial=0.0)),
+        difference=float(np.max(regular_error, initial=0.0)),
         near_difference=float(np.max(error[:compared][near[:compared]], initial=0.0)),
         worst_tick=worst,
         found=float(commands[worst]) if compared else 0.0,
@@ -168,10 +179,11 @@ def replay_lane(lane: LaneRecord, gain_file: GainFile) -> LaneReplay:
 def compute_runtime_commands(
     controller: Controller, lane: LaneRecord
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the runtime's commands and estimates for the lane's signals, four arrays (ticks,).
+    """Compute the commands of the runtime's controller for the recorded signals of a run.
 
-    They are force command [N], position command [m], stiffness [N/m] and damping [N s/m]. A position command
-    is NaN if the next motion of the numerical model is not recorded.
+    Return force command [N], position command [m], identified stiffness [N/m] and identified damping [N s/m],
+    each (ticks,). A position command is NaN if the record does not contain the next state of the numerical
+    model.
     """
     controller.reset()
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
@@ -180,12 +192,12 @@ def compute_runtime_commands(
         if age == 0 and tick > 0:
             controller.next_contact()
         if age == 0:
-            # The first position command tells the controller that the model is moving already.
+            # The first position command tells the controller that the numerical model already moves.
             controller.position_command(position, velocity, 0.0)
         command = controller.step(force, position, velocity, measured)
         identified, sent = controller.identified, math.nan
         if lane.sent is not None and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
-            # Every integrator has v(n+1) = v(n) + T a.
+            # All integrators compute v(n+1) = v(n) + T a, so that the record determines a.
             next_position, next_velocity = readings[tick + 1][1:3]
             acceleration = (next_velocity - velocity) / controller.control_period
             sent = controller.position_command(next_position, next_velocity, acceleration)
@@ -195,9 +207,9 @@ def compute_runtime_commands(
 
 
 def compute_position_difference(positions: np.ndarray, lane: LaneRecord) -> float:
-    """Return the largest difference of the position commands from the lane's, over the range of these.
+    """Return the largest difference between `positions` and the recorded position commands.
 
-    Commands that are NaN are ignored.
+    The difference is divided by the range of the recorded commands. NaN in `positions` is ignored.
     """
     if lane.sent is None:
         return 0.0
@@ -207,16 +219,19 @@ def compute_position_difference(positions: np.ndarray, lane: LaneRecord) -> floa
 
 
 def compute_command_range(commands: np.ndarray) -> float:
-    """Return the range of the finite commands [N], 0 included."""
+    """Return the range [N] of the commands and 0; commands that are not finite are ignored."""
     finite = commands[np.isfinite(commands)]
     return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
 
 
 def compute_relative_difference(commands: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the differences over the expected range, 0 where NaN is expected, and that range [N]."""
+    """Return the differences of commands, divided by the range of the expected commands, and this range [N].
+
+    A difference is 0 if the expected command is NaN.
+    """
     span = compute_command_range(expected)
     error = np.where(np.isnan(expected), 0.0, np.abs(commands - expected))
-    # If the expected command is always 0, only equal commands pass.
+    # If the expected command is always 0, every other command has an infinite relative difference.
     return error / span if span > 0 else np.where(error == 0, 0.0, np.inf), span
 
 
@@ -226,25 +241,35 @@ def find_divergence_tick(
     expected: Sequence[np.ndarray | jax.Array] | None,
     near: np.ndarray,
 ) -> int | None:
-    """Return the tick near a threshold from which both sides differ, by commands or estimates; None if none.
+    """Return the first tick in which runtime and simulation decide differently at a threshold.
 
-    `error` is that of the commands; `identified` and `expected` are the estimates of both sides, if any.
+    The result is None if no tick near a threshold has a difference of commands or estimates, or if an earlier
+    tick already has one.
+
+    Args:
+        error: relative difference of the force commands, (ticks,).
+        identified: stiffness and damping identified by the runtime, each (ticks,).
+        expected: stiffness and damping identified in the simulation; None if not recorded.
+        near: whether a value is near a threshold, (ticks,).
     """
     differs = error > REPLAY_LIMIT
     for estimate, recorded in zip(identified, expected or (), strict=expected is not None):
         recorded = np.asarray(recorded)[: len(error)]
         differs |= np.abs(estimate - recorded) > ESTIMATE_TOLERANCE * np.max(np.abs(recorded), initial=0.0)
-    partings = np.nonzero(near & differs)[0]
-    # A difference that existed before the tick near a threshold was not caused by a decision there.
-    return int(partings[0]) if len(partings) and not np.any(differs[: partings[0]]) else None
+    differing_ticks = np.nonzero(near & differs)[0]
+    # If a difference existed before this tick, then the decision at the threshold did not cause it.
+    if not len(differing_ticks) or np.any(differs[: differing_ticks[0]]):
+        return None
+    return int(differing_ticks[0])
 
 
 def find_threshold_ticks(signals: Signals, gain_file: GainFile) -> np.ndarray:
-    """Return the ticks, (ticks,), with a decision of the law within `THRESHOLD_TOLERANCE` of its threshold.
+    """Return whether a value of the compensator is near a threshold, for each tick, (ticks,) of bool.
 
-    Laws that identify have two decisions. One is the side of a surface on which the delay-aligned position
-    lies, with a margin relative to the measured positions. The other, in contact, is whether |F| exceeds the
-    contact threshold, with a margin relative to the larger of both. If both are 0, rounding cannot decide.
+    Compensators that identify the contact have two thresholds. The first is each surface, for the
+    delay-aligned position; near means within `THRESHOLD_TOLERANCE` times the largest measured position. The
+    second is the contact threshold, for |F| in contact; near means within `THRESHOLD_TOLERANCE` times the
+    larger of both.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)
@@ -261,7 +286,10 @@ def find_threshold_ticks(signals: Signals, gain_file: GainFile) -> np.ndarray:
 
 
 def _align_position(signals: Signals, delay: float, period: float) -> np.ndarray:
-    """Return the measured position [m] delayed by `delay` [s], linear between ticks, uniform before a run."""
+    """Delay the measured position [m] by `delay` [s].
+
+    Between ticks, the position is interpolated linearly. Before a run, the motion is uniform.
+    """
     measured, velocity, age = signals.position_measured, signals.velocity_desired, signals.age
     tick = np.arange(len(measured))
     begun = tick - age
@@ -298,20 +326,20 @@ def _list_replay_reasons(replays: list[LaneReplay]) -> Iterator[str]:
             yield f"{run}: the runtime's controller {lane.status}"
         if lane.difference > REPLAY_LIMIT:
             yield (
-                f"{run}, tick {lane.worst_tick}: force command found {lane.found!r} N, expected "
-                f"{lane.expected!r} N: they differ by {lane.difference:.1e} of the command's range "
-                f"{lane.command_range:.4g} N, limit {REPLAY_LIMIT:.0e}"
+                f"{run}, tick {lane.worst_tick}: force command: found {lane.found!r} N, expected "
+                f"{lane.expected!r} N (simulation): the difference is {lane.difference:.1e} of the command's "
+                f"range {lane.command_range:.4g} N, expected {REPLAY_LIMIT:.0e} or less"
             )
         if lane.position_difference > REPLAY_LIMIT:
             yield (
-                f"{run}: position commands differ by {lane.position_difference:.1e} of their range, limit "
-                f"{REPLAY_LIMIT:.0e}"
+                f"{run}: position commands differ by {lane.position_difference:.1e} of their range, expected "
+                f"{REPLAY_LIMIT:.0e} or less"
             )
     ticks, compared = sum(lane.ticks for lane in replays), sum(lane.compared for lane in replays)
     if compared < MIN_COMPARED_SHARE * ticks:
         yield (
-            f"replay: {compared} of {ticks} ticks could be compared before rounding decided at a threshold, "
-            f"expected at least {MIN_COMPARED_SHARE:.0%}"
+            f"replay: {compared} of {ticks} ticks could be compared before a rounding error decided at a "
+            f"threshold, expected at least {MIN_COMPARED_SHARE:.0%}"
         )
 
 
@@ -322,15 +350,18 @@ def _list_closed_loop_reasons(
     for number, contact in enumerate(comparisons, start=1):
         where = f"closed loop, contact {number}"
         if tripped and contact.status == "not reached":
-            # The stop is a reason of its own.
+            # The stop is already a reason.
             continue
         if contact.restitution is None or contact.simulated_restitution is None:
-            yield f"{where}: found {contact.status}, simulated {contact.simulated_status}, expected ok"
+            yield (
+                f"{where}: status: found {contact.status} with the runtime and {contact.simulated_status} in "
+                "the simulation, expected ok"
+            )
             continue
         difference = abs(contact.restitution - contact.simulated_restitution)
         if not difference <= CLOSED_LOOP_LIMIT:
             yield (
-                f"{where}: restitution found {contact.restitution!r}, simulated "
-                f"{contact.simulated_restitution!r}: they differ by {difference:.1e}, limit "
-                f"{CLOSED_LOOP_LIMIT:.0e}"
+                f"{where}: restitution: found {contact.restitution!r}, expected "
+                f"{contact.simulated_restitution!r} (simulation): the difference is {difference:.1e}, "
+                f"expected {CLOSED_LOOP_LIMIT:.0e} or less"
             )

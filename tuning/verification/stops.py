@@ -1,7 +1,7 @@
-"""Stops of runs by the limits of a gain file: fault, value, limit, contact and time, in numbers and words.
+"""Description of how a limit of a gain file stops a run: fault, value, limit, contact and time.
 
-`RecordingController` is the rig's controller with a record of its inputs, from which it determines its stop.
-`find_stop` runs it on a recorded run, and `find_passing_limits` returns limits under which that run passes.
+`RecordingController` is the rig's controller with a record of its inputs, which explains a stop. `find_stop`
+replays a recorded run through this controller. `find_passing_limits` finds limits that do not stop the run.
 """
 
 import math
@@ -16,11 +16,11 @@ from jaxhil.rig.law_status import STATUSES
 from jaxhil.rig.limits import LIMITS, NO_LIMITS
 from jaxhil.rig.watchdog import Watchdog
 
-if TYPE_CHECKING:  # It imports JAX, which takes a second; an early error need not wait for that.
+if TYPE_CHECKING:  # This import needs JAX, which takes a second, and would delay early error messages.
     from jaxhil.simulation.recording import LaneRecord
 
 WATCHDOG_FAULTS = faults.RESTITUTION | faults.ENERGY_BALANCE | faults.CONTACT_TOO_LONG
-# Name of the limit of each fault that has one; two names are the lower and the upper limit.
+# Names of the limits whose violation raises each fault; two names are the lower and the upper limit.
 FAULT_LIMITS: Mapping[int, tuple[str, ...]] = {
     faults.FORCE_OUT_OF_RANGE: ("force_range",),
     faults.POSITION_OUT_OF_RANGE: ("measured_lowest", "measured_highest"),
@@ -35,33 +35,33 @@ FAULT_LIMITS: Mapping[int, tuple[str, ...]] = {
     faults.ENERGY_BALANCE: ("energy_balance",),
     faults.CONTACT_TOO_LONG: ("longest_contact",),
 }
-LIMIT_WIDENING = 1.25  # proposed limit over the value that the run needs
-MAX_LIMIT_CHANGES = 24  # largest number of changes of limits that are tried until a run passes
+LIMIT_WIDENING = 1.25  # proposed limit, divided by the value that the run reaches [1]
+MAX_LIMIT_CHANGES = 24  # largest number of limits that are widened, one after the other, until a run passes
 STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 
 
 class ControllerStop(msgspec.Struct, frozen=True, kw_only=True):
-    """First stop of a run, or first other action of the controller on a fault."""
+    """First fault of a run on which the controller acts, by a trip or by changing a reading or a command."""
 
     fault: str  # name of the fault, as in `jaxhil.rig.faults`
-    by: str  # "watchdog" or "guard"
-    tripped: bool  # whether the controller tripped; otherwise it only flagged a reading or limited a command
-    contact: int  # number of the current, just audited or next contact, from 1
+    by: str  # part of the controller that raises the fault: "watchdog" or "guard"
+    tripped: bool  # whether the controller trips; otherwise it replaces a reading or limits a command
+    contact: int  # number of the contact, from 1; between contacts, number of the audited or the next contact
     tick: int  # tick of the run, from 0
-    time: float  # time since the run began [s]
-    found: float | None  # value compared with the limit [its unit]; None if it is no number
-    limit: str | None  # name of the limit; None if the fault has none
-    allowed: float | None  # value of the limit
+    time: float  # time since the start of the run [s]
+    found: float | None  # value that is compared with the limit [`unit`]; None if there is no such number
+    limit: str | None  # name of the limit; None if the fault has no limit
+    allowed: float | None  # value of the limit [`unit`]
     unit: str | None  # unit of the limit
-    text: str  # description with all of the above
+    text: str  # description with all fields above
 
 
 class TickInputs(NamedTuple):
-    """Inputs of the controller at a tick, and its command of the tick before."""
+    """Inputs of the controller in one tick, and its force command in the previous tick."""
 
-    begins: bool  # whether the next contact was announced before the tick
-    given: float  # force command [N] of the tick before
-    status: int  # status of the law at that command
+    begins: bool  # whether the next contact was announced before this tick
+    command: float  # force command in the previous tick [N]
+    status: int  # status of the compensator at this force command
     force: float  # measured force [N]
     position: float  # position of the numerical model [m]
     velocity: float  # velocity of the numerical model [m/s]
@@ -69,7 +69,7 @@ class TickInputs(NamedTuple):
 
 
 class RecordingController:
-    """Controller of the rig with a record of its inputs up to the first fault on which it acted."""
+    """Rig's controller that records its inputs until the first fault on which it acts."""
 
     def __init__(self, gain_file: GainFile):
         self.controller = Controller(gain_file)
@@ -86,18 +86,18 @@ class RecordingController:
         return self._acting != 0
 
     def next_contact(self) -> None:
-        """Announce the next contact, at which the watchdog audits the current one."""
+        """Announce the next contact; this makes the watchdog audit the current contact."""
         self.controller.next_contact()
         if not self.stopped:
             self._begins = self._announced = True
         self._record_faults()
 
     def start(self, position: float, velocity: float) -> None:
-        """Set the controller's position and velocity at the start of a run, before its first tick."""
+        """Set position [m] and velocity [m/s] of the numerical model before the first tick of a run."""
         self.controller.position_command(position, velocity, 0.0)
 
     def step(self, force: float, position: float, velocity: float, measured: float) -> float:
-        """Return the controller's force [N] of a tick."""
+        """Return the controller's force command [N] for one tick."""
         if not self.stopped:
             status = STATUS_NUMBERS[self.controller.law_status]
             self._ticks.append(
@@ -109,7 +109,7 @@ class RecordingController:
         return self._force
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the controller's position command [m] of a tick."""
+        """Return the controller's position command [m] for one tick."""
         if not self.stopped:
             self._motions[len(self._ticks) - 1] = (position, velocity, acceleration)
         sent = self.controller.position_command(position, velocity, acceleration)
@@ -117,12 +117,12 @@ class RecordingController:
         return sent
 
     def stop(self) -> ControllerStop | None:
-        """Return the first stop or other action of the controller on a fault; None if there was none."""
+        """Describe the first fault on which the controller acted; return None if there was no such fault."""
         if not self.stopped:
             return None
         fault = next(candidate for candidate in faults.FAULTS if self._acting & candidate.bit)
-        watchdog = self._audited()
-        found, limit, words = self._measured(fault.bit, watchdog)
+        watchdog = self._replay_watchdog()
+        found, limit, description = self._describe_value(fault.bit, watchdog)
         allowed = None if limit is None else float(self._gain_file.limits[limit])
         audited = fault.bit & (faults.RESTITUTION | faults.ENERGY_BALANCE)
         contact = watchdog.contacts + (0 if audited else 1)
@@ -133,9 +133,9 @@ class RecordingController:
         unit = None if limit is None else LIMITS[limit].unit
         stated = "" if limit is None else f", {limit} {allowed:.4g}{'' if unit == '1' else f' {unit}'}"
         text = (
-            f"{'stopped' if tripped else 'interfered with'} at {time:.4g} s (tick {tick}), "
+            f"{'stopped' if tripped else 'changed'} at {time:.4g} s (tick {tick}), "
             f"{'after' if audited else 'in or before'} contact {contact}, by the {by}'s check {fault.name}: "
-            f"{words or fault.condition.removeprefix('watchdog: ')}{stated}"
+            f"{description or fault.condition.removeprefix('watchdog: ')}{stated}"
         )
         return ControllerStop(
             fault=fault.name, by=by, tripped=tripped, contact=contact, tick=tick, time=time, found=found,
@@ -143,77 +143,84 @@ class RecordingController:
         )  # fmt: skip
 
     def _record_faults(self) -> None:
-        """Store the first faults on which the controller acts; `LAW_IN_DOUBT` changes no command."""
+        """Store the first faults on which the controller acts; `LAW_IN_DOUBT` is not such a fault."""
         if not self._acting:
             self._acting = self.controller.cause or self.controller.faults & ~faults.LAW_IN_DOUBT
 
-    def _audited(self) -> Watchdog:
-        """Return a watchdog in its state after the recorded inputs."""
+    def _replay_watchdog(self) -> Watchdog:
+        """Replay the recorded inputs through a new watchdog; return this watchdog."""
         file = self._gain_file
         stated = STATUS_NUMBERS[self.controller.law_status] != STATUS_NUMBERS["unstated"]
         watchdog = Watchdog(file.limits, file.control_period, file.clearance, stated)
         for tick in self._ticks:
             if tick.begins:
-                watchdog.conclude(tick.given, tick.status)
+                watchdog.conclude(tick.command, tick.status)
                 watchdog.restart()
             watchdog.tick(*tick[1:])
         if self._announced:
             watchdog.conclude(self._force, STATUS_NUMBERS[self.controller.law_status])
         return watchdog
 
-    def _measured(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
-        """Return the value compared with the fault's limit, that limit's name, and the value as text."""
+    def _describe_value(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
+        """Return the value that violates the limit of a fault, the limit's name, and a description.
+
+        The value is None if it cannot be compared with the limit; value and name are None if the fault has no
+        limit.
+        """
         names = FAULT_LIMITS.get(fault)
         if not names:
             return None, None, ""
         if fault == faults.RESTITUTION:
             value = abs(watchdog.restitution - watchdog.expected)
-            words = f"restitution {watchdog.restitution:.4g} and expected {watchdog.expected:.4g} differ by "
-            return value, names[0], f"{words}{value:.2g}"
+            pair = f"restitution {watchdog.restitution:.4g} and expected {watchdog.expected:.4g}"
+            return value, names[0], f"{pair} differ by {value:.2g}"
         if fault == faults.ENERGY_BALANCE:
-            return None, names[0], f"{abs(watchdog.balance):.3g} J are out of balance"
+            return None, names[0], f"the energy balance is {abs(watchdog.balance):.3g} J"
         if fault == faults.CONTACT_TOO_LONG:
             return (
                 self._gain_file.limits[names[0]] + self._gain_file.control_period,
                 names[0],
-                "it is not over",
+                "the contact has not ended",
             )
-        if fault == faults.VELOCITY_LIMIT and math.isfinite(first := self._first_distance()):
-            return first, "start_distance", f"{first:.4g} m from where the drives read"
-        value = self._compared(fault)
+        if fault == faults.VELOCITY_LIMIT and math.isfinite(first := self._compute_start_distance()):
+            return first, "start_distance", f"the first command is {first:.4g} m from the measured position"
+        value = self._find_compared_value(fault)
         *lower, limit = names
         if lower and value < self._gain_file.limits[lower[0]]:
             limit = lower[0]
         unit = LIMITS[limit].unit
         return value, limit, f"{value:.4g} {unit}"
 
-    def _compared(self, fault: int) -> float:
-        """Return the value that a guard compares with its limit."""
+    def _find_compared_value(self, fault: int) -> float:
+        """Return the value that a guard compares with the limit of `fault`, in the unit of this limit."""
         tick, period = self._ticks[-1], self._gain_file.control_period
         if fault in (faults.FORCE_OUT_OF_RANGE, faults.FORCE_IN_FLIGHT):
             return abs(tick.force)
         if fault == faults.POSITION_OUT_OF_RANGE:
             return tick.measured
         if fault == faults.FORCE_STUCK:
-            return self._travel("force", "measured", in_contact=True)
+            return self._compute_travel("force", "measured", in_contact=True)
         if fault == faults.POSITION_STUCK:
-            return self._travel("measured", "position", in_contact=False)
-        command, before, sent = self._unlimited()
+            return self._compute_travel("measured", "position", in_contact=False)
+        command, before, sent = self._compute_unlimited_commands()
         if fault == faults.FORCE_LIMIT:
             return abs(command)
         if fault == faults.FORCE_SLEW:
-            return abs(command - tick.given) / period
+            return abs(command - tick.command) / period
         return sent if fault == faults.STROKE else abs(sent - before) / period
 
-    def _first_distance(self) -> float:
-        """Return |last position command - measured position| [m] if it is a run's first command; else NaN."""
-        _, before, sent = self._unlimited()
+    def _compute_start_distance(self) -> float:
+        """Return the distance [m] of a run's first position command from the measured position.
+
+        Return NaN if the last recorded command is not the first command of a run.
+        """
+        _, before, sent = self._compute_unlimited_commands()
         return math.nan if math.isfinite(before) else abs(sent - self._ticks[-1].measured)
 
-    def _travel(self, constant: str, moving: str, in_contact: bool) -> float:
-        """Return the travel [m] of the signal `moving` since the signal `constant` last changed.
+    def _compute_travel(self, constant: str, moving: str, in_contact: bool) -> float:
+        """Return the distance [m] that the signal `moving` has travelled since the signal `constant` changed.
 
-        With `in_contact`, it counts from the last tick at which the measured position was out of contact.
+        With `in_contact`, only the travel since the last tick without contact counts.
         """
         travel, clearance = 0.0, self._gain_file.clearance
         for tick in range(len(self._ticks) - 1, 0, -1):
@@ -225,8 +232,11 @@ class RecordingController:
             travel += abs(getattr(now, moving) - getattr(before, moving))
         return travel
 
-    def _unlimited(self) -> tuple[float, float, float]:
-        """Return the law's force command [N] at the last tick, and its last two position commands [m]."""
+    def _compute_unlimited_commands(self) -> tuple[float, float, float]:
+        """Return the commands that the controller would have sent without limits.
+
+        These are the force command [N] of the last recorded tick, and the last two position commands [m].
+        """
         free = Controller(self._gain_file._replace(limits=NO_LIMITS))
         force, before, sent = 0.0, math.nan, math.nan
         for number, tick in enumerate(self._ticks):
@@ -240,26 +250,32 @@ class RecordingController:
 
 
 def find_stop(gain_file: GainFile, lane: "LaneRecord") -> ControllerStop | None:
-    """Return the first stop in a recorded run, whose last contact is audited too; None if there is none."""
-    witness = RecordingController(gain_file)
+    """Replay a recorded run; return the first fault on which the controller acts, or None.
+
+    The watchdog audits the last contact at the end of the run.
+    """
+    controller = RecordingController(gain_file)
     readings = list(zip(*(leaf.tolist() for leaf in lane.signals), strict=True))
     for tick, (*signals, age) in enumerate(readings):
         if age == 0 and tick > 0:
-            witness.next_contact()
-        if not witness.stopped:
-            witness.step(*signals)
-        if not witness.stopped and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
+            controller.next_contact()
+        if not controller.stopped:
+            controller.step(*signals)
+        if not controller.stopped and tick + 1 < len(readings) and readings[tick + 1][4] == age + 1:
             position, velocity = readings[tick + 1][1:3]
             acceleration = (velocity - signals[2]) / gain_file.control_period
-            witness.position_command(position, velocity, acceleration)
-        if witness.stopped:
-            return witness.stop()
-    witness.next_contact()
-    return witness.stop()
+            controller.position_command(position, velocity, acceleration)
+        if controller.stopped:
+            return controller.stop()
+    controller.next_contact()
+    return controller.stop()
 
 
 def find_passing_limits(gain_file: GainFile, lane: "LaneRecord") -> dict[str, float] | None:
-    """Return names and values of limits with which a recorded run passes; None if it cannot pass."""
+    """Widen limits until the controller no longer acts on a fault in a recorded run.
+
+    Return the changed limits by name, or None if no change of limits helps.
+    """
     limits, changed = dict(gain_file.limits), {}
     for _ in range(MAX_LIMIT_CHANGES):
         stop = find_stop(gain_file._replace(limits=limits), lane)
@@ -272,15 +288,15 @@ def find_passing_limits(gain_file: GainFile, lane: "LaneRecord") -> dict[str, fl
 
 
 def describe_limit_changes(passing: Mapping[str, float] | None) -> str:
-    """Return a text with the changes of limits with which a run passes."""
+    """Describe how the user can change limits so that they do not stop a run."""
     if not passing:
-        return "no other limits let it pass"
+        return "no change of limits prevents this"
     changes = " ".join(f"--set {name}={value:g}" for name, value in passing.items())
-    return f"tune better gains, or {changes} lets this run pass, and others like it"
+    return f"tune better gains, or use {changes}, which lets this run and similar runs pass"
 
 
 def _widen_limit(name: str, found: float) -> float:
-    """Return a limit beyond the found value, rounded outward to two digits."""
+    """Return a limit beyond the value `found`, rounded outward to two digits."""
     outward = -1.0 if name.endswith("_lowest") else 1.0
     value = found + outward * (LIMIT_WIDENING - 1) * abs(found)
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1) if value else 1.0

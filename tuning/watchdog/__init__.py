@@ -1,5 +1,5 @@
-"""Calibration of the limits in a gain file, and of the watchdog's rates of alarm, from recorded runs.
+"""Calibration of the limits in a gain file, and estimation of the watchdog's alarm rates, from recorded runs.
 
-The watchdog itself, `jaxhil.rig.watchdog`, trips the controller after a contact whose energy or restitution
-is outside these limits.
+The watchdog, `jaxhil.rig.watchdog`, trips the controller after a contact whose energy or restitution violates
+these limits.
 """

@@ -1,7 +1,7 @@
-"""False and missed alarms of the watchdog and the other guards in recorded runs.
+"""Rates of false and missed alarms of the watchdog and the other guards in recorded runs.
 
-A run is good if no contact's error exceeds a limit. A good run that is stopped is a false alarm, and a bad
-run that continues after its bad contact is a missed alarm.
+A run is good if no restitution error of its contacts exceeds a limit. A false alarm is a good run that the
+controller stops. A missed alarm is a bad run that the controller does not stop by the end of its bad contact.
 """
 
 from collections.abc import Mapping
@@ -17,25 +17,29 @@ from tuning.watchdog.expectation import ContactFeatures, Expectation, expected_r
 from tuning.watchdog.recording import RecordedRuns
 from tuning.watchdog.signal_extremes import SignalExtremes, find_signal_extremes
 
-# Multiples of the limit: a run with errors up to the first is good, beyond the second it must be stopped.
+# Errors divided by the limit: a run with errors up to the first value is good for the alarm rates; a run with
+# an error above the second value must be stopped.
 GOOD_ERROR_FACTOR, BAD_ERROR_FACTOR = 0.5, 1.0
-MIN_DETECTED_SHARE = 0.95  # share of alarms that defines the error from which contacts are noticed
-MIN_DETECTED_CONTACTS = 20  # least number of contacts for such a share
+MIN_DETECTED_SHARE = 0.95  # fraction of contacts that must raise an alarm for an error to be detectable [1]
+MIN_DETECTED_CONTACTS = 20  # smallest number of contacts for an estimate of this fraction
 
 
 class EvaluatedRuns(NamedTuple):
-    """Evaluation of recorded runs."""
+    """Errors, audits and extreme signals of recorded runs; slots are contacts, lanes are runs."""
 
     index: Int[np.ndarray, "lanes"]  # index of each run in its sweep
-    error: Float[np.ndarray, "slots lanes"]  # restitution error; NaN if the contact did not end
-    reference: Float[np.ndarray, "slots lanes"]  # restitution e* of the ideal contact
+    error: Float[np.ndarray, "slots lanes"]  # restitution error e - e* [1]; NaN if the contact did not end
+    reference: Float[np.ndarray, "slots lanes"]  # restitution e* of the ideal contact [1]
     status: Int[np.ndarray, "slots lanes"]  # status of each contact, as in `jaxhil.simulation.metrics`
-    audited: AuditedContacts  # the watchdog's audit of each contact
-    extent: SignalExtremes  # extreme values of the signals
+    audited: AuditedContacts  # values that the watchdog computes for each contact
+    extent: SignalExtremes  # extreme values of the signals of each run
 
 
 def evaluate_runs(chunk: RecordedRuns, rules: AuditRules, free_distance: float) -> EvaluatedRuns:
-    """Evaluate recorded runs; `free_distance` [m] is that of `find_signal_extremes`."""
+    """Compute errors, audits and extreme signals of recorded runs.
+
+    `free_distance` [m] is the distance from the surfaces beyond which the mechanism counts as in free flight.
+    """
     contacts, slots = chunk.contacts, len(chunk.contacts.status)
     return EvaluatedRuns(
         chunk.first + np.arange(contacts.status.shape[1]),
@@ -48,19 +52,19 @@ def evaluate_runs(chunk: RecordedRuns, rules: AuditRules, free_distance: float) 
 
 
 def find_good_runs(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
-    """Return the runs whose contacts all ended, with errors within the limit."""
+    """Return whether all contacts of a run have ended with errors within `limit`, for each run."""
     return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
 
 
 def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
-    """Return the contacts that the rig would reach, since no earlier contact of the run had to be stopped."""
+    """Return which contacts the rig would reach: those with no bad contact before them in their run."""
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
     first = find_first_true(bad)
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
 
 
 def extract_features(audited: AuditedContacts) -> ContactFeatures:
-    """Return the features of the expectation, 0 if a contact gave no estimate."""
+    """Return stiffness, damping and approach speed from the audits; a missing estimate becomes 0."""
     return ContactFeatures(
         np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
     )
@@ -74,13 +78,21 @@ def compute_alarm_rates(
     mass: float,
     chosen: Bool[np.ndarray, "lanes"],
 ) -> dict[str, Any]:
-    """Return rates of false and missed alarms in the chosen runs, with exact 95 % intervals, as plain data.
+    """Compute the rates of false and missed alarms, with exact 95 % intervals, as JSON data.
 
-    A run is good if no error exceeds half the limit; it is a false alarm if the watchdog or another guard
-    stops it. A run must be stopped if a contact does not end or has an error beyond the limit; it is missed
-    if the watchdog has not tripped by the end of that contact. The intervals are valid for independent
-    scenarios, even if the number of failures decides their number; Sobol points are spread more evenly. The
-    result also holds the error from which contacts are noticed (`find_detectable_error`).
+    A good run has no error above half the limit. It is a false alarm if the watchdog or another guard stops
+    it. A bad run has a contact that does not end or has an error beyond the limit. It is a missed alarm if
+    the watchdog has not tripped by the end of this contact. The intervals are exact for independent
+    scenarios, and conservative for points of a Sobol sequence. The result also contains the smallest
+    detectable error (`find_detectable_error`).
+
+    Args:
+        runs: recorded runs.
+        expectation: expected restitution of the watchdog.
+        limits: limits of the gain file by name.
+        limit: limit of the restitution error [1].
+        mass: equivalent mass [kg].
+        chosen: which runs to use, (lanes,).
     """
     alarmed = find_alarms(runs, expectation, limits, mass)
     first_alarm = find_first_true(alarmed)
@@ -89,9 +101,9 @@ def compute_alarm_rates(
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= BAD_ERROR_FACTOR * limit)
     first_bad = find_first_true(bad)
     bad_runs = chosen & np.any(bad, axis=0)
-    use = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen
+    is_used = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen
     expected = expected_restitution(expectation, extract_features(runs.audited), mass)
-    difference = np.abs((expected - runs.reference)[use])
+    difference = np.abs((expected - runs.reference)[is_used])
     return {
         "limit": limit,
         "restitution_margin": limits["restitution_margin"],
@@ -100,7 +112,7 @@ def compute_alarm_rates(
         "expectation_largest": float(np.max(difference)) if len(difference) else None,
         "false_alarms": _compute_alarm_rate(stopped[good]),
         "missed_alarms": _compute_alarm_rate(first_alarm[bad_runs] > first_bad[bad_runs]),
-        "noticed_from": find_detectable_error(runs.error[use], alarmed[use]),
+        "noticed_from": find_detectable_error(runs.error[is_used], alarmed[is_used]),
         "held_out_runs": int(np.sum(chosen)),
     }
 
@@ -108,7 +120,7 @@ def compute_alarm_rates(
 def find_alarms(
     runs: EvaluatedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
 ) -> Bool[np.ndarray, "slots lanes"]:
-    """Return the contacts for which the watchdog raises an alarm."""
+    """Return whether the watchdog raises an alarm, for each contact."""
     audited = runs.audited
     expected = expected_restitution(expectation, extract_features(audited), mass)
     margin, balance, longest = (
@@ -116,16 +128,16 @@ def find_alarms(
         for name in ("restitution_margin", "energy_balance", "longest_contact")
     )
     with np.errstate(invalid="ignore"):
-        quiet = (
+        passes = (
             (np.abs(audited.restitution - expected) <= margin)
             & (audited.imbalance <= balance)
             & (audited.duration <= longest)
         )
-    return audited.begun & ~quiet & ~(audited.approach == 0)
+    return audited.begun & ~passes & ~(audited.approach == 0)
 
 
 def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
-    """Return the runs that a guard other than the watchdog would stop, or whose readings it would flag."""
+    """Return whether a guard other than the watchdog would act on a reading or a command, for each run."""
 
     def limit(name: str, unlimited: float = np.inf) -> float:
         value = limits[name]
@@ -149,20 +161,21 @@ def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None])
 def find_detectable_error(
     error: Float[np.ndarray, "contacts"], alarmed: Bool[np.ndarray, "contacts"]
 ) -> dict[str, Any]:
-    """Return the least |error| from which 95 % of the contacts raise an alarm.
+    """Return the smallest detectable error: 95 % of the contacts with at least this |error| raise an alarm.
 
-    The result holds this `error` (None if there is none, or fewer than 20 such contacts), the number of these
-    `contacts`, and the `largest` |error| of all contacts.
+    The keys of the result are `error` (None if no error is detectable, or if fewer than 20 contacts have at
+    least this error), `contacts` (the number of these contacts), and `largest` (the largest |error| of all
+    contacts).
     """
-    size = np.abs(error)
-    order = np.argsort(-size)
-    number = np.arange(1, len(size) + 1)
+    magnitude = np.abs(error)
+    order = np.argsort(-magnitude)
+    number = np.arange(1, len(magnitude) + 1)
     enough = (np.cumsum(alarmed[order]) >= MIN_DETECTED_SHARE * number) & (number >= MIN_DETECTED_CONTACTS)
-    largest = float(size[order[0]]) if len(size) else None
+    largest = float(magnitude[order[0]]) if len(magnitude) else None
     if not np.any(enough):
         return {"error": None, "contacts": 0, "largest": largest}
     last = int(np.max(np.nonzero(enough)[0]))
-    return {"error": float(size[order[last]]), "contacts": last + 1, "largest": largest}
+    return {"error": float(magnitude[order[last]]), "contacts": last + 1, "largest": largest}
 
 
 def _compute_alarm_rate(alarmed: Bool[np.ndarray, "runs"]) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Audit of recorded contacts as by the watchdog, in NumPy, for many lanes at a time.
+"""Vectorised audit of recorded contacts, which computes the same values as the watchdog on the rig.
 
-The arithmetic is that of `jaxhil.rig.watchdog` with a trailing axis of lanes: begin and end of every contact
-as the rig detects them, velocities, energy-consistency test, and least squares of the measured force on the
-delay-aligned measured position and its rate.
+The arithmetic is that of `jaxhil.rig.watchdog`, with an additional axis of lanes (recorded runs). An audit
+consists of onset and end of the contact as the rig detects them, approach and rebound speed, the
+energy-consistency test, and estimates of stiffness and damping. The estimates come from least squares of the
+measured force on the delay-aligned measured position and its rate.
 """
 
 from typing import NamedTuple
@@ -16,43 +17,43 @@ from tuning.watchdog.recording import RecordedSignals
 
 
 class AuditRules(NamedTuple):
-    """Parameters of the audit."""
+    """Parameters of the watchdog's audit."""
 
     period: float  # control period [s]
-    clearance: float  # [m]
+    clearance: float  # distance between the two surfaces [m]; infinite for one surface
     mass: float  # equivalent mass [kg]
     alignment: float  # delay of the force reading relative to the position reading [s]
-    settling: float  # time in which force and command die out [s]
-    fading: float  # largest force reading that counts as no force [N]
-    has_status: bool = False  # whether the law states when it acts, and commands no force out of contact
+    settling: float  # time in which force and force command decay after a contact [s]
+    fading: float  # largest force reading without contact, caused by noise and bias [N]
+    has_status: bool = False  # whether the compensator reports a status, and commands no force out of contact
 
 
 class AuditedContacts(NamedTuple):
-    """Audit of every contact."""
+    """Values that the watchdog computes for every contact (slot) of every run (lane)."""
 
     approach: Float[np.ndarray, "slots lanes"]  # approach speed [m/s]
     rebound: Float[np.ndarray, "slots lanes"]  # rebound speed [m/s]
-    stiffness: Float[np.ndarray, "slots lanes"]  # estimate [N/m]; 0 if not observable
-    damping: Float[np.ndarray, "slots lanes"]  # estimate [N s/m]; 0 if not observable
-    imbalance: Float[
-        np.ndarray, "slots lanes"
-    ]  # |energy balance| over the kinetic energy of the approach [1]
+    stiffness: Float[np.ndarray, "slots lanes"]  # estimated stiffness [N/m]; 0 if not observable
+    damping: Float[np.ndarray, "slots lanes"]  # estimated damping [N s/m]; 0 if not observable
+    # magnitude of the energy balance, divided by the kinetic energy of the approach [1]
+    imbalance: Float[np.ndarray, "slots lanes"]
     duration: Float[np.ndarray, "slots lanes"]  # time from the onset to the audit [s]
     tick: Float[np.ndarray, "slots lanes"]  # tick of the onset
     begun: Bool[np.ndarray, "slots lanes"]  # whether the contact occurred
 
     @property
     def restitution(self) -> Float[np.ndarray, "slots lanes"]:
-        """Return the rebound speed over the approach speed."""
+        """Return the restitution: rebound speed divided by approach speed."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.rebound / self.approach
 
 
+# Sums for the least squares of force f on penetration x and its rate v.
 LEAST_SQUARES_SUMS = ("xx", "xv", "vv", "xf", "vf")
 
 
 class _AuditState:
-    """Current contact of every lane, and the contacts audited so far."""
+    """State of the audit: the current contact of every lane, and the results of earlier contacts."""
 
     def __init__(self, rules: AuditRules, slots: int, lanes: int):
         zeros = np.zeros(lanes)
@@ -60,17 +61,18 @@ class _AuditState:
         self.open = np.zeros(lanes, bool)
         self.count = np.zeros(lanes, int)
         self.entry, self.side, self.peak, self.work = (zeros.copy() for _ in range(4))
-        self.quiet, self.ticks = zeros.copy(), zeros.copy()
+        self.ticks_without_contact, self.ticks = zeros.copy(), zeros.copy()
         self.sums = {name: zeros.copy() for name in LEAST_SQUARES_SUMS}
         self.results = {name: np.full((slots, lanes), np.nan) for name in AuditedContacts._fields[:-1]}
         self.begun = np.zeros((slots, lanes), bool)
 
     def begin(self, where: Bool[np.ndarray, "lanes"], tick: int, entry: np.ndarray, side: np.ndarray) -> None:
-        """Begin a contact in the lanes `where`."""
+        """Begin a contact in the lanes `where`, with velocity `entry` [m/s] at surface `side` (1 or -1)."""
         self.open |= where
         self.entry[where] = entry[where]
         self.side[where] = side[where]
-        for accumulator in (self.peak, self.work, self.quiet, self.ticks, *self.sums.values()):
+        counters = self.ticks_without_contact, self.ticks
+        for accumulator in (self.peak, self.work, *counters, *self.sums.values()):
             accumulator[where] = 0.0
         stored = where & (self.count < self.slots)
         index = self.count[stored], np.nonzero(stored)[0]
@@ -78,7 +80,10 @@ class _AuditState:
         self.results["tick"][index] = tick
 
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
-        """Audit the contacts that end with this velocity [m/s]; `extra` [J] is the last command's work."""
+        """Audit the contacts that end in the lanes `where`.
+
+        `velocity` [m/s] is that of the rebound, `extra` [J] the work of the last force command.
+        """
         lanes = np.nonzero(where & (self.count < self.slots))[0]
         mass = self.rules.mass
         entry, speed = self.entry[lanes], velocity[lanes]
@@ -102,17 +107,17 @@ class _AuditState:
 
 
 def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> AuditedContacts:
-    """Audit the first `slots` contacts of every lane like the watchdog.
+    """Audit the first `slots` contacts of every lane in the same way as the watchdog.
 
-    A contact that has not ended is audited at the end of the record or when the next run begins.
+    A contact that does not end is audited when the next run begins, or at the end of the record.
     """
     ticks, lanes = signals.force.shape
     period, mass, clearance = rules.period, rules.mass, rules.clearance
     middle = -0.5 * clearance
-    quiet_ticks, patience = rules.settling / period, (rules.settling + MAX_DECAY_WAIT) / period
+    min_ticks, max_ticks = rules.settling / period, (rules.settling + MAX_DECAY_WAIT) / period
     state = _AuditState(rules, slots, lanes)
     alignment = _LaneDelayLine(rules.alignment, period)
-    # These are values of the previous tick; the first tick of a lane begins a run, which sets them.
+    # Values of the previous tick. Every lane begins with a run, whose first tick sets these values.
     velocity_before, command_before, force_before, aligned_before = (np.zeros(lanes) for _ in range(4))
     with np.errstate(invalid="ignore", over="ignore"):
         for tick in range(ticks + 1):
@@ -134,20 +139,20 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
             )
             in_contact |= rules.has_status & (command_before != 0)
             side = np.where(position > middle, 1.0, -1.0)
-            fresh = live & ~state.open & in_contact
-            if np.any(fresh):
-                state.begin(fresh, tick, velocity_before, side)
-            going = live & state.open
-            if np.any(going):
-                state.quiet = np.where(in_contact, 0.0, state.quiet + 1)
-                state.ticks += going
+            starts = live & ~state.open & in_contact
+            if np.any(starts):
+                state.begin(starts, tick, velocity_before, side)
+            in_progress = live & state.open
+            if np.any(in_progress):
+                state.ticks_without_contact = np.where(in_contact, 0.0, state.ticks_without_contact + 1)
+                state.ticks += in_progress
                 state.work += np.where(
-                    going, period * command_before * 0.5 * (velocity_before + velocity), 0.0
+                    in_progress, period * command_before * 0.5 * (velocity_before + velocity), 0.0
                 )
-                size = np.abs(command_before)
-                state.peak = np.where(going, np.maximum(state.peak, size), state.peak)
+                command_magnitude = np.abs(command_before)
+                state.peak = np.where(in_progress, np.maximum(state.peak, command_magnitude), state.peak)
                 side_open = state.side
-                inside = going & (deflection * side_open > 0) & (aligned_before * side_open > 0)
+                inside = in_progress & (deflection * side_open > 0) & (aligned_before * side_open > 0)
                 x = np.where(inside, side_open * (deflection + aligned_before) * 0.5, 0.0)
                 v = np.where(inside, side_open * (deflection - aligned_before) / period, 0.0)
                 f = np.where(inside, side_open * (force + force_before) * 0.5, 0.0)
@@ -155,14 +160,15 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
                     LEAST_SQUARES_SUMS, (x * x, x * v, v * v, x * f, v * f), strict=True
                 ):
                     state.sums[name] += product
-                unfelt = FORCE_DECAY_RATIO * mass * np.abs(state.entry) / MAX_DECAY_WAIT
-                faded = (
-                    (size <= FORCE_DECAY_RATIO * state.peak) | (size <= unfelt) | (state.quiet >= patience)
-                )
-                leaves = ~in_contact & (state.quiet >= quiet_ticks) & (side_open * velocity < 0) & faded
-                over = going & (leaves | (side != side_open))
-                if np.any(over):
-                    state.audit(over, velocity, np.zeros(lanes))
+                negligible = FORCE_DECAY_RATIO * mass * np.abs(state.entry) / MAX_DECAY_WAIT
+                free_ticks = state.ticks_without_contact
+                faded = command_magnitude <= FORCE_DECAY_RATIO * state.peak
+                faded |= command_magnitude <= negligible
+                faded |= free_ticks >= max_ticks
+                leaves = ~in_contact & (free_ticks >= min_ticks) & (side_open * velocity < 0) & faded
+                has_ended = in_progress & (leaves | (side != side_open))
+                if np.any(has_ended):
+                    state.audit(has_ended, velocity, np.zeros(lanes))
             velocity_before = np.where(live, velocity, velocity_before)
             command_before = np.where(live, command, command_before)
             force_before, aligned_before = force, deflection
@@ -170,7 +176,7 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
 
 
 class _LaneDelayLine:
-    """Vectorised `DelayLine` with one lane per element."""
+    """Vectorised `jaxhil.rig.filters.DelayLine`, with one element for each lane."""
 
     def __init__(self, delay: float, period: float):
         DelayLine(delay, period)  # Raises an error if the delay spans too many periods.
@@ -181,7 +187,7 @@ class _LaneDelayLine:
         self._past: list[np.ndarray] = []
 
     def step(self, position: np.ndarray, velocity: np.ndarray, begins: np.ndarray) -> np.ndarray:
-        """Return the delayed position [m]; before a run `begins`, the motion is uniform."""
+        """Return the delayed position [m]; before the tick in which a run `begins`, the motion is uniform."""
         if not self._past:
             self._past = [np.zeros_like(position)] * (self._whole + 1)
         if np.any(begins):
@@ -200,5 +206,5 @@ def _compute_deflection(position: np.ndarray, clearance: float) -> np.ndarray:
 
 
 def find_first_true(beyond: Bool[np.ndarray, "slots lanes"]) -> Int[np.ndarray, "lanes"]:
-    """Return the index of the first true contact of each lane; the number of slots if there is none."""
+    """Return the index of the first true slot of each lane, or the number of slots if all are false."""
     return np.where(np.any(beyond, axis=0), np.argmax(beyond, axis=0), len(beyond))

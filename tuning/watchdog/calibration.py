@@ -1,9 +1,9 @@
 """Calibration of the limits of a gain file from recorded runs.
 
-The scenarios of a sweep's store are run again and recorded. A run is good if no contact's error exceeds the
-sweep's limit. The watchdog's expected restitution is fitted to some of the runs; the limits are margins on
-the extreme signals of the good ones among them. The rates of false and missed alarms come from the other
-runs, with exact intervals and a verdict.
+The scenarios of a sweep are simulated again and recorded. A run is good if no restitution error of its
+contacts exceeds the sweep's limit. Some of the runs determine the watchdog's expected restitution and the
+limits, which are the extreme signals of the good runs times a margin. The other runs determine the rates of
+false and missed alarms, with exact intervals and a verdict.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,28 +37,23 @@ from tuning.watchdog.recording import LANES_PER_RECORDING, ScenarioSelection, re
 from tuning.watchdog.signal_extremes import SignalExtremes
 from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
-LIMIT_MARGIN = 1.5  # factor on the extreme signals of good runs
-FITTED_RUNS = 2048  # runs that suffice for the fit; 3/4 to 15/16 of all runs remain for the rates
-MIN_FORCE_LIMIT_SHARE = 0.02  # least limit on forces, as a share of the largest force reading
-DEFAULT_DRAWS = 2048  # draws without a store; they bound false alarms if a third of the runs is good
-DEFAULT_ERROR_LIMIT = 0.01  # limit of the restitution error [1] if no sweep states one
-MAX_BAD_TICKS_IN_A_ROW = 3  # bad readings, missed ticks or limited rates that are allowed in a row [ticks]
+LIMIT_MARGIN = 1.5  # limit divided by the extreme signal of good runs [1]
+FITTED_RUNS = 2048  # number of runs that determine the limits, but 1/16 to 1/4 of all runs
+MIN_FORCE_LIMIT_SHARE = 0.02  # smallest limit of a force, divided by the largest force reading [1]
+DEFAULT_DRAWS = 2048  # number of draws without a sweep; enough for the rate of false alarms if 1/3 are good
+DEFAULT_ERROR_LIMIT = 0.01  # limit of the restitution error without a sweep [1]
+MAX_BAD_TICKS_IN_A_ROW = 3  # largest number of successive ticks with a bad reading, a miss or a limited rate
 TARE_DURATION = 0.1  # duration of the tare [s]
-FREE_APPROACH_TIME = (
-    0.005  # time of free approach [s] that, with the sensor's error, defines the free distance
-)
-MIN_BALANCE_LIMIT = (
-    1e-6  # least limit of the energy balance over the approach's energy [1], far above rounding errors
-)
-SUFFICIENT_FIT_ERROR = 0.01  # rms error of a sufficient expectation over the limit [1]
+FREE_APPROACH_TIME = 0.005  # time before a contact in which the mechanism is not in free flight [s]
+MIN_BALANCE_LIMIT = 1e-6  # smallest limit of the relative energy balance [1]; far above rounding errors
+SUFFICIENT_FIT_ERROR = 0.01  # rms error of a sufficient fit of the restitution, divided by the limit [1]
 
 
 class Calibration(NamedTuple):
-    """Limits of a gain file, and the watchdog's rates of alarm."""
+    """Calibrated limits of a gain file, and the watchdog's alarm rates with these limits."""
 
-    # by name [SI units], all of `jaxhil.rig.limits.LIMITS`; None for no limit
-    limits: dict[str, float | None]
-    rates: dict[str, Any]  # rates of the watchdog's alarms under these limits, as plain data
+    limits: dict[str, float | None]  # limits of `jaxhil.rig.limits.LIMITS` by name [SI units]; None: no limit
+    rates: dict[str, Any]  # alarm rates and verdict, as JSON data
 
 
 def calibrate(
@@ -72,24 +67,25 @@ def calibrate(
     progress: Callable[[int], None] = lambda runs: None,
     faulty: int = 0,
 ) -> Calibration:
-    """Calibrate the limits of a gain file, and evaluate the watchdog's rates of false and missed alarms.
+    """Calibrate the limits of a gain file, and estimate the watchdog's rates of false and missed alarms.
 
     Args:
-        loaded: the gain file.
-        store: sweep of that gain file whose scenarios are run again; None: draws of its uncertainty.
-        scenarios: number of scenarios; by default all of the store, or 2048 draws.
-        limit: limit of the restitution error [1]; by default the store's, else 0.01.
-        lanes: number of scenarios that run at a time.
-        replaced: limits that replace the calibrated ones, also for the rates.
-        allowed: largest acceptable rates.
-        progress: called with the number of further runs that are complete.
-        faulty: number of scenarios of every injected fault (`tuning.watchdog.fault_injection`); 0: no faults.
+        loaded: gain file.
+        store: sweep with this gain file, whose scenarios are simulated again. None: draw new scenarios.
+        scenarios: number of scenarios. Default: all scenarios of the sweep, or 2048 draws.
+        limit: limit of the restitution error [1]. Default: the limit of the sweep, or 0.01.
+        lanes: number of scenarios that are simulated together.
+        replaced: limits that replace the calibrated limits, also in the estimation of the rates.
+        allowed: largest acceptable alarm rates.
+        progress: callback, called with the number of runs that have been completed since the last call.
+        faulty: number of scenarios for each injected fault (`tuning.watchdog.fault_injection`). 0: inject no
+            faults.
 
     Returns:
-        The limits, and the rates with their verdict.
+        The limits, and the alarm rates with a verdict.
 
     Raises:
-        InputError: if the store is of another gain file or holds fewer scenarios, or if no run ends.
+        InputError: If the sweep has another gain file or fewer scenarios, or if no run ends.
     """
     chosen = _choose_scenarios(loaded, store, scenarios)
     limit = _error_limit(limit, store)
@@ -103,7 +99,7 @@ def calibrate(
     good = find_good_runs(runs, limit) & fitted
     used = good if np.any(good) else np.all(runs.status == OK, axis=0) & fitted
     if not np.any(used):
-        raise InputError("limits: found no run all of whose contacts end, expected gains with which they do")
+        raise InputError("limits: found no run in which all contacts end: tune better gains first")
     expectation = fit_reached_contacts(runs, limit, rules.mass, fitted)
     margin = choose_restitution_margin(runs, expectation, limit, rules.mass, fitted, allowed.false_alarms)
     limits = compute_guard_limits(loaded, runs, used, rules, free_distance) | expectation.limits()
@@ -146,12 +142,15 @@ def _error_limit(limit: float | None, store: SweepStore | None) -> float:
 
 
 def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
-    """Return the rules of the watchdog's audit, and `free_distance` [m], from the mechanism alone."""
+    """Compute from the mechanism the parameters of the watchdog's audit, and the free distance [m].
+
+    The mechanism counts as in free flight if it is farther than the free distance from every surface.
+    """
     mechanism = loaded.mechanism
     rig = mechanism.rig
     force, position, period = rig.force_sensor, rig.position_sensor, rig.control_period
     drawn = _find_largest_draws(loaded)
-    # This is the time that the loop waits for the force to die out, at the largest delays of all draws.
+    # Time that the simulated loop waits for the force to decay, with the largest delays of all draws.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
     mass = mechanism.bodies.mass
     noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"]
@@ -172,7 +171,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
 def fit_reached_contacts(
     runs: EvaluatedRuns, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
 ) -> Expectation:
-    """Fit the expected restitution to the contacts reached in the chosen runs."""
+    """Fit the expected restitution to the contacts that the rig would reach in the chosen runs."""
     use = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     run = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
     features = ContactFeatures(*(leaf[use] for leaf in extract_features(runs.audited)))
@@ -186,7 +185,7 @@ def compute_guard_limits(
     rules: AuditRules,
     free_distance: float,
 ) -> dict[str, float | None]:
-    """Return the limits of readings and commands, with margins on the extent of the runs `used`."""
+    """Return the limits of readings and commands: extreme signals of the runs `used`, times a margin."""
     extent = SignalExtremes(*(leaf[used] for leaf in runs.extent))
     rig, period = loaded.mechanism.rig, rules.period
     most = {name: float(np.max(getattr(extent, name))) for name in SignalExtremes._fields}
@@ -232,14 +231,15 @@ def compute_guard_limits(
 
 
 def _compute_balance_limit(runs: EvaluatedRuns, used) -> float:
-    """Return the limit of the energy balance [1] from the runs `used`, at least `MIN_BALANCE_LIMIT`."""
+    """Return the limit of the relative energy balance [1], calibrated on the runs `used`."""
     return max(MIN_BALANCE_LIMIT, LIMIT_MARGIN * float(np.nanmax(runs.audited.imbalance[:, used])))
 
 
 def _widen_range(low: float, high: float, clearance: float) -> tuple[float | None, float]:
-    """Widen a range of positions [m], which includes the gap between two surfaces, by half on either side.
+    """Widen a range of positions [m] on both sides by half its width.
 
-    With one surface there is no lower limit, since the simulation does not show where an approach starts.
+    With two surfaces, the range includes the gap between them. With one surface there is no lower limit,
+    because an approach on the rig may start farther away than in the simulation.
     """
     if np.isinf(clearance):
         return None, high + (LIMIT_MARGIN - 1) * (high - low)
@@ -249,7 +249,10 @@ def _widen_range(low: float, high: float, clearance: float) -> tuple[float | Non
 
 
 def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
-    """Return the largest possible draws of the quantities that determine rules and limits."""
+    """Return the largest values that the uncertainty permits for the quantities that determine limits.
+
+    The keys are names of quantities, the values are in SI units.
+    """
     scenarios = build_scenarios(loaded.mechanism, draw_extremes(loaded.mechanism))
     force, position = scenarios.force_sensor, scenarios.position_sensor
     largest = {
@@ -269,7 +272,10 @@ def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _has_status(loaded: LoadedGains) -> bool:
-    """Return whether the law has a status on the rig, by which it opens a contact at any surface position."""
+    """Return whether the compensator reports a status on the rig.
+
+    With a status, the watchdog detects a contact by the force command, wherever the surface is.
+    """
     law = COMPENSATORS.get(loaded.compensator)
     if law is None:
         return False
@@ -281,7 +287,10 @@ def _has_status(loaded: LoadedGains) -> bool:
 def _choose_scenarios(
     loaded: LoadedGains, store: SweepStore | None, scenarios: int | None
 ) -> ScenarioSelection:
-    """Return the scenarios to run; raise `InputError` for another gain file's store or an invalid number."""
+    """Return the scenarios to simulate.
+
+    Raise `InputError` if the sweep has another gain file, or if the number of scenarios is out of range.
+    """
     if scenarios is not None and scenarios < 2:
         raise InputError(f"--scenarios: found {scenarios}, expected 2 or more")
     if store is None:
@@ -292,14 +301,14 @@ def _choose_scenarios(
         raise InputError(f"{store.folder}: gains_sha256: found {found}..., expected {allowed}...")
     stored = count_stored_scenarios(store)
     if scenarios is not None and scenarios > stored:
-        raise InputError(f"--scenarios: found {scenarios}, expected at most the store's {stored}")
+        raise InputError(f"--scenarios: found {scenarios}, expected at most {stored} (those of the sweep)")
     return ScenarioSelection(manifest.sampling, manifest.seed, scenarios or stored)
 
 
 def count_stored_scenarios(store: SweepStore) -> int:
-    """Return the number of scenarios of a sweep, which may have stopped early.
+    """Return the number of complete scenarios of a sweep, which may have stopped early.
 
-    Raise `InputError` if a part is damaged.
+    Raise `InputError` if a chunk is damaged.
     """
     stored = 0
     for part in range(store.manifest.parts):

@@ -1,9 +1,10 @@
-"""Fit of the watchdog's expected restitution of a contact to recorded contacts.
+"""Fit of the watchdog's expected restitution to recorded contacts.
 
-It is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 and z = b/(2 sqrt(k M)), k and b as the watchdog
-estimates them (`jaxhil.rig.watchdog`). An unknown delay delta of the force changes k only by a factor
-cos(omega delta), but b by -k delta, which the rig cannot distinguish from damping. So b is used only if it
-improves the expectation of contacts that were not fitted.
+The expected restitution is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 and z = b/(2 sqrt(k M)). Here v
+is the approach speed, M the equivalent mass, and k and b are the stiffness and damping that the watchdog
+estimates (`jaxhil.rig.watchdog`). An unknown delay delta of the force changes the estimate of k only by the
+factor cos(omega delta), but the estimate of b by -k delta. The rig cannot distinguish this from damping.
+Therefore b is used only if it reduces the error for contacts that were not part of the fit.
 """
 
 from collections.abc import Sequence
@@ -13,25 +14,25 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 POLYNOMIAL_TERMS = ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
-# Sets of terms, of which the first one that is sufficient, or about as good as the best, is selected.
+# Sets of terms, simplest first. `fit_expectation` selects the first sufficient set.
 TERM_SETS = (("1",), ("1", "p", "pp", "ppp"), POLYNOMIAL_TERMS[:7], POLYNOMIAL_TERMS)
-MAX_RESIDUAL_RATIO = 1.25  # rms residual over the best one, up to which a set is as good as the best
-RANGE_EXTENSION = 0.1  # share of a range by which it is widened on each side
-SINGULAR_VALUE_CUTOFF = 1e-9  # relative singular value below which the fit is singular
+MAX_RESIDUAL_RATIO = 1.25  # rms residual of a sufficient set, divided by that of the best set [1]
+RANGE_EXTENSION = 0.1  # extension of a fitted range on each side, divided by its width [1]
+SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the largest, count as 0 [1]
 
 
 class Expectation(NamedTuple):
     """Fitted polynomial of the expected restitution."""
 
-    coefficients: dict[str, float]  # by term [1]
+    coefficients: dict[str, float]  # coefficient of each of `POLYNOMIAL_TERMS` [1]
     stiffness: float  # reference stiffness k_0 [N/m]
     velocity: float  # reference speed v_0 [m/s]
-    softness: tuple[float, float]  # fitted range of p
-    speed: tuple[float, float]  # fitted range of w
-    loss: tuple[float, float]  # fitted range of z
+    softness: tuple[float, float]  # range of p in which the polynomial is valid [1]
+    speed: tuple[float, float]  # range of w in which the polynomial is valid [1]
+    loss: tuple[float, float]  # range of z in which the polynomial is valid [1]
 
     def limits(self) -> dict[str, float]:
-        """Return the expectation as limits of a gain file."""
+        """Return coefficients, reference values and ranges as limits of a gain file, by name."""
         ranges = {"softness": self.softness, "speed": self.speed, "loss": self.loss}
         return {
             "reference_stiffness": self.stiffness,
@@ -43,15 +44,15 @@ class Expectation(NamedTuple):
 
 
 class ContactFeatures(NamedTuple):
-    """Estimates of contacts from which the restitution is expected."""
+    """Inputs of the expected restitution, for many contacts."""
 
-    stiffness: Float[np.ndarray, "*shape"]  # estimate [N/m]; 0 if not observable
-    damping: Float[np.ndarray, "*shape"]  # estimate [N s/m]
+    stiffness: Float[np.ndarray, "*shape"]  # estimated stiffness [N/m]; 0 if not observable
+    damping: Float[np.ndarray, "*shape"]  # estimated damping [N s/m]
     velocity: Float[np.ndarray, "*shape"]  # approach speed [m/s]
 
 
 def expected_restitution(expectation: Expectation, features: ContactFeatures, mass: float) -> np.ndarray:
-    """Return the watchdog's expected restitution, computed as in `jaxhil.rig.watchdog.Expectation`."""
+    """Return the expected restitution of contacts [1], as `jaxhil.rig.watchdog.Expectation` computes it."""
     p, w, z = _normalise_features(features, expectation.stiffness, expectation.velocity, mass)
     p = _clip_to_range(np.where(features.stiffness > 0, p, np.inf), expectation.softness)
     z = _clip_to_range(np.where(features.stiffness > 0, z, -np.inf), expectation.loss)
@@ -66,14 +67,22 @@ def fit_expectation(
     reference: Float[np.ndarray, "contacts"],
     run: np.ndarray,
     mass: float,
-    enough: float,
+    sufficient: float,
 ) -> Expectation:
-    """Fit the restitution e* (`reference`) of contacts by least squares; `run` is the number of each's run.
+    """Fit the expected restitution to the ideal restitution e* of contacts, by least squares.
 
-    The simplest set of `TERM_SETS` is used whose rms residual on runs left out of the fit is at most
-    `enough`, or about the best; it is then fitted to all runs. Simple sets are robust: a feature that hardly
-    improves the fit over the sweep may be wrong for a rig that differs from the sweep. If no contact has a
-    stiffness, the expectation is the mean.
+    Every set of `TERM_SETS` is first fitted to half of the runs. The simplest set is selected whose rms
+    residual in the other half is at most `sufficient`, or at most `MAX_RESIDUAL_RATIO` times that of the best
+    set. The selected set is fitted to all runs. A simple set is preferred, because a term that hardly
+    improves the fit may be wrong on a rig that differs from the sweep. If no contact has a stiffness, the
+    expectation is the mean of e*.
+
+    Args:
+        features: stiffness, damping and approach speed of the contacts.
+        reference: restitution e* of the ideal contacts, (contacts,).
+        run: number of the run to which each contact belongs, (contacts,).
+        mass: equivalent mass [kg].
+        sufficient: rms residual [1] at which a set of terms is sufficient.
     """
     observable = features.stiffness > 0
     if not np.any(observable):
@@ -86,9 +95,10 @@ def fit_expectation(
     p, w, z = _normalise_features(features, stiffness, velocity, mass)
     columns = np.stack([np.ones_like(p), p, p * p, p**3, w, w * w, p * w, z, z * z, p * z, w * z], axis=1)
     fitted = np.isin(run % 4, (0, 1))
-    residuals = [_compute_left_out_rms(columns, terms, reference, fitted) for terms in TERM_SETS]
-    enough = max(enough, MAX_RESIDUAL_RATIO * min(residuals))
-    terms = next(terms for terms, residual in zip(TERM_SETS, residuals, strict=True) if residual <= enough)
+    residuals = [_compute_validation_rms(columns, terms, reference, fitted) for terms in TERM_SETS]
+    sufficient = max(sufficient, MAX_RESIDUAL_RATIO * min(residuals))
+    candidates = zip(TERM_SETS, residuals, strict=True)
+    terms = next(terms for terms, residual in candidates if residual <= sufficient)
     solved = _solve_least_squares(columns, terms, reference, np.ones(len(p), bool))
     coefficients = {
         **dict.fromkeys(POLYNOMIAL_TERMS, 0.0),
@@ -97,8 +107,8 @@ def fit_expectation(
     return Expectation(coefficients, stiffness, velocity, *(_find_range(share) for share in (p, w, z)))
 
 
-def _compute_left_out_rms(columns, terms, reference, fitted: Bool[np.ndarray, "contacts"]) -> float:
-    """Return the root mean square residual of the contacts that are not `fitted`."""
+def _compute_validation_rms(columns, terms, reference, fitted: Bool[np.ndarray, "contacts"]) -> float:
+    """Fit a set of terms to the contacts `fitted`; return the rms residual of the other contacts."""
     if not np.any(fitted) or np.all(fitted):
         return 0.0 if len(terms) == 1 else np.inf
     solved = _solve_least_squares(columns, terms, reference, fitted)
@@ -108,9 +118,9 @@ def _compute_left_out_rms(columns, terms, reference, fitted: Bool[np.ndarray, "c
 
 def _solve_least_squares(columns, terms, reference, fitted) -> np.ndarray:
     chosen = columns[fitted][:, _find_term_indices(terms)]
-    size = np.linalg.norm(chosen, axis=0)
-    size[size == 0] = 1.0
-    return np.linalg.lstsq(chosen / size, reference[fitted], rcond=SINGULAR_VALUE_CUTOFF)[0] / size
+    norms = np.linalg.norm(chosen, axis=0)
+    norms[norms == 0] = 1.0
+    return np.linalg.lstsq(chosen / norms, reference[fitted], rcond=SINGULAR_VALUE_CUTOFF)[0] / norms
 
 
 def _find_term_indices(terms: Sequence[str]) -> list[int]:
@@ -118,7 +128,7 @@ def _find_term_indices(terms: Sequence[str]) -> list[int]:
 
 
 def _normalise_features(features: ContactFeatures, stiffness: float, velocity: float, mass: float):
-    """Return p, w and z."""
+    """Return the dimensionless variables p, w and z of the polynomial, each (contacts,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         p = np.sqrt(stiffness / features.stiffness) - 1
         z = features.damping / (2 * np.sqrt(features.stiffness * mass))
@@ -131,5 +141,5 @@ def _find_range(values: np.ndarray) -> tuple[float, float]:
 
 
 def _clip_to_range(values: np.ndarray, span: tuple[float, float]) -> np.ndarray:
-    # The negated comparison also maps NaN to the low end.
+    # The negated comparison also maps NaN to the lower bound.
     return np.where(~(values > span[0]), span[0], np.where(values < span[1], values, span[1]))

@@ -1,15 +1,15 @@
-"""Share of missed alarms in runs with an injected fault that makes the error just too large.
+"""Rate of missed alarms in runs with injected faults, whose restitution errors are slightly above the limit.
 
-With good gains an error beyond the limit is so rare that random draws cannot bound the missed share. So a
-fault that neither controller nor watchdog knows is injected, and scaled in every scenario until the
-restitution error is between 1 and `MAX_FAULT_ERROR` times the limit. This is the hardest case, since a larger
-error is farther from the expected restitution. The rate is conditional on such a fault, not the probability
-that one occurs. Every fault has fresh and independent scenarios, so that the exact binomial interval is
-valid.
+With good gains, errors beyond the limit are so rare that random draws cannot bound the rate of missed alarms.
+Therefore a fault is injected that neither controller nor watchdog knows. In every scenario, its size is
+increased until the restitution error is between 1 and `MAX_FAULT_ERROR` times the limit. This is the hardest
+case: a larger error differs more from the expected restitution. The rate is conditional on such a fault, and
+not the probability that the fault occurs. All scenarios are independent of each other and of the calibration,
+so that the exact binomial interval is valid.
 
-A scenario does not count if its error exceeds the limit without the fault, or if no fault of up to
-`MAX_FAULT_MULTIPLE` gives an error within the band. A fault that makes fewer than half of the scenarios bad
-is reported but does not count, since the gains are insensitive to it.
+A scenario is not used if its error exceeds the limit without the fault, or if no size of the fault up to
+`MAX_FAULT_MULTIPLE` causes such an error. If fewer than half of the scenarios are used, the gains are
+insensitive to the fault: its rate is reported, but does not count for the verdict.
 """
 
 import math
@@ -35,42 +35,42 @@ from tuning.watchdog.audit import AuditRules, find_first_true
 from tuning.watchdog.expectation import Expectation
 from tuning.watchdog.recording import record_runs
 
-MAX_FAULT_ERROR = 1.25  # largest error of a fault run over the limit [1]
-MIN_BAD_SHARE = 0.5  # least share of scenarios that a fault must make bad in order to count
-FIRST_SCENARIO_INDEX = 2**31  # index of the first scenario; lower ones are for sweeps and calibration
-MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS = 64, 4096  # least and largest number of scenarios of a fault
-MAX_FAULT_MULTIPLE = (
-    32.0  # largest fault over the delay that alone causes an error of the limit, uncompensated
-)
+MAX_FAULT_ERROR = 1.25  # largest restitution error of a used scenario, divided by the limit [1]
+MIN_BAD_SHARE = 0.5  # smallest fraction of used scenarios for a fault that counts for the verdict [1]
+FIRST_SCENARIO_INDEX = 2**31  # index of the first scenario; sweeps and calibration use lower indices
+MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS = 64, 4096  # bounds on the number of scenarios for a fault
+# Largest size of a fault, in multiples of the uncompensated delay whose restitution error equals the limit.
+MAX_FAULT_MULTIPLE = 32.0
+# Sizes that are tried in this order, before bisection.
 FAULT_MULTIPLES = tuple(MAX_FAULT_MULTIPLE / 2.0**step for step in range(6, -1, -1))
-BISECTION_STEPS = 4  # bisections of the interval between two steps of the ladder
-MAX_DELAY_SHARE = 0.5  # longest injected delay over the ideal contact's duration [1]
+BISECTION_STEPS = 4  # number of bisections between two successive sizes of `FAULT_MULTIPLES`
+MAX_DELAY_SHARE = 0.5  # longest injected delay, divided by the duration of the ideal contact [1]
 
 FaultSizes = Float[np.ndarray, "lanes"]
 
 
 class InjectedFault(NamedTuple):
-    """Fault that the controller does not know."""
+    """Fault that is injected into the simulation, and that the controller does not know."""
 
-    name: str
-    meaning: str  # description for messages
-    unit: str  # unit of its size
+    name: str  # name of the fault in files
+    meaning: str  # description of the fault for messages
+    unit: str  # unit of the fault's size
 
 
-FORCE_DELAY_FAULT = InjectedFault("force_delay", "the force measured later than told", "s")
-POSITION_DELAY_FAULT = InjectedFault("position_delay", "the position measured later than told", "s")
-SIMULATOR_DELAY_FAULT = InjectedFault("simulator_delay", "the motion simulator later than told", "s")
-GAIN_FAULT = InjectedFault("gains", "the gains nearer to no compensation", "1")
+FORCE_DELAY_FAULT = InjectedFault("force_delay", "an unmodelled delay of the force sensor", "s")
+POSITION_DELAY_FAULT = InjectedFault("position_delay", "an unmodelled delay of the position sensor", "s")
+SIMULATOR_DELAY_FAULT = InjectedFault("simulator_delay", "an unmodelled delay of the motion simulator", "s")
+GAIN_FAULT = InjectedFault("gains", "gains shifted towards no compensation", "1")
 INJECTED_FAULTS = (FORCE_DELAY_FAULT, POSITION_DELAY_FAULT, SIMULATOR_DELAY_FAULT, GAIN_FAULT)
 
 
 class _FaultCase(NamedTuple):
-    """Fault with its scenarios and sizes."""
+    """Injected fault, the scenarios for it, and its range of sizes."""
 
     fault: InjectedFault
-    scenarios: Scenario
-    unit: float  # size of one multiple, in the fault's unit
-    most: float  # largest size, in the fault's unit
+    scenarios: Scenario  # scenarios without the fault
+    unit: float  # size of a fault with the multiple 1 [the fault's unit]
+    most: float  # largest size [the fault's unit]
 
 
 def compute_fault_rates(
@@ -84,24 +84,24 @@ def compute_fault_rates(
     seed: int,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> list[dict[str, Any]]:
-    """Return the share of missed alarms for every fault, with an exact 95 % interval, as plain data.
+    """Estimate the rate of missed alarms for each fault, with an exact 95 % interval, as JSON data.
 
     Args:
-        loaded: the gain file.
-        rules: rules of the watchdog's audit.
-        free_distance: free distance [m] of the guards.
+        loaded: gain file.
+        rules: parameters of the watchdog's audit.
+        free_distance: distance from the surfaces beyond which the mechanism counts as in free flight [m].
         expectation: expected restitution of the watchdog.
         limits: limits of the gain file by name.
-        limit: limit of the restitution error [1], beyond which a run must be stopped.
+        limit: restitution error [1] above which a run must be stopped.
         number: number of scenarios for each fault.
         seed: seed of the scenarios.
-        progress: called with the number of further runs that are complete.
+        progress: callback, called with the number of runs that have been completed since the last call.
     """
     cases = _build_cases(loaded, limit, number, seed)
     loop = _build_widest_loop(loaded, cases)
     rates = []
     for case in cases:
-        sizes, usable = _find_just_bad_faults(loop, loaded, case, limit)
+        sizes, usable = _find_critical_sizes(loop, loaded, case, limit)
         rates.append(
             _compute_missed_rate(
                 loop, loaded, case, sizes, usable, rules, free_distance, expectation, limits, limit
@@ -112,9 +112,10 @@ def compute_fault_rates(
 
 
 def count_fault_scenarios(allowed: float) -> int:
-    """Return the number of scenarios of a fault that decides whether at most the share `allowed` is missed.
+    """Return a number of scenarios that decides whether the rate of missed alarms is at most `allowed`.
 
-    It is twice the number for no missed alarm, to allow for a few missed alarms and unusable scenarios.
+    The result is twice the number that is needed without any missed alarm. This allows for a few missed
+    alarms and for scenarios that cannot be used.
     """
     if not 0 < allowed < 1:
         return MIN_FAULT_SCENARIOS if allowed >= 1 else MAX_FAULT_SCENARIOS
@@ -127,9 +128,9 @@ def count_fault_scenarios(allowed: float) -> int:
 
 
 def _build_cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> list[_FaultCase]:
-    """Return the faults that the compensator can have, each with fresh scenarios."""
+    """Return the faults that can affect the compensator, each with scenarios of its own."""
     cases, duration = [], _compute_ideal_duration(loaded)
-    # e = exp(pi omega tau/2) - 1 of a net delay tau, and pi/omega is the duration.
+    # A net delay tau causes the error exp(pi omega tau/2) - 1, and a contact lasts pi/omega.
     delay = 2 * duration / math.pi**2 * math.log1p(limit)
     for index, fault in enumerate(INJECTED_FAULTS):
         if fault == GAIN_FAULT and not _find_neutral_gains(loaded):
@@ -145,7 +146,7 @@ def _build_cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> l
 
 
 def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
-    """Return the neutral values of the gains that have one and differ from it."""
+    """Return the neutral values, by name, of the gains that differ from their neutral value."""
     return {
         gain.name: float(gain.neutral)
         for gain in COMPENSATORS[loaded.compensator].gains
@@ -154,7 +155,7 @@ def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _compute_ideal_duration(loaded: LoadedGains) -> float:
-    """Return the duration [s] of the first nominal ideal contact; half an oscillation if it never ends."""
+    """Return the duration [s] of the first nominal ideal contact, or half a period if it does not end."""
     first = summarise_mechanism(loaded.mechanism).contacts[0]
     return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
 
@@ -162,7 +163,7 @@ def _compute_ideal_duration(loaded: LoadedGains) -> float:
 def _inject_fault(
     loaded: LoadedGains, case: _FaultCase, sizes: FaultSizes
 ) -> tuple[Mapping[str, Any], Scenario]:
-    """Return gains and scenarios with the fault of these sizes."""
+    """Return gains and scenarios into which the fault is injected, with one size for each scenario."""
     scenarios, fault = case.scenarios, case.fault
     gains = {name: np.full(len(sizes), value) for name, value in loaded.gains.items()}
     if fault == GAIN_FAULT:
@@ -180,7 +181,7 @@ def _inject_fault(
 
 
 def _build_widest_loop(loaded: LoadedGains, cases: list[_FaultCase]) -> Any:
-    """Return the loop that serves every fault at its largest."""
+    """Return a loop whose delay lines are long enough for the largest size of every fault."""
     largest = [
         _inject_fault(
             loaded, case, _limit_sizes(case, np.full(count_lanes(case.scenarios), MAX_FAULT_MULTIPLE))
@@ -192,14 +193,17 @@ def _build_widest_loop(loaded: LoadedGains, cases: list[_FaultCase]) -> Any:
 
 
 def _limit_sizes(case: _FaultCase, multiples: FaultSizes) -> FaultSizes:
-    """Return the sizes of the multiples, limited to the largest size."""
+    """Convert multiples to sizes in the fault's unit, at most the largest size."""
     return np.minimum(multiples * case.unit, case.most)
 
 
-def _find_just_bad_faults(
+def _find_critical_sizes(
     loop: Any, loaded: LoadedGains, case: _FaultCase, limit: float
 ) -> tuple[FaultSizes, np.ndarray]:
-    """Return per scenario the size with an error just beyond the limit, and whether there is such a size."""
+    """Find for each scenario a size of the fault whose restitution error is slightly above the limit.
+
+    Return the sizes, and whether a scenario has such a size and can be used, both (lanes,).
+    """
     number = count_lanes(case.scenarios)
 
     def errors(multiples: Any) -> FaultSizes:
@@ -208,7 +212,7 @@ def _find_just_bad_faults(
         size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.wanted, np.inf, 0.0))
         return np.max(size, axis=0)
 
-    # Multiples whose error is within the limit and beyond it bracket the searched size.
+    # The searched size lies between the multiples `below` (error within the limit) and `above` (beyond it).
     below, above = np.zeros(number), np.full(number, np.nan)
     beyond = np.full(number, np.inf)
     usable = errors(np.zeros(number)) <= limit
@@ -240,7 +244,7 @@ def _compute_missed_rate(
     limits: Mapping[str, float | None],
     limit: float,
 ) -> dict[str, Any]:
-    """Return the rate of missed alarms of a fault and its statistics, as plain data."""
+    """Estimate the rate of missed alarms for a fault with the given sizes, as JSON data."""
     gains, scenarios = _inject_fault(loaded, case, sizes)
     chunk = record_runs(loop, loaded._replace(gains=gains), scenarios)  # pyright: ignore[reportArgumentType]
     runs = evaluate_runs(chunk, rules, free_distance)

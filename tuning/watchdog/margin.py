@@ -1,9 +1,10 @@
-"""Restitution margin: the largest difference from the expected restitution without an alarm.
+"""Choice of the restitution margin: the largest difference from the expected restitution without an alarm.
 
-If the expectation is accurate, the margin plus its error is below the limit, so that no bad run is missed. If
-damping and delay are both unknown, the expectation's error is too large for that (an unknown delay looks like
-damping, `tuning.watchdog.expectation`), and good runs would be stopped. The margin is then widened until they
-pass, and `tuning.watchdog.alarms.noticed_from` states which errors are still noticed.
+If the expected restitution is accurate, the sum of the margin and the error of the expectation is below the
+limit, so that no bad run is missed. If neither damping nor delay is known, the error of the expectation is
+too large for this, because an unknown delay looks like damping (`tuning.watchdog.expectation`). Then a small
+margin would stop good runs. The margin is widened until good runs pass, and
+`tuning.watchdog.alarms.find_detectable_error` computes which errors are still detected.
 """
 
 from typing import NamedTuple
@@ -22,17 +23,17 @@ from tuning.watchdog.alarms import (
 )
 from tuning.watchdog.expectation import Expectation, expected_restitution
 
-UNSEEN_RUN_FACTOR = 1.25  # factor on the largest value among some runs, as a bound for other runs
-# Least margin, and margin of a good expectation, over the limit [1].
+UNSEEN_RUN_FACTOR = 1.25  # bound for other runs, divided by the largest value in the used runs [1]
+# Smallest margin, and margin for an accurate expectation, divided by the limit [1].
 MIN_MARGIN_SHARE, USUAL_MARGIN_SHARE = 0.25, 0.75
 
 
 class RestitutionMargin(NamedTuple):
-    """Restitution margin and the runs that determine it."""
+    """Restitution margin, and the runs from which it was computed."""
 
-    value: float  # margin [1]
-    widened_from: float | None  # margin against missed alarms only [1]; None if it was not widened
-    runs: Bool[np.ndarray, "lanes"]  # runs that determine the margin
+    value: float  # restitution margin [1]
+    widened_from: float | None  # margin before it was widened for good runs [1]; None if it was not widened
+    runs: Bool[np.ndarray, "lanes"]  # whether each run was used
 
 
 def choose_restitution_margin(
@@ -43,17 +44,26 @@ def choose_restitution_margin(
     fitted: Bool[np.ndarray, "lanes"],
     false_alarms: float,
 ) -> RestitutionMargin:
-    """Return the restitution margin.
+    """Choose the restitution margin.
 
-    It is `USUAL_MARGIN_SHARE` times the limit, less if the expectation's error exceeds the rest, but so large
-    that at most the share `false_alarms` of good runs is stopped. An error e - e* beyond the limit is
-    detected if the expectation's error is below limit - margin. A small share of good runs needs more runs
-    than the fit of the expectation; in that case every second run is used besides the `fitted` ones.
+    The margin is `USUAL_MARGIN_SHARE` times the limit. It is smaller if the error of the expectation exceeds
+    the rest of the limit, because an error e - e* beyond the limit is detected only if the expectation's
+    error is below limit - margin. It is larger if it would otherwise stop more than the fraction
+    `false_alarms` of good runs. Then every second run is used in addition to the `fitted` runs, because a
+    small fraction needs many runs.
+
+    Args:
+        runs: recorded runs.
+        expectation: expected restitution of the watchdog.
+        limit: limit of the restitution error [1].
+        mass: equivalent mass [kg].
+        fitted: runs to which the expectation was fitted, (lanes,).
+        false_alarms: largest acceptable rate of false alarms [1].
     """
     expected = expected_restitution(expectation, extract_features(runs.audited), mass)
     difference = runs.audited.restitution - expected
     use = find_reached_contacts(runs, limit) & (runs.status == OK) & fitted
-    # This includes the difference between the audit's and the loop's restitution.
+    # The deviation includes the difference between the restitution in the audit and in the simulation.
     deviation = np.abs((difference - runs.error)[use])
     narrow = float(
         np.clip(
@@ -69,16 +79,17 @@ def choose_restitution_margin(
         return RestitutionMargin(narrow, None, fitted)
     used = fitted | (runs.index % 2 == 1)
     wide = furthest[good & used]
-    # The largest of n values is exceeded by a further one with probability 1/(n + 1).
+    # A further value exceeds the largest of n values with probability 1/(n + 1).
     few = (len(wide) + 1) * false_alarms < 1
     margin = max(narrow, (UNSEEN_RUN_FACTOR if few else 1.0) * _find_passing_margin(wide, false_alarms))
     return RestitutionMargin(margin, narrow if margin > narrow else None, used)
 
 
 def _find_passing_margin(furthest: Float[np.ndarray, "runs"], share: float) -> float:
-    """Return the least margin that, with 95 % confidence, at most a `share` of runs exceeds.
+    """Return the smallest margin that at most the fraction `share` of runs exceeds, with 95 % confidence.
 
-    With too few runs for that it is the largest of these runs.
+    `furthest` is the largest difference from the expected restitution in each run. If there are too few runs
+    for this confidence, return the largest of these differences.
     """
     if not len(furthest):
         return 0.0

@@ -1,7 +1,7 @@
-"""Recording of scenarios by index: readings and commands of the controller at every tick.
+"""Recording of the controller's readings and commands in every tick of many scenarios.
 
-Scenario i is that of a sweep with the same seed, sensor noise included. All chunks share one compiled
-program, and memory is bounded.
+Scenario i equals scenario i of a sweep with the same seed, including the sensor noise. The scenarios are
+recorded in chunks, which share one compiled program and limit the memory.
 """
 
 from collections.abc import Generator
@@ -20,13 +20,13 @@ from jaxhil.simulation.scenario import Scenario
 from tuning.sweeps.chunks import build_widest_loop
 from tuning.sweeps.draws import draw_scenarios
 
-LANES_PER_RECORDING = 1024  # scenarios recorded at a time
+LANES_PER_RECORDING = 1024  # number of scenarios that are recorded together, to limit the memory
 
 _compare_with_reference = jax.jit(compare_with_ideal, static_argnums=0)
 
 
 class ScenarioSelection(NamedTuple):
-    """Selection of scenarios 0 to `number` - 1."""
+    """Selection of the scenarios 0 to `number` - 1 of a sweep."""
 
     sampling: str  # sampling method (`tuning.sweeps.draws`)
     seed: int  # seed of the draws
@@ -34,7 +34,7 @@ class ScenarioSelection(NamedTuple):
 
 
 class RecordedSignals(NamedTuple):
-    """Signals of many lanes at every tick; between two surfaces all contacts are one run."""
+    """Signals of many scenarios (lanes) in every tick; with two surfaces, a run includes all contacts."""
 
     force: Float[np.ndarray, "ticks lanes"]  # measured force [N]
     position: Float[np.ndarray, "ticks lanes"]  # position of the numerical model [m]
@@ -42,38 +42,38 @@ class RecordedSignals(NamedTuple):
     measured: Float[np.ndarray, "ticks lanes"]  # measured position [m]
     command: Float[np.ndarray, "ticks lanes"]  # force command F_c [N]
     sent: Float[np.ndarray, "ticks lanes"]  # position command sent to the drives [m]
-    live: Bool[np.ndarray, "ticks lanes"]  # whether the lane's record has not ended
-    begins: Bool[np.ndarray, "ticks lanes"]  # whether a run begins
+    live: Bool[np.ndarray, "ticks lanes"]  # whether the record of the scenario contains this tick
+    begins: Bool[np.ndarray, "ticks lanes"]  # whether a run begins in this tick
 
 
 class RecordedContacts(NamedTuple):
-    """Results of the contacts."""
+    """Simulated restitution and status of every contact (slot) of every scenario (lane)."""
 
     restitution: Float[np.ndarray, "slots lanes"]  # restitution e [1]
     reference: Float[np.ndarray, "slots lanes"]  # restitution e* of the ideal contact [1]
-    status: Int[np.ndarray, "slots lanes"]  # as in `jaxhil.simulation.metrics`
+    status: Int[np.ndarray, "slots lanes"]  # status of the contact, as in `jaxhil.simulation.metrics`
 
     @property
     def error(self) -> Float[np.ndarray, "slots lanes"]:
-        """Return the restitution error [1]; NaN if the contact did not end."""
+        """Return the restitution error e - e* [1]; NaN if the contact did not end."""
         return np.where(self.status == OK, self.restitution - self.reference, np.nan)
 
 
 class RecordedRuns(NamedTuple):
-    """Recorded scenarios."""
+    """Scenarios, and the recorded signals and contacts of their runs."""
 
-    first: int  # index of the first lane's scenario
-    scenarios: Scenario
+    first: int  # index of the first scenario in the sweep
+    scenarios: Scenario  # parameters of the scenarios
     signals: RecordedSignals  # readings and commands of the controller
-    contacts: RecordedContacts  # results of the contacts
+    contacts: RecordedContacts  # restitution and status of the contacts
 
 
 def record_selection(
     loaded: LoadedGains, chosen: ScenarioSelection, lanes: int = LANES_PER_RECORDING
 ) -> Generator[RecordedRuns, None, None]:
-    """Record the chosen scenarios, `lanes` at a time; yield the chunks."""
+    """Simulate and record the chosen scenarios; yield chunks of `lanes` scenarios."""
     loop = build_widest_loop(loaded, works=False)
-    # A short last chunk is recorded with further scenarios, so that it needs no other program.
+    # Record further scenarios in a short last chunk, so that it can use the same compiled program.
     lanes = min(lanes, chosen.number)
     for first in range(0, chosen.number, lanes):
         _, scenarios = draw_scenarios(loaded.mechanism, chosen.sampling, chosen.seed, first, lanes)
@@ -83,7 +83,7 @@ def record_selection(
 
 
 def record_runs(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: int = 0) -> RecordedRuns:
-    """Record the runs of the scenarios under the loaded gains."""
+    """Simulate and record the scenarios with the loaded gains; `first` is the index of the first scenario."""
     metrics, record = record_ticks(loop, loaded.gains, scenarios)
     outcome = jax.device_get(_compare_with_reference(loop, scenarios, metrics))
     number = loaded.mechanism.approach.contacts
@@ -94,7 +94,7 @@ def record_runs(loop: Loop, loaded: LoadedGains, scenarios: Scenario, first: int
         )
     )
     ticks = np.arange(len(record.active))[:, None]
-    # A record ends with its last active tick; a pause between two contacts is part of it.
+    # A record ends with the last active tick, and includes the pauses between contacts.
     live = ticks <= np.max(np.where(record.active, ticks, -1), axis=0)
     force, position, velocity, measured, age = (np.asarray(leaf) for leaf in record.signals)
     begins = live & (age == 0)

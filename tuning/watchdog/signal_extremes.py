@@ -1,4 +1,4 @@
-"""Extreme values of the signals of recorded runs, from which limits of readings and commands are set."""
+"""Extreme values of the signals in recorded runs, which determine the limits of readings and commands."""
 
 from typing import NamedTuple
 
@@ -9,29 +9,36 @@ from tuning.watchdog.recording import RecordedSignals
 
 
 class SignalExtremes(NamedTuple):
-    """Extreme values of the signals of every run; all but the positions are at least 0."""
+    """Extreme values of the signals in every recorded scenario (lane)."""
 
-    reading: Float[np.ndarray, "lanes"]  # largest |force reading| [N]
-    measured_lowest: Float[np.ndarray, "lanes"]  # measured position [m]
-    measured_highest: Float[np.ndarray, "lanes"]  # measured position [m]
-    sent_lowest: Float[np.ndarray, "lanes"]  # position command [m]
-    sent_highest: Float[np.ndarray, "lanes"]  # position command [m]
-    command: Float[np.ndarray, "lanes"]  # largest |F_c| [N]
-    slew: Float[np.ndarray, "lanes"]  # fastest change of F_c [N/s]
-    start: Float[np.ndarray, "lanes"]  # largest |first command - measured position| of a run [m]
-    sent_speed: Float[np.ndarray, "lanes"]  # fastest change of the position command [m/s]
-    speed: Float[np.ndarray, "lanes"]  # fastest change of the desired position [m/s]
-    acceleration: Float[np.ndarray, "lanes"]  # fastest change of the desired velocity [m/s^2]
-    force_stuck: Float[np.ndarray, "lanes"]  # longest travel in contact with a constant force reading [m]
-    position_stuck: Float[np.ndarray, "lanes"]  # longest desired travel with a constant position reading [m]
-    flight_force: Float[np.ndarray, "lanes"]  # largest |force reading| in flight [N]
-    flight_spread: Float[np.ndarray, "lanes"]  # range of the force readings in flight [N]
+    reading: Float[np.ndarray, "lanes"]  # largest magnitude of the measured force [N]
+    measured_lowest: Float[np.ndarray, "lanes"]  # lowest measured position [m]
+    measured_highest: Float[np.ndarray, "lanes"]  # highest measured position [m]
+    sent_lowest: Float[np.ndarray, "lanes"]  # lowest position command [m]
+    sent_highest: Float[np.ndarray, "lanes"]  # highest position command [m]
+    command: Float[np.ndarray, "lanes"]  # largest magnitude of the force command F_c [N]
+    slew: Float[np.ndarray, "lanes"]  # largest rate of the force command [N/s]
+    # largest distance of a run's first position command from the measured position [m]
+    start: Float[np.ndarray, "lanes"]
+    sent_speed: Float[np.ndarray, "lanes"]  # largest rate of the position command [m/s]
+    speed: Float[np.ndarray, "lanes"]  # largest speed of the numerical model [m/s]
+    acceleration: Float[np.ndarray, "lanes"]  # largest acceleration of the numerical model [m/s^2]
+    # longest travel of the measured position in contact while the force reading is constant [m]
+    force_stuck: Float[np.ndarray, "lanes"]
+    # longest travel of the numerical model while the position reading is constant [m]
+    position_stuck: Float[np.ndarray, "lanes"]
+    flight_force: Float[np.ndarray, "lanes"]  # largest magnitude of the measured force in free flight [N]
+    flight_spread: Float[np.ndarray, "lanes"]  # range of the measured force in free flight [N]
 
 
 def find_signal_extremes(
     signals: RecordedSignals, period: float, clearance: float, free_distance: float, settling: float
 ) -> SignalExtremes:
-    """Return the extent of every lane's runs; flight is defined as in `jaxhil.rig.inputs`."""
+    """Return the extreme values of the signals in every lane.
+
+    Free flight is defined as in `jaxhil.rig.inputs`: the measured position has been farther than
+    `free_distance` [m] from every surface for longer than `settling` [s].
+    """
     live, begins = signals.live, signals.begins
     force, position, velocity, measured, command, sent = (np.where(live, leaf, 0.0) for leaf in signals[:6])
     goes_on = live[1:] & ~begins[1:]
@@ -42,7 +49,7 @@ def find_signal_extremes(
     def least(values):
         return np.min(np.where(live, values, np.inf), axis=0)
 
-    # The force command is continuous from one run to the next; positions start again.
+    # The force command is continuous between runs, but positions jump at the start of a run.
     step = np.abs(np.diff(command, axis=0, prepend=0.0))
     flying = _find_flight_ticks(measured, begins, clearance, free_distance, settling / period) & live
     lowest = np.min(np.where(flying, force, np.inf), axis=0, initial=np.inf)
@@ -69,7 +76,11 @@ def find_signal_extremes(
 
 
 def _find_flight_ticks(measured, begins, clearance, free_distance, settling):
-    """Return the ticks at which contact has been farther than `free_distance` for over `settling` ticks."""
+    """Return whether the mechanism is in free flight in each tick, (ticks, lanes).
+
+    In free flight, the measured position has been farther than `free_distance` [m] from every surface for
+    more than `settling` ticks.
+    """
     free = (measured < -free_distance) & (measured > free_distance - clearance)
     since = np.zeros(measured.shape[1])
     flying = np.empty(measured.shape, bool)
@@ -81,7 +92,10 @@ def _find_flight_ticks(measured, begins, clearance, free_distance, settling):
 
 
 def _measure_stuck_travel(signals: RecordedSignals, clearance: float):
-    """Return the longest travels with bit-identical readings of force and position, as `InputGuard` does."""
+    """Return the longest travel [m] with a constant force reading, and with a constant position reading.
+
+    Both are computed as in `jaxhil.rig.inputs.InputGuard`, each (lanes,).
+    """
     zeros = np.zeros(signals.force.shape[1])
     force_travel, position_travel, most_force, most_position = zeros, zeros, zeros, zeros
     for tick in range(1, len(signals.force)):
@@ -90,7 +104,7 @@ def _measure_stuck_travel(signals: RecordedSignals, clearance: float):
         in_contact = (now > 0) | (now < -clearance)
         same = counted & in_contact & (signals.force[tick] == signals.force[tick - 1])
         deeper = np.where(now > 0, now - before, before - now)
-        # At zero force only net penetration counts, since a damped mechanism may separate without a force.
+        # At zero force, only net penetration counts, because a damped mechanism can separate without a force.
         pressed = np.where(signals.force[tick] == 0, np.maximum(force_travel + deeper, 0.0), np.inf)
         force_travel = np.where(same, np.minimum(pressed, force_travel + np.abs(deeper)), 0.0)
         moved = np.abs(signals.position[tick] - signals.position[tick - 1])

@@ -1,7 +1,8 @@
-"""Verdict on the watchdog's rates of alarm.
+"""Verdict on the watchdog's rates of false and missed alarms.
 
-A rate is good if its 95 % interval ends at or below the allowed rate, and bad if the interval begins above.
-Otherwise it is unknown, and the verdict states the size of a sweep that would decide.
+A rate is good if the upper end of its 95 % interval is at most the allowed rate. It is bad if the lower end
+is above the allowed rate. In all other cases it is unknown, and the verdict names the size of a sweep that
+would decide.
 """
 
 import math
@@ -14,27 +15,29 @@ from tuning.statistics.intervals import binomial_interval, estimate_deciding_sce
 class AllowedAlarmRates(NamedTuple):
     """Largest acceptable rates of false and missed alarms."""
 
-    false_alarms: float = 0.01  # share of the good runs that are stopped
-    missed_alarms: float = 0.02  # share of the bad runs that are not stopped
+    false_alarms: float = 0.01  # fraction of good runs that are stopped [1]
+    missed_alarms: float = 0.02  # fraction of bad runs that are not stopped [1]
 
 
 DEFAULT_ALLOWED_RATES = AllowedAlarmRates()
 
 
 def add_verdict(rates: Mapping[str, Any], allowed: AllowedAlarmRates, scenarios: int) -> dict[str, Any]:
-    """Return the rates with their allowed values and the verdict on them.
+    """Add the allowed rates and the verdict to the estimated alarm rates.
 
-    If faults were injected and count, they decide on missed alarms; the drawn runs can only add that too many
-    are missed.
+    If the rates of injected faults count, they decide whether missed alarms are good or unknown. The rate in
+    the drawn runs can then only make the verdict bad.
 
     Args:
-        rates: result of `tuning.watchdog.alarms.watchdog_rates`, and `fault_runs` if faults were injected
-            (`tuning.watchdog.fault_injection`).
+        rates: result of `tuning.watchdog.alarms.compute_alarm_rates`. If faults were injected, `fault_runs`
+        is
+            the result of `tuning.watchdog.fault_injection.compute_fault_rates`.
         allowed: largest acceptable rates.
         scenarios: number of drawn scenarios.
 
     Returns:
-        The rates with `verdict`: "good", "bad" with `reasons`, or "unknown" with texts of what is `unknown`.
+        The rates with `verdict`, which is "good", "bad" or "unknown". The lists `reasons` and `unknown`
+        describe the bad and the unknown rates.
     """
     reasons, unknown = [], []
     kinds = {kind: {**rates[kind], "allowed": most} for kind, most in allowed._asdict().items()}
@@ -64,27 +67,28 @@ def _describe_interval(rate: Mapping[str, Any]) -> str:
 
 
 def _describe_deciding_runs(rate: Mapping[str, Any]) -> str:
-    """Return a text with the number of runs with injected faults that would decide on a rate."""
+    """Describe how many runs with an injected fault would decide whether a rate is acceptable."""
     runs = estimate_deciding_scenarios(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
-        return "at this rate no number of runs would tell"
-    return f"at this rate about {_round_up(runs)} such runs tell, there are {rate['runs']}"
+        return "at this rate, no number of runs would decide"
+    return f"at this rate, about {_round_up(runs)} such runs would decide; there are {rate['runs']}"
 
 
 def _describe_deciding_sweep(kind: str, rate: Mapping[str, Any], scenarios: int, held_out: int) -> str:
-    """Return a text with the size of a sweep that would decide on a rate."""
+    """Describe how large a sweep would decide whether a rate is acceptable."""
     runs = estimate_deciding_scenarios(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
-        return "at this rate no sweep would tell"
+        return "at this rate, no sweep would decide"
     if rate["runs"]:
-        return f"at this rate a sweep of about {_round_up(runs / rate['runs'] * scenarios)} scenarios tells"
+        needed = _round_up(runs / rate["runs"] * scenarios)
+        return f"at this rate, a sweep of about {needed} scenarios would decide"
     share = float(binomial_interval(0, held_out).high)
     if kind == "false_alarms" and held_out:
         return f"none of {held_out} runs is good: gains with smaller errors are needed"
-    return f"no such run among {held_out}: a sweep of at least {_round_up(runs / share)} scenarios tells"
+    return f"{held_out} runs contain no such run: a sweep of {_round_up(runs / share)} scenarios may decide"
 
 
 def _round_up(number: float) -> int:
-    """Round up to two digits."""
+    """Round a number up to two significant digits."""
     unit = 10 ** max(0, math.floor(math.log10(number)) - 1)
     return math.ceil(number / unit) * unit
