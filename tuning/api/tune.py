@@ -100,7 +100,7 @@ def tune_each(
     from tuning.gains.tune_all import tune_all
 
     mechanisms = [entry.mechanism for entry in loaded]
-    settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.known()
+    settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.load_start_gains()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
     results = tune_all(

@@ -169,8 +169,8 @@ def find_differing_lines(content, checksums):
     if len(found) == len(expected):
         pairs = enumerate(zip(found, expected, strict=True), start=1)
         return [f"line {number}: differs from what was exported" for number, (a, b) in pairs if a != b]
-    first = [*(a == b for a, b in zip(here, expected, strict=False)), False].index(False)
-    return [f"line {first + 1}: differs from what was exported; {len(here)} lines, expected {len(expected)}"]
+    first = [*(a == b for a, b in zip(found, expected, strict=False)), False].index(False)
+    return [f"line {first + 1}: differs from what was exported; {len(found)} lines, expected {len(expected)}"]
 
 
 def find_value_differences(content, expected):

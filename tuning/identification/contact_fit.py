@@ -392,14 +392,14 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
     The result keeps the readings of all contacts, so that it can be evaluated on the omitted contacts.
     """
     readings, problem = fit.readings, fit.problem
-    taught = replace(readings, counts=readings.counts & ~held)
-    taught = ContactProblem(problem.motion, taught, fit.law, problem.plane, problem.time_constant)
-    freedom = len(taught.kept) - len(fit.posterior.names)
+    rest = replace(readings, counts=readings.counts & ~held_out)
+    rest = ContactProblem(problem.motion, rest, fit.law, problem.plane, problem.time_constant)
+    freedom = len(rest.kept) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
-    taught = summarized(taught, (delay, plane))
-    if taught.time_constant:
-        best = search_coarsely(taught, (delay, plane, inner.misfit), 2)
-        posterior = compute_posterior_at_lag(taught, best, fit.posterior, seed)
+    rest = summarized(rest, (delay, plane))
+    if rest.time_constant:
+        best = search_coarsely(rest, (delay, plane, inner.misfit), 2)
+        posterior = compute_posterior_at_lag(rest, best, fit.posterior, seed)
     else:
-        posterior = compute_posterior(training, seed, (delay, plane), COARSE_GRID_SIZE)
+        posterior = compute_posterior(rest, seed, (delay, plane), COARSE_GRID_SIZE)
     return replace(fit, posterior=posterior, freedom=freedom)

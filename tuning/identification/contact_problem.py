@@ -237,7 +237,8 @@ class ContactProblem:
             tables: Values of the functions in these rows, for each time in `before`.
             onsets: Onsets of contact, or None without a lag.
             first: Values of the functions just after the onsets, shape (functions, onsets), or None.
-            window: Range of rows.
+            where: Rows of the result.
+            whitening: Whitening filter of the noise.
         """
         full, places = [], [where.places(part.rows) for part in near]
         for columns, place in zip(tables, places, strict=True):

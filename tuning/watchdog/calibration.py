@@ -132,7 +132,7 @@ def _origin(
 
 
 def _error_limit(limit: float | None, store: SweepStore | None) -> float:
-    """Return the limit of the restitution error [1]: the given one, else the store's, else `DEFAULT_ERROR_LIMIT`."""
+    """Return the limit of the restitution error [1]: `limit`, the store's, or `DEFAULT_ERROR_LIMIT`."""
     if limit is None and store is not None:
         limit = store.manifest.limit
     limit = DEFAULT_ERROR_LIMIT if limit is None else limit

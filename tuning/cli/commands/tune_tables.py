@@ -71,8 +71,8 @@ def _error_table(options: Tune, result: Any, better: bool) -> Any:
         metrics = metrics_by_gains[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
-        shares = f"{100 * figures.diverging:.0f} %", f"{figures.peak_ratio:.3f}", f"{figures.chatter:.3f}"
-        rows.append((label, *_cells(figures), *shares, figures.failed))
+        shares = f"{100 * metrics.diverging:.0f} %", f"{metrics.peak_ratio:.3f}", f"{metrics.chatter:.3f}"
+        rows.append((label, *_cells(metrics), *shares, metrics.failed))
     count = int(result.outcomes["tuned"].wanted.sum())
     return terminal.build_table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
@@ -90,7 +90,7 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
     for key, label in names.items():
         for error in ("energy_error", "twist_error"):
             figures = entry[error][key]
-            cells = *_cells(figures), f"{figures.peak_ratio:.3f}", figures.failed
+            cells = *_cells(figures), f"{metrics.peak_ratio:.3f}", figures.failed
             rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
     count = int(result.outcomes["tuned"].wanted.sum()) // 2
     return terminal.build_table(
