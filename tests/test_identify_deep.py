@@ -79,9 +79,9 @@ def test_touches_are_never_summarized():
     assert deep.sum() >= 8 and not deep[-3:].any()
     short = problem(kelvin_voigt(), seconds=4.0)
     assert summarized(short, NEAR) is short
-    lanes = representative(problem(kelvin_voigt(), seconds=40.0))
-    assert len(np.unique(lanes)) < COMPARED + 8
-    np.testing.assert_array_equal(lanes[-3:], np.arange(len(lanes))[-3:])
+    long = problem(kelvin_voigt(), seconds=40.0)
+    lanes, total = representative(long), long.readings.force.shape[1]
+    assert len(lanes) < COMPARED + 8 < total and {total - 3, total - 2, total - 1} < {*lanes}
 
 
 @pytest.mark.parametrize("whitening", [(1.0,), COLOURED])

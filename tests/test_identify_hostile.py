@@ -71,7 +71,7 @@ def only(kind, number=99):
 
 REFUSED = {
     "the force's sign": (lambda day: changed(day, FORCE, np.negative), "expected the other sign"),
-    "N for kN": (lambda day: changed(day, FORCE, lambda values: 1e3 * values), "is its unit right?"),
+    "N for kN": (lambda day: changed(day, FORCE, lambda values: 1e3 * values), "force in N, read as kN"),
     "m for mm": (lambda day: changed(day, COMMAND, lambda values: 1e-3 * values), "is its unit right?"),
     "position and command": (swapped(COMMAND, POSITION), "are the two swapped?"),
     "force and position": (swapped(FORCE, POSITION), "is its unit right?"),
@@ -85,7 +85,7 @@ REFUSED = {
     ),
     "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact where there is"),
     "a force range of 5 N": (
-        lambda day: changed(day, FORCE, lambda values: np.clip(values, -5e-3, 5e-3)), "is its unit right?",
+        lambda day: changed(day, FORCE, lambda values: np.clip(values, -5e-3, 5e-3)), "turns 350 kg round",
     ),
     "no force": (
         lambda day: {
@@ -136,7 +136,10 @@ BAD = {
 def test_identify_command_verdict_is_bad_for_spoilt_logs(jaxhil, day, tmp_path, case):
     spoil, words = BAD[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
-    assert ran.code == 1 and ran.document["verdict"] == "bad" and words in ran.document["reason"]
+    assert ran.code == 1 and ran.document["verdict"] == "bad"
+    # The verdict names the check with the largest effect; others may also be beyond the limit.
+    failed = {check["name"] for check in ran.document["checks"] if check["there"] and check["effect"] > 0.01}
+    assert words in ran.document["reason"] or words in failed
 
 
 def test_identify_command_verdict_is_bad_for_rest_alone_despite_prior(jaxhil, day, tmp_path):

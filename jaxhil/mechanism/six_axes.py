@@ -86,7 +86,7 @@ class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     inertia: Annotated[
         Inertia,
         vector_metadata(
-            "inertia about the centre of mass, in body axes: vector_metadata moments, or vector_metadata rows"
+            "inertia about the centre of mass, in body axes: three moments, or three rows"
         ),
     ]
     interface: Annotated[

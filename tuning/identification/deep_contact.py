@@ -20,7 +20,7 @@ from tuning.identification.contact_regression import Inner, Pseudo, force_of
 from tuning.identification.motion import MotionResponse
 
 FEWEST = 6  # deep lanes that are worth the effort
-COMPARED = 18  # deep lanes that suffice for a comparison of contact laws
+COMPARED = 8  # deep lanes that suffice to find the exponent or the depths of a contact law
 SHALLOW = 0.1  # share of a lane's median depth that its least depth exceeds
 WIDTH = 0.002  # s, delays that one interpolation covers
 NODES = 8  # delays at which it is exact
@@ -54,16 +54,10 @@ def summarized(problem: ContactProblem, near: tuple[float, float] | None) -> Con
 
 
 def representative(problem: ContactProblem) -> np.ndarray:
-    """Return for each lane one that stands for it in comparisons of contact laws; deep lanes are alike."""
-    lanes = np.arange(problem.readings.force.shape[1])
-    if problem.local:
-        # Behind a dead zone the assumed surface makes contacts differ.
-        return lanes
+    """Return the lanes of a problem without most of its deep ones, which are alike."""
     deep = np.flatnonzero(deep_lanes(problem.motion, _surface(problem)))
-    if len(deep) > COMPARED:
-        part = len(deep) / COMPARED
-        lanes[deep] = deep[((np.arange(len(deep)) // part + 0.5) * part).astype(int)]
-    return lanes
+    dropped = np.delete(deep, np.linspace(0, len(deep) - 1, min(COMPARED, len(deep))).round().astype(int))
+    return np.delete(np.arange(problem.readings.force.shape[1]), dropped)
 
 
 def _surface(problem: ContactProblem) -> float:

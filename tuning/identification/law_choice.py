@@ -55,24 +55,22 @@ def choose_contact_law(
 ) -> list[EvaluatedLaw]:
     """Fit and evaluate all laws, or those named; return them with the chosen one first.
 
-    The parts of a long press are alike, so a few stand for all.
+    The parts of a long press are alike, so exponents and depths are fitted to a few of them.
     """
     judged = []
-    lanes, alike = np.unique(
-        representative(ContactProblem(motion, readings, kelvin_voigt(), plane)), return_inverse=True
-    )
-    rows = readings.counts.sum()
-    motion, readings = motion.of(lanes), readings.select_lanes(lanes)
+    lanes = representative(ContactProblem(motion, readings, kelvin_voigt(), plane))
+    few, few_readings = motion.of(lanes), readings.select_lanes(lanes)
+    is_same, fitted_families = len(lanes) == readings.force.shape[1], {}
     _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
     judging = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for family in list_law_families(deepest, len(readings.entries), names):
         law, result = _fit_shape(
-            family, lambda candidate: _fit_coarsely(motion, readings, candidate, plane, guess)
+            family, lambda candidate: _fit_coarsely(few, few_readings, candidate, plane, guess)
         )
-        result = _for_all(ContactProblem(motion, readings, law, plane), result, np.bincount(alike))
-        likelihood = _cross_validate(motion, readings, judging, law, plane, result)
-        judged.append((law, result, likelihood[alike] if len(likelihood) == len(lanes) else likelihood))
+        result = result if is_same else _fit_coarsely(motion, readings, law, plane, guess)
+        fitted_families[id(law)] = family
+        judged.append((law, result, _cross_validate(motion, readings, judging, law, plane, result)))
     totals = [likelihood.sum() for _, _, likelihood in judged]
     best = judged[int(np.argmax(totals))][2]
     results = []
@@ -80,7 +78,8 @@ def choose_contact_law(
         behind = best - likelihood
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(EvaluatedLaw(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
-    preferred = min(results, key=lambda fit: fit.misfit + np.log(max(rows, 2)) * fit.law.complexity)
+    rows = np.log(max(readings.counts.sum(), 2))
+    preferred = min(results, key=lambda fit: fit.misfit + rows * fit.law.complexity)
     # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
     damped = [fit for fit in results if "damping" in fit.law.names] or results
     # The delay also replaces damping at the onset if the damping of the law is zero at zero depth.
@@ -101,20 +100,14 @@ def choose_contact_law(
     good = good or [min(damped, key=lambda fit: fit.likelihood_deficit[0])]
     # Among laws of equal complexity, the first one is chosen; the misfits would depend on noise.
     taken = min(good, key=lambda fit: fit.law.complexity)
-    return [
-        taken,
-        *(fit for fit in sorted(results, key=lambda fit: fit.likelihood_deficit[0]) if fit is not taken),
-    ]
-
-
-def _for_all(problem: ContactProblem, result: CoarseFit, lanes: np.ndarray) -> CoarseFit:
-    """Return the fit with the misfit of all `lanes` that each lane of the problem stands for."""
-    delay, plane, misfit = result
-    if np.all(lanes == 1):
-        return result
-    coefficients = problem.at(delay, plane).coefficients
-    by_lane = compute_contact_misfits(problem, problem.readings, delay, plane, coefficients)
-    return delay, plane, misfit + float(np.sum(by_lane * (lanes - 1)))
+    others = [fit for fit in results if fit is not taken]
+    if not is_same and taken.law.shape:
+        law, (delay, at, misfit) = _fit_shape(
+            fitted_families[id(taken.law)],
+            lambda candidate: _fit_coarsely(motion, readings, candidate, plane, guess),
+        )
+        taken = replace(taken, law=law, delay=delay, plane=at, misfit=misfit)
+    return [taken, *sorted(others, key=lambda fit: fit.likelihood_deficit[0])]
 
 
 def has_onset_damping(law: Law) -> bool:

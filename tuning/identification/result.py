@@ -105,8 +105,14 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        """Return whether no value is missing and the checks found only effects below `limit`."""
-        return not self.missing and bool(self.lines) and max(self.effect, self.effect_on_error) < self.limit
+        """Return whether both effects are below the limit and logs were compared with the model."""
+        is_small = max(self.effect, self.effect_on_error) < self.limit
+        return not self.missing and self.is_compared and is_small
+
+    @property
+    def is_compared(self) -> bool:
+        """Return whether a check compares logs with the model; the file's own uncertainty does not."""
+        return any(line.name != UNCERTAINTY_CHECK for line in self.lines)
 
     @property
     def worst(self) -> CheckResult | None:
@@ -118,7 +124,7 @@ class Identification:
     def verdict(self) -> str:
         if self.missing:
             return f"Bad: no file is written: logs and prior do not determine {' and '.join(self.missing)}"
-        if not self.lines:
+        if not self.is_compared:
             return "Bad: the logs have neither free motion nor contact, so that the file cannot be checked"
         change = f"can change e by {self.effect:.2g} and e - e* by {self.effect_on_error:.2g}"
         if self.good:
