@@ -86,7 +86,8 @@ def test_watchdog_without_a_margin_misses_every_fault():
         one = fault(blind, name)
         assert one["alarms"] == one["runs"] > 0 and one["low"] > 0.9
     assert blind["verdict"] == "bad"
-    assert any(text.startswith("missed alarms with the force measured later") for text in blind["reasons"])
+    start = "missed alarms with an unmodelled delay of the force sensor"
+    assert any(text.startswith(start) for text in blind["reasons"])
 
 
 def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):

@@ -285,7 +285,7 @@ def test_calibration_runs_a_store_again(tmp_path):
     limits, rates = calibrate(loaded, store, progress=done.append)
     assert sum(done) == LANES and rates["limit"] == LIMIT and rates["calibrated_on"]["scenarios"] == LANES
     assert limits["equivalent_mass"] == loaded.mechanism.bodies.mass
-    with pytest.raises(InputError, match="--scenarios: found 129, expected at most the store's 128"):
+    with pytest.raises(InputError, match="--scenarios: found 129, expected at most 128"):
         calibrate(loaded, store, scenarios=129)
     with pytest.raises(InputError, match="gains_sha256"):
         calibrate(ONE_SIDED, store)

@@ -184,7 +184,7 @@ def _replace_folder(new: Path, target: Path) -> None:
 
 
 def _exchange_folders(new: Path, target: Path) -> None:
-    """Exchange the names of two folders."""
+    """Exchange the names of two folders, in one step if the operating system can do this."""
     try:
         exchange_names(new, target)
         return

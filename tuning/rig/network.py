@@ -75,7 +75,7 @@ class Network:
             heapq.heappush(self._outgoing, (time.monotonic_ns() + delay, self._count, packet))
 
     def send_without_faults(self, packet: bytes) -> None:
-        """Send a packet without injected faults."""
+        """Send a packet at once, without injected loss or delay."""
         try:
             self._socket.send(packet)
         except OSError:

@@ -152,7 +152,7 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDE
 
 
 def _compute_rank(number: ArrayLike, order: float) -> np.ndarray:
-    """Return the rank ceil(order n), at least 1 and at most n."""
+    """Return the rank of the order statistic that estimates the quantile: ceil(order n), from 1 to n."""
     # Without this factor, a rounding error could increase an exact product to the next rank.
     rank = np.ceil(order * np.asarray(number) * (1.0 - 1e-14))
     return np.clip(rank, 1, np.maximum(number, 1)).astype(np.int64)

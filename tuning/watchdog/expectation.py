@@ -22,7 +22,7 @@ SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the larg
 
 
 class Expectation(NamedTuple):
-    """Fitted polynomial of the expected restitution."""
+    """Fitted polynomial of the expected restitution in p, w and z (see the module's text)."""
 
     coefficients: dict[str, float]  # coefficient of each of `POLYNOMIAL_TERMS` [1]
     stiffness: float  # reference stiffness k_0 [N/m]
