@@ -85,9 +85,7 @@ class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     mass: Annotated[float, key_metadata("mass of the body", "kg", gt=0.0)]
     inertia: Annotated[
         Inertia,
-        vector_metadata(
-            "inertia about the centre of mass, in body axes: three moments, or three rows"
-        ),
+        vector_metadata("inertia about the centre of mass, in body axes: three moments, or three rows"),
     ]
     interface: Annotated[
         list[Metre], vector_metadata("vector from the centre of mass to the interface frame, in body axes")

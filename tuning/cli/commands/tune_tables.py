@@ -89,8 +89,8 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
     rows = []
     for key, label in names.items():
         for error in ("energy_error", "twist_error"):
-            figures = entry[error][key]
-            cells = *_cells(figures), f"{metrics.peak_ratio:.3f}", figures.failed
+            metrics = entry[error][key]
+            cells = *_cells(metrics), f"{metrics.peak_ratio:.3f}", metrics.failed
             rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
     count = int(result.outcomes["tuned"].wanted.sum()) // 2
     return terminal.build_table(
