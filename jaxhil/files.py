@@ -183,7 +183,7 @@ def resolve_output_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def exchange_names(one: Path, other: Path) -> None:
+def exchange_names(first: Path, other: Path) -> None:
     """Exchange the names of two files or folders atomically.
 
     Raise OSError; its number is ENOSYS or EINVAL if the system does not support the exchange.
@@ -193,7 +193,7 @@ def exchange_names(one: Path, other: Path) -> None:
     except (AttributeError, OSError, TypeError):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
     rename.argtypes = ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint
-    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) != 0:
+    if rename(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) != 0:
         reason = ctypes.get_errno()
         raise OSError(reason, os.strerror(reason), os.fspath(other))
 

@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.statistics.quantiles import compute_order_ranks
 
 
-def quantile(values: ArrayLike, order: float) -> Estimate:
+def quantile(values: ArrayLike, order: float) -> IntervalEstimate:
     """The order statistic of rank ceil(order n) of |values|, non-finite ones infinite, and the interval."""
     ordered = np.sort(np.nan_to_num(np.abs(np.asarray(values, float)).ravel(), nan=np.inf, posinf=np.inf))
     bounded = np.concatenate([[0.0], ordered, [np.inf]])
@@ -15,4 +15,4 @@ def quantile(values: ArrayLike, order: float) -> Estimate:
     # Rounding must not lift an exact product to the next rank.
     rank = max(1, int(np.ceil(order * len(ordered) * (1.0 - 1e-14))))
     estimate = bounded[rank] if len(ordered) else np.nan
-    return Estimate(np.asarray(estimate), bounded[low], bounded[high])
+    return IntervalEstimate(np.asarray(estimate), bounded[low], bounded[high])

@@ -22,7 +22,7 @@ from tuning.benchmark.tables import (
     find_winners,
 )
 from tuning.plots.comparison import plot_errors, plot_transparency
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 
 COMMAND = [sys.executable, "-m", "tuning", "compare"]
 # A non-interactive shell starts background jobs with SIGINT ignored.
@@ -66,8 +66,8 @@ def test_compare_command_is_reproducible_from_seed(tmp_path):
 
 
 def figures(rms, **others):
-    estimates = dict.fromkeys(METRIC_HEADINGS, Estimate(1.0, 0.9, 1.1))
-    return {**estimates, "rms": Estimate(rms, 0.9 * rms, 1.1 * rms), **others}
+    estimates = dict.fromkeys(METRIC_HEADINGS, IntervalEstimate(1.0, 0.9, 1.1))
+    return {**estimates, "rms": IntervalEstimate(rms, 0.9 * rms, 1.1 * rms), **others}
 
 
 FOUND = [
@@ -76,7 +76,7 @@ FOUND = [
         "phase_lead",
         "m",
         {"literature": {"phase_lead": 0.1}, "tuned": {"phase_lead": 0.2}},
-        {"literature": figures(0.4), "tuned": figures(0.1, worst=Estimate(nan, nan, nan))},
+        {"literature": figures(0.4), "tuned": figures(0.1, worst=IntervalEstimate(nan, nan, nan))},
     ),
 ]
 

@@ -23,7 +23,7 @@ from tuning.gains.common_program import group_by_common_program
 from tuning.transparency.damping_perturbations import MAX_DAMPING_RATIO, perturb_damping
 from tuning.transparency.metrics import (
     BEST_AT_ONE,
-    Estimate,
+    IntervalEstimate,
     bootstrap_metric,
     compute_distance_from_best,
     estimate_share,
@@ -159,21 +159,32 @@ def test_comparison_intervals_have_stated_coverage():
 
 
 def test_winner_requires_separated_intervals():
-    figures = {"a": Estimate(0.1, 0.09, 0.11), "b": Estimate(0.2, 0.12, 0.3), "c": Estimate(0.15, 0.105, 0.2)}
+    figures = {
+        "a": IntervalEstimate(0.1, 0.09, 0.11),
+        "b": IntervalEstimate(0.2, 0.12, 0.3),
+        "c": IntervalEstimate(0.15, 0.105, 0.2),
+    }
     assert find_winner("rms", figures) is None
     assert find_winner("rms", {name: figures[name] for name in "ab"}) == "a"
     assert find_winner("rms", {"a": figures["a"]}) is None
     # A compensator with unfinished contacts has no interval; it does not win and does not block a winner.
     assert (
-        find_winner("rms", {"a": figures["a"], "b": figures["b"], "d": Estimate(0.01, np.nan, np.nan)}) == "a"
+        find_winner(
+            "rms", {"a": figures["a"], "b": figures["b"], "d": IntervalEstimate(0.01, np.nan, np.nan)}
+        )
+        == "a"
     )
 
 
 def test_transparency_distance_is_measured_from_1():
     assert set(BEST_AT_ONE) == {"early", "late", "slope"}
-    assert compute_distance_from_best("early", Estimate(0.7, 0.6, 0.8)) == pytest.approx((0.3, 0.2, 0.4))
-    assert compute_distance_from_best("slope", Estimate(1.1, 0.9, 1.3)) == pytest.approx((0.1, 0.0, 0.3))
-    assert compute_distance_from_best("rms", Estimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
+    assert compute_distance_from_best("early", IntervalEstimate(0.7, 0.6, 0.8)) == pytest.approx(
+        (0.3, 0.2, 0.4)
+    )
+    assert compute_distance_from_best("slope", IntervalEstimate(1.1, 0.9, 1.3)) == pytest.approx(
+        (0.1, 0.0, 0.3)
+    )
+    assert compute_distance_from_best("rms", IntervalEstimate(0.7, 0.6, 0.8)) == (0.7, 0.6, 0.8)
 
 
 def test_comparison_resamples_scenarios_with_all_their_contacts():

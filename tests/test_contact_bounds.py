@@ -97,7 +97,7 @@ def test_verify_checks_real_contact_of_closed_loop(slow_simulator):
     # The closed loop counts samples.
     sample = mechanism.rig.control_period * simulated.duration_ratio / simulated.duration
     assert contact.duration_ratio == pytest.approx(simulated.duration_ratio, abs=sample)
-    reason = f"closed loop, contact 1: real peak force {contact.peak_force_ratio:.3g} times"
+    reason = f"closed loop, contact 1: found a real peak force of {contact.peak_force_ratio:.3g} times"
     assert not report.verdict and report.reasons[0].startswith(reason)
 
 

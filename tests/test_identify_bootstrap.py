@@ -86,9 +86,9 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
 
     monkeypatch.setattr(bootstrap, "fit_resampled_contacts", means)
     with pytest.raises(KeyboardInterrupt):
-        bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path))
+        bootstrap.bootstrap(fit, 20, checkpoints=Checkpoints(tmp_path))
     most = 100
-    again = bootstrap.bootstrap(fit, 20, kept=Checkpoints(tmp_path, resume=True), say=messages.append)
+    again = bootstrap.bootstrap(fit, 20, checkpoints=Checkpoints(tmp_path, resume=True), say=messages.append)
     assert len(done) == 4 and messages == ["bootstrap fits: 15 of 20"]
     whole = bootstrap.bootstrap(fit, 20)
     assert again.resampled == whole.resampled

@@ -108,7 +108,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
     [
         ([], ["logs: found none"]),
         (["--guess"], ["logs: found none"]),
-        (["LOGS"], ["': found no column with this name", "--guess drafts one"]),
+        (["LOGS"], ["': found no column with this name", "--guess drafts such a file"]),
         (["LOGS", "--map", "none.toml"], ["none.toml: found no such file"]),
         (["LOGS", "--prior", "rig-300"], ["did you mean rig-300kg"]),
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),

@@ -7,7 +7,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from tuning.statistics.intervals import (
-    Estimate,
+    IntervalEstimate,
     SequentialState,
     binomial_interval,
     confidence_sequence,
@@ -112,7 +112,7 @@ def walks(probability, repeats=1000, looks=150, step=25):
 def of_each(interval, failures, number):
     """Return the interval of many looks, computed once for equal looks."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
-    return Estimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
+    return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
 
 def ever_outside(interval, probability):
@@ -143,7 +143,7 @@ def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, 
     narrow = (high - low <= width) & (low <= high)
     assert np.all(np.any(narrow, axis=1))
     stop = np.arange(1000), np.argmax(narrow, axis=1)
-    stopped = Estimate(failures[stop] / number[stop], low[stop], high[stop])
+    stopped = IntervalEstimate(failures[stop] / number[stop], low[stop], high[stop])
     coverage, mean, needed = covered(stopped, probability), np.mean(stopped.width), np.mean(number[stop])
     with capsys.disabled():
         print(

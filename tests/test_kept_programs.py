@@ -269,7 +269,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 def solved(static, matrix):
     print("traced")
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), jnp.ones(2))
-print(cached_programs.run_program(solved, 1, np.diag([4.0, 0.5])))
+print(cached_programs.run_cached(solved, 1, np.diag([4.0, 0.5])))
 """
 
 

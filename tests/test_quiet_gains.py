@@ -62,7 +62,7 @@ def quiet():
     """Return the quietest gains, and the number of solver programs they took."""
     cached_programs._programs.clear()
     result = tuned(SETTINGS)
-    return result, sum(key[0].__name__ == "_advance" for key in cached_programs._programs)
+    return result, sum(key[0].__name__ == "_solve_call" for key in cached_programs._programs)
 
 
 def noise_of(result, gains):

@@ -23,7 +23,7 @@ from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
 from tuning.gains.common_program import group_by_common_program
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune_all import tune_all
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 
 HERE = Path(__file__).parent
 FILES = 5  # more than those that have pictures of their own
@@ -194,7 +194,7 @@ def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
         judged.append((law, len(scenes)))
         if law == "smith":
             raise KeyboardInterrupt
-        figures = {"literature": {"rms": Estimate(0.1, math.nan, 1 / 3)}}
+        figures = {"literature": {"rms": IntervalEstimate(0.1, math.nan, 1 / 3)}}
         return [
             LawMetrics(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures) for scene in scenes
         ]

@@ -29,7 +29,7 @@ from tuning.watchdog.calibration import build_audit_rules, calibrate, compute_gu
 from tuning.watchdog.expectation import (
     POLYNOMIAL_TERMS,
     ContactFeatures,
-    Expectation,
+    ExpectationFit,
     expected_restitution,
     fit_expectation,
 )
@@ -104,7 +104,7 @@ def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
         **{f"{name}_highest": 0.5 for name in ("softness", "speed", "loss")},
         **{f"expected_{term}": 0.9 / 3**index for index, term in enumerate(POLYNOMIAL_TERMS)},
     }
-    expectation = Expectation(
+    expectation = ExpectationFit(
         {term: limits[f"expected_{term}"] for term in POLYNOMIAL_TERMS}, 1e5, 0.004, *[(-0.5, 0.5)] * 3
     )
     features = ContactFeatures(audited.stiffness, audited.damping, audited.approach)

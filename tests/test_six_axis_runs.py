@@ -313,8 +313,8 @@ def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
             ["simulate", "petals", "--animate", "x.avi"],
             "--animate: found 'x.avi', expected a name that ends in .gif",
         ),
-        (["simulate", "petals", "--compensator", "passivity"], "response_error: in six axes"),
-        (["simulate", "petals", "--reference", "--plot", "x.png"], "expected none beside --reference"),
+        (["simulate", "petals", "--compensator", "passivity"], "response_error for six axes"),
+        (["simulate", "petals", "--reference", "--plot", "x.png"], "expected none together with --reference"),
         (
             ["simulate", "rig-300kg", "--reference"],
             "--reference: found a one-axis mechanism, expected a six-axis mechanism",

@@ -169,7 +169,7 @@ def test_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").touch()
     for resume in (False, True):
-        with refused("thesis", "allowed"):
+        with refused("thesis", "expected"):
             open_store(tmp_path / "thesis", MANIFEST, resume)
 
 

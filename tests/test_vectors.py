@@ -162,7 +162,7 @@ def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
     monkeypatch.setitem(ON_THE_RIG, loaded.compensator, Wrong)
     result = make_vectors(loaded, seed=3, draws=2)
     assert len(result.reasons) == 3 and result.reasons[0].startswith("the nominal run, tick ")
-    assert "limit 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
+    assert "expected 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
 
 
 def test_vectors_of_a_noisy_biased_rig_agree():

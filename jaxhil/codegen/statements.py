@@ -202,9 +202,9 @@ class BodyLowering(CallLowering):
     def _emit_store(self, node: ast.stmt, field: CExpression, value: CExpression) -> None:
         self.fit(node, field.type, value, f"for a {field.type.kind}", "one type for each name")
         text = self.program.stored(field.type, value)
-        own = re.match(rf"{re.escape(field.text)} ([-+*/&|^]) ", text)
-        if own and isinstance(node, ast.AugAssign):
-            self.emit(f"{field.text} {own[1]}= {text[own.end() :]};")
+        operation = re.match(rf"{re.escape(field.text)} ([-+*/&|^]) ", text)
+        if operation and isinstance(node, ast.AugAssign):
+            self.emit(f"{field.text} {operation[1]}= {text[operation.end() :]};")
         elif text != field.text:
             self.emit(f"{field.text} = {text};")
 

@@ -120,7 +120,7 @@ class _Problem(NamedTuple):
     tolerance: Float[Array, ""] | float  # relative error of a step
 
 
-class _State(NamedTuple):
+class _IntegrationState(NamedTuple):
     """State of the motion."""
 
     time: Array  # time since the first touch [s]
@@ -194,7 +194,7 @@ def _try_step(problem, state, length):
 def _initial_state(problem):
     """Return the state at the first touch."""
     zeros = jnp.zeros_like(problem.approach)
-    return _State(
+    return _IntegrationState(
         time=zeros,
         depth=zeros,
         velocity=problem.approach,
@@ -329,7 +329,7 @@ def _update_state(problem, state, step, trial, rest, is_located):
     magnitude, hold = jnp.abs(depth), problem.law.hold(problem.parameters, memory, depth, velocity)
     phase = state.phase + is_located.astype(state.phase.dtype)
     phase = jnp.where((phase == FREE) & (time >= problem.push_end), ENDED, phase)
-    return _State(
+    return _IntegrationState(
         time=time,
         depth=depth,
         velocity=velocity,

@@ -82,9 +82,9 @@ def format_key_path(path: KeyPath) -> str:
     return text
 
 
-def suggest_names(word: str, known: Iterable[str]) -> str:
+def suggest_names(word: str, names: Iterable[str]) -> str:
     """Return ` (did you mean X?)` with the known words closest to `word`, or an empty text."""
-    matches = difflib.get_close_matches(word[:200], list(known), n=3, cutoff=0.6)
+    matches = difflib.get_close_matches(word[:200], list(names), n=3, cutoff=0.6)
     return f" (did you mean {' or '.join(matches)}?)" if matches else ""
 
 

@@ -43,19 +43,19 @@ def load(
     return file.load_any(_source(name_or_path), overrides or {}).mechanism
 
 
-def as_mechanism(given: object) -> Mechanism:
+def as_mechanism(argument: object) -> Mechanism:
     """Validate a one-axis mechanism, or load that of a name or path. Raise `InputError`."""
-    if not isinstance(given, (Mechanism, SixAxisMechanism)):
-        return file.load(_source(given)).mechanism
+    if not isinstance(argument, (Mechanism, SixAxisMechanism)):
+        return file.load(_source(argument)).mechanism
     # Structs do not validate their fields: a mechanism that was not read from a file is unchecked.
-    return file.from_plain_data(file.to_plain_data(given), f"mechanism {format_value(given.name)}")
+    return file.from_plain_data(file.to_plain_data(argument), f"mechanism {format_value(argument.name)}")
 
 
-def as_any_mechanism(given: object) -> file.AnyMechanism:
+def as_any_mechanism(argument: object) -> file.AnyMechanism:
     """Validate a mechanism with one axis or with six, or load that of a name or path. Raise `InputError`."""
-    if not isinstance(given, (Mechanism, SixAxisMechanism)):
-        return file.load_any(_source(given)).mechanism
-    return file.any_from_plain_data(file.to_plain_data(given), f"mechanism {format_value(given.name)}")
+    if not isinstance(argument, (Mechanism, SixAxisMechanism)):
+        return file.load_any(_source(argument)).mechanism
+    return file.any_from_plain_data(file.to_plain_data(argument), f"mechanism {format_value(argument.name)}")
 
 
 def _source(argument: object) -> str | os.PathLike[str]:

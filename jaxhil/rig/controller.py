@@ -104,6 +104,7 @@ class Controller:
             GainFileError: if the document is invalid.
 
         Example:
+            >>> from jaxhil.rig import Controller, digest
             >>> document = {
             ...     "schema": "jaxhil/gains/1",
             ...     "compensator": "none",

@@ -114,12 +114,18 @@ class Watchdog:
         self.restitution = 0.0
 
     def tick(
-        self, given: float, status: int, force: float, position: float, velocity: float, measured: float
+        self,
+        previous_force: float,
+        status: int,
+        force: float,
+        position: float,
+        velocity: float,
+        measured: float,
     ) -> int:
         """Return the faults that this tick shows, 0 if none.
 
         Args:
-            given: force F_c of the tick before [N].
+            previous_force: force F_c of the tick before [N].
             status: the compensator's status of that force.
             force: force reading of this tick [N].
             position: position of the numerical model [m].
@@ -131,7 +137,7 @@ class Watchdog:
         else:
             self._known = True
             self._alignment.start(measured, velocity)
-            before, given = velocity, 0.0
+            before, previous_force = velocity, 0.0
         clearance = self._clearance
         aligned = deflection(self._alignment.step(measured), clearance)
         in_contact = (
@@ -151,8 +157,8 @@ class Watchdog:
             self._ticks += 1
             self._statuses.take(status)
             self._measured = self._measured or abs(force) > self._fading
-            self._work += self._period * given * 0.5 * (before + velocity)
-            size = abs(given)
+            self._work += self._period * previous_force * 0.5 * (before + velocity)
+            size = abs(previous_force)
             if size > self._peak:
                 self._peak = size
             self._regress(force, aligned)
@@ -170,11 +176,11 @@ class Watchdog:
         self._aligned = aligned
         return fault
 
-    def conclude(self, given: float, status: int) -> int:
+    def conclude(self, previous_force: float, status: int) -> int:
         """Audit the current contact, if there is one, and return the faults.
 
         Args:
-            given: force F_c of the last tick [N].
+            previous_force: force F_c of the last tick [N].
             status: the compensator's status of that force.
         """
         if not self._open:
@@ -183,8 +189,8 @@ class Watchdog:
         before = self._velocity
         if not self._mass > 0.0:
             return self._audit(before)
-        velocity = before - self._period * given / self._mass
-        self._work += self._period * given * 0.5 * (before + velocity)
+        velocity = before - self._period * previous_force / self._mass
+        self._work += self._period * previous_force * 0.5 * (before + velocity)
         return self._audit(velocity)
 
     def detail(self) -> str:

@@ -64,7 +64,7 @@ def check_document(
 
     Raise `InputError` if the content is invalid; `source` names the file in the message.
     """
-    axes = 6 if document.get("axes") == 6 else 1
+    axes = 6 if isinstance(document, dict) and document.get("axes") == 6 else 1
     try:
         on_the_rig = check_gain_document(
             document, source, _gains_without_runtime(axes), (1, 6) if any_axes else (1,)

@@ -50,27 +50,29 @@ def init_latch(latch: Latch, pose: Pose) -> Held:
     return Held(latch.from_start, latch_points(latch, pose), attitude)
 
 
-def latch_wrench(latch: Latch, held: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
+def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
     """Return the latches' wrench [N, N m] on the chaser, about T's origin, and their next state."""
     point = latch_points(latch, pose)
     (position, attitude), (linear, angular) = jax.tree.map(lambda part: part[None], (pose, twist))
     velocity = linear + cross(angular, point - position)
     tilt = 2 * jnp.arctan2(_sine(attitude), jnp.abs(attitude.w))
     fires = (-point.z > latch.depth) & (tilt < latch.angle) & (velocity.z <= latch.speed)
-    first = fires & ~held.caught
-    now = Held(held.caught | fires, point, attitude)
-    held = Held(now.caught, *(_either(first, new, old) for new, old in zip(now[1:], held[1:], strict=True)))
+    first = fires & ~memory.caught
+    now = Held(memory.caught | fires, point, attitude)
+    memory = Held(
+        now.caught, *(_either(first, new, old) for new, old in zip(now[1:], memory[1:], strict=True))
+    )
 
-    displaced = point - held.point
-    turned = logarithm(compose(attitude, reverse(held.attitude)))
+    displaced = point - memory.point
+    turned = logarithm(compose(attitude, reverse(memory.attitude)))
     moved = _product(latch.stiffness, displaced, turned)
     damped = _product(latch.damping, velocity, angular)
-    pull = held.caught.astype(point.x.dtype)
+    pull = memory.caught.astype(point.x.dtype)
     force = (-pull) * (moved[0] + damped[0])
     # The spring's moment is the energy's gradient with respect to the rotation, not to the rotation vector.
     moment = (-pull) * (inverse_left_jacobian(-turned, moved[1]) + damped[1]) + cross(point, force)
     total = jax.tree.map(lambda part: part.sum(axis=0), Wrench(force, moment))
-    return total, held
+    return total, memory
 
 
 def latch_points(latch: Latch, pose: Pose) -> Vector:

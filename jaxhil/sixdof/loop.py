@@ -94,7 +94,7 @@ class Rig(NamedTuple):
     prepared: Any  # result of the compensator's `prepare`
 
 
-class Controller(NamedTuple):
+class NumericalController(NamedTuple):
     """State of the force sensor's lag and of the compensator."""
 
     # last reading before the lag and behind it; None without a lag
@@ -111,7 +111,7 @@ class RunState(NamedTuple):
     hardware: Hardware
     memories: tuple[Memory, ...]  # states of the contact's laws
     held: tuple[Held, ...]  # states of the latches
-    controller: Controller
+    controller: NumericalController
     tick: Int[Array, ""]
 
 
@@ -215,7 +215,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
         hardware=hardware,
         memories=tuple(group.init() for group in rig.groups),
         held=tuple(init_latch(latch, pose) for latch in rig.latches),
-        controller=Controller(
+        controller=NumericalController(
             (nothing, nothing) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
         ),
@@ -297,7 +297,7 @@ def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Ar
 
 def _control(
     loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Array | None
-) -> tuple[Wrench, Controller]:
+) -> tuple[Wrench, NumericalController]:
     """Return the wrench on the numerical model, from sensor and compensator, and their next state."""
     sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
@@ -328,7 +328,7 @@ def _control(
     )
     commands, law_state = law.step(rig.prepared, last.law, signals, state.tick)
     command = structure.unflatten(commands)
-    return command, Controller(None if last.lag is None else (raw, lagged), law_state)
+    return command, NumericalController(None if last.lag is None else (raw, lagged), law_state)
 
 
 def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:

@@ -53,7 +53,7 @@ class Episode(NamedTuple):
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
 
 
-class Progress(NamedTuple):
+class EpisodeProgress(NamedTuple):
     """State of a batch of runs."""
 
     run: RunState
@@ -80,10 +80,10 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
     # Each further episode has a start of its own, which must not be lost between two checks.
     stretch = STRETCH if loop.episodes == 1 else 1
 
-    def one_tick(progress: Progress, _) -> tuple[Progress, None]:
+    def one_tick(progress: EpisodeProgress, _) -> tuple[EpisodeProgress, None]:
         return _tick(loop, rig, last, progress), None
 
-    def body(progress: Progress) -> Progress:
+    def body(progress: EpisodeProgress) -> EpisodeProgress:
         after, _ = lax.scan(one_tick, progress, None, stretch)
         return _turn_over(loop, rig, last, after)
 
@@ -100,7 +100,7 @@ def ideal_contact(rig: Rig, states: States, ticks: Int[Array, "*batch"]) -> Refe
     return follow_contact(space, states, quiet_time(rig.sensor, rig.period), until, rig.period)
 
 
-def _start(loop: Loop, rig: Rig, states: States, last: Array) -> Progress:
+def _start(loop: Loop, rig: Rig, states: States, last: Array) -> EpisodeProgress:
     """Return the state at the start of the runs."""
     none = jnp.zeros(rig.period.shape, jnp.int32)
     beginning = Beginning(states, none, relative_energy(rig, states), ideal_contact(rig, states, last))
@@ -110,7 +110,7 @@ def _start(loop: Loop, rig: Rig, states: States, last: Array) -> Progress:
         lambda leaf: jnp.broadcast_to(leaf, (loop.episodes, *leaf.shape)),
         episode._replace(status=none + MISS),
     )
-    return Progress(
+    return EpisodeProgress(
         run=begin(loop, rig, states),
         beginning=beginning,
         watch=watch,
@@ -121,7 +121,7 @@ def _start(loop: Loop, rig: Rig, states: States, last: Array) -> Progress:
     )
 
 
-def _tick(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
+def _tick(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
     """Run one tick. In lanes whose run is over the bodies stand still."""
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
@@ -158,7 +158,7 @@ def _episode(
     )
 
 
-def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progress:
+def _turn_over(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
     """Write finished episodes, and begin the next ones."""
     watch, run, beginning, age = progress.watch, progress.run, progress.beginning, progress.lasted
     over = watch.over & progress.active
@@ -179,7 +179,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: Progress) -> Progres
     return progress if loop.episodes == 1 else _begin_next(rig, last, progress, over & active)
 
 
-def _begin_next(rig: Rig, last: Array, progress: Progress, begins: Array) -> Progress:
+def _begin_next(rig: Rig, last: Array, progress: EpisodeProgress, begins: Array) -> EpisodeProgress:
     """Begin another episode on the lanes where one is over."""
     states, age, watch = progress.run.states, progress.lasted, progress.watch
 

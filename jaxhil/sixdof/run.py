@@ -112,7 +112,7 @@ def simulate_six_axes(
     `InputError` if an argument is invalid.
     """
     if compensator not in SIX_AXIS_COMPENSATORS:
-        allowed = f"{', '.join(SIX_AXIS_COMPENSATORS)}: in six axes there are no others so far"
+        allowed = f"one of {', '.join(SIX_AXIS_COMPENSATORS)} for six axes"
         raise InputError(f"compensator: found {format_value(compensator)}, expected {allowed}")
     number = check_seed(seed)
     name, values = choose_gains(mechanism, compensator, gains)

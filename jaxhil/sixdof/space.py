@@ -239,13 +239,13 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
     return lax.stop_gradient(norm(apart) + norm(chaser - target) + 1e-9)
 
 
-def choose(condition: Array, one: Any, other: Any) -> Any:
+def choose(condition: Array, first: Any, other: Any) -> Any:
     """Select lane by lane; lanes are the last axes."""
 
     def either(a: Array, b: Array) -> Array:
         return lax.select(jnp.broadcast_to(condition, a.shape), a, b)
 
-    return jax.tree.map(either, one, other)
+    return jax.tree.map(either, first, other)
 
 
 def _nothing(until: Array) -> Array:

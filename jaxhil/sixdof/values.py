@@ -63,20 +63,20 @@ class Values:
         half = np.sqrt((theta**2).sum(axis=0)) / 2
         return Quaternion(jnp.asarray(np.cos(half)), self.vector(np.sinc(half / np.pi) / 2 * theta))
 
-    def vector(self, given: Any) -> Vector:
+    def vector(self, values: Any) -> Vector:
         """Return a vector of components (3, number)."""
-        return Vector(*(jnp.asarray(part) for part in given))
+        return Vector(*(jnp.asarray(part) for part in values))
 
-    def matrix(self, given: Any) -> Matrix:
+    def matrix(self, values: Any) -> Matrix:
         """Return a matrix of rows (3, 3, number)."""
-        return Matrix(*(self.vector(row) for row in given))
+        return Matrix(*(self.vector(row) for row in values))
 
-    def turned(self, angle: Any, place: Any) -> Any:
+    def turned(self, angle: Any, axis: Any) -> Any:
         """Return points (3, number), rotated about z by an angle [rad]."""
         cosine, sine = self.np.cos(angle), self.np.sin(angle)
-        x, y, z = place
+        x, y, z = axis
         return self.np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
 
-    def direction(self, given: Any) -> Vector:
+    def direction(self, values: Any) -> Vector:
         """Return the unit vector along (3, number)."""
-        return self.vector(given / self.np.sqrt((given**2).sum(axis=0)))
+        return self.vector(values / self.np.sqrt((values**2).sum(axis=0)))

@@ -64,10 +64,12 @@ def commands() -> str:
 
 
 def gains() -> str:
-    """The gain file, and the gains of every compensator for the default mechanism."""
-    mechanism = load(DEFAULT).mechanism
+    """The gain file, and the gains of every compensator for a mechanism with one axis and one with six."""
+    one_axis, six_axes = load(DEFAULT).mechanism, load_any(six_axis_names()[0]).mechanism
+    laws = [(name, law, one_axis) for name, law in COMPENSATORS.items()]
+    laws += [(f"{name}, six axes", law, six_axes) for name, law in SIX_AXIS_LAWS.items()]
     sections = [GAINS]
-    for name, law in {**COMPENSATORS, **SIX_AXIS_LAWS}.items():
+    for name, law, mechanism in laws:
         rows = [_row_of_gain(gain, mechanism) for gain in law.gains]
         text = inspect.getdoc(inspect.getmodule(type(law))) or ""
         known = ", ".join(law.knows) or "nothing"

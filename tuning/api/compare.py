@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tuning.caches.checkpoints import Checkpoints
 
 
-class IntervalEstimate(float):
+class ComparedMetric(float):
     """Number with its 95 % confidence interval.
 
     Attributes:
@@ -40,7 +40,7 @@ class IntervalEstimate(float):
     low: float
     high: float
 
-    def __new__(cls, value: float, low: float, high: float) -> "IntervalEstimate":
+    def __new__(cls, value: float, low: float, high: float) -> "ComparedMetric":
         """Create a number with its confidence interval."""
         number = super().__new__(cls, value)
         number.low, number.high = low, high
@@ -60,7 +60,7 @@ class Board:
         document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
         figures: metrics by compensator, then by the name of its gains ("literature", "tuned", or that of a
             setting). The metrics are attributes rms, p99, worst, early, late, slope, peak [1] and more, each
-            an `IntervalEstimate`.
+            an `ComparedMetric`.
         gains: gains [SI units] by compensator, then by the names of `figures`, then by the gain's name.
         winners: for each metric, the compensator that is better than all others by more than the confidence
             intervals, or None if there is no such compensator.
@@ -230,7 +230,7 @@ def build_board(
     figures = {
         result.law: {
             gains_name: SimpleNamespace(
-                **{name: IntervalEstimate(*estimate[:3]) for name, estimate in metrics.items()}
+                **{name: ComparedMetric(*estimate[:3]) for name, estimate in metrics.items()}
             )
             for gains_name, metrics in result.figures.items()
         }

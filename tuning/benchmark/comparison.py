@@ -23,7 +23,7 @@ from jaxhil.simulation.jax_environment import DEVICE_COUNT_FLAG, MIN_DEVICES, pr
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
 from tuning.caches.cluster import WorkUnit, run_on_workers
 from tuning.caches.worker import get_process_setting
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 
 LITERATURE_GAINS, TUNED_GAINS = "literature", "tuned"
 SEED_OFFSET = 0xFA1  # added to the seed for the evaluation, so that tuning never used these scenarios
@@ -57,7 +57,9 @@ class LawMetrics(NamedTuple):
     law: str  # name of the compensator
     mechanism: str  # name of the mechanism
     gains: dict[str, dict[str, float]]  # gains by name, for each set
-    figures: dict[str, dict[str, Estimate]]  # metrics by name (`tuning.transparency.metrics`), for each set
+    figures: dict[
+        str, dict[str, IntervalEstimate]
+    ]  # metrics by name (`tuning.transparency.metrics`), for each set
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -81,7 +83,7 @@ def compare_laws(
     laws: Sequence[str],
     settings: CompareSettings,
     processes: int,
-    tell: Callable[[str, float, float], None] = lambda text, done, kept: None,
+    tell: Callable[[str, float, float], None] = lambda text, done, done_before: None,
     pieces: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[LawMetrics | LawFailure]:

@@ -19,7 +19,7 @@ from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from tuning.batches import join_batches, split_batch
 from tuning.gains.common_program import CommonProgram
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.damping_perturbations import perturb_damping
 from tuning.transparency.metrics import PerturbedOutcomes, compute_metrics
 from tuning.transparency.pushes import (
@@ -58,7 +58,7 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
 
 def evaluate_gains(
     scene: ScenarioSet, law: str, gains: Mapping[str, float], limit: float, seed: int
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Simulate a compensator with the given gains in all scenarios, and compute its metrics by name.
 
     `limit` [1] is the limit of the restitution error, `seed` the seed of the bootstrap.

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from tuning import terminal
 from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, LawMetrics
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.metrics import find_winner
 
 PERCENT_METRICS = ("rms", "p99", "worst", "failures", "trajectory")
@@ -37,7 +37,7 @@ def find_winners(results: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dic
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
 
 
-def choose_best_metrics(result: LawMetrics, which: str = TUNED_GAINS) -> dict[str, Estimate]:
+def choose_best_metrics(result: LawMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
     """Return the metrics for the gains `which` or, without them, for the gains of the literature."""
     return result.figures.get(which) or result.figures[LITERATURE_GAINS]
 
@@ -123,7 +123,7 @@ def _set_compact_style(table: Table) -> Table:
     return table
 
 
-def format_metric(key: str, metric: Estimate, wins: bool = False) -> str:
+def format_metric(key: str, metric: IntervalEstimate, wins: bool = False) -> str:
     """Return a metric as text with three digits, followed by `WINNER_MARK` if it `wins`."""
     value = 100 * metric.value if key in PERCENT_METRICS else metric.value
     return terminal.format_number(value, 3) + WINNER_MARK * wins

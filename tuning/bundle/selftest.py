@@ -136,13 +136,13 @@ def find_manifest_differences(content):
     """Check a manifest against the checksums at its end; return descriptions of the differences."""
     body, found, seal = content.rpartition(b',\n "own_lines": ')
     try:
-        own = json.loads(b'{"own_lines": ' + seal) if found else {}
-        if hashlib.sha256(body).hexdigest() == own["own_sha256"]:
+        seals = json.loads(b'{"own_lines": ' + seal) if found else {}
+        if hashlib.sha256(body).hexdigest() == seals["own_sha256"]:
             # The checksums must also have the exported notation.
             good = seal == build_manifest_seal(body).partition(b',\n "own_lines": ')[2]
             line = body.count(b"\n") + 2
             return [] if good else [f"line {line} or later: differs from what was exported"]
-        return find_differing_lines(body, own["own_lines"])
+        return find_differing_lines(body, seals["own_lines"])
     except Exception:
         return ["the checksums at its end differ from what was exported"]
 
@@ -415,10 +415,10 @@ def check_this_file():
     here = os.path.dirname(os.path.abspath(__file__))
     try:
         manifest = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))
-        own = manifest["files"]["selftest.py"]["sha256"]
+        digest = manifest["files"]["selftest.py"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError):
         return  # the checks above have reported this error
-    if hashlib.sha256(read_plain_file(here, os.path.basename(__file__))).hexdigest() != own:
+    if hashlib.sha256(read_plain_file(here, os.path.basename(__file__))).hexdigest() != digest:
         sys.exit("FAIL  selftest.py: differs from what was exported: do not trust its results")
 
 

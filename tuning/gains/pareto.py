@@ -39,7 +39,7 @@ from tuning.gains.tune import ErrorMetrics, TuneResult, compute_error_metrics, d
 from tuning.gains.tune_all import MAX_GROUP_SIZE
 from tuning.gains.validation import Validation, build_validation, count_evaluated_runs, split_nominal
 from tuning.statistics.bootstrap import ErrorIntervals, compute_error_intervals
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.probes import compute_probe_metrics
 
 TABLE_DIGITS = 4  # significant digits in which points are compared
@@ -58,7 +58,7 @@ class ParetoPoint(NamedTuple):
     nominal: ErrorMetrics  # metrics of the nominal run
     intervals: ErrorIntervals  # 95 % intervals of `compute_error_metrics`
     on_front: bool  # whether no other point dominates it (`find_dominated`)
-    transparency: dict[str, Estimate] | None = None  # transparency, slope and peak, if probed
+    transparency: dict[str, IntervalEstimate] | None = None  # transparency, slope and peak, if probed
 
     @property
     def place(self) -> tuple[float, float]:

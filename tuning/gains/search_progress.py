@@ -17,7 +17,7 @@ SearchProgressCallback = Callable[[str, float, float], None]
 class SearchProgress:
     """Progress counter of a search; code that does some of the work reports it here."""
 
-    def __init__(self, tell: SearchProgressCallback = lambda text, share, kept: None):
+    def __init__(self, tell: SearchProgressCallback = lambda text, share, cached: None):
         self._tell = tell
         self.name = ""  # name of the current block
         self.runs_after_group = 0.0  # runs after the current block
@@ -51,5 +51,5 @@ class SearchProgress:
 
     def _show(self) -> None:
         total = self._kept + self._done + self._left + self.runs_after_group
-        done, kept = ((self._kept + self._done) / total, self._kept / total) if total > 0 else (0.0, 0.0)
-        self._tell(self._text, done, kept)
+        done, cached = ((self._kept + self._done) / total, self._kept / total) if total > 0 else (0.0, 0.0)
+        self._tell(self._text, done, cached)

@@ -28,7 +28,7 @@ from tuning.gains.validation import (
 )
 from tuning.optimisation.sensitivity import compute_gain_tolerance
 from tuning.statistics.bootstrap import ErrorIntervals, compute_error_intervals
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.probes import compute_probe_metrics
 
 
@@ -78,7 +78,7 @@ class TuneResult:
     freedom: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
     global_comparison: GlobalComparison | None = None  # comparison with a global search, if there was one
     # transparency, slope and peak of "before", "literature" and "tuned", if the scenarios have probes
-    transparency: dict[str, dict[str, Estimate]] = field(default_factory=dict)
+    transparency: dict[str, dict[str, IntervalEstimate]] = field(default_factory=dict)
     # of the tuned gains on the same fresh scenarios without the sensors' noise; None if there is no noise
     without_noise: ErrorMetrics | None = None
     quiet: bool = False  # whether these are the quietest gains within the limit, not those of least error
@@ -233,7 +233,7 @@ def _evaluate_baselines(validation: Validation) -> dict[str, list]:
 
 def _compute_transparency(
     validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
-) -> dict[str, dict[str, Estimate]]:
+) -> dict[str, dict[str, IntervalEstimate]]:
     """Return the transparency of a task under several gains; empty if its scenarios have no probes."""
     probed = validation.probed[task]
     if probed is None:

@@ -33,7 +33,7 @@ from tuning.gains.tune import (
 )
 from tuning.gains.validation import draw_fresh_scenarios
 from tuning.statistics.bootstrap import ErrorIntervals
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 
 MAX_GROUP_SIZE = 16  # mechanisms tuned and evaluated together; an interruption loses at most one block
 
@@ -57,7 +57,7 @@ class _CachedResult(NamedTuple):
     intervals: ErrorIntervals | None
     freedom: dict[str, GainTolerance]
     global_comparison: GlobalComparison | None
-    transparency: dict[str, dict[str, Estimate]]
+    transparency: dict[str, dict[str, IntervalEstimate]]
     without_noise: ErrorMetrics | None
     quiet: bool
 

@@ -34,7 +34,7 @@ def bootstrap(
     repeats: int,
     seed: int = 0,
     scheduler: str | None = None,
-    kept: Checkpoints = NO_CHECKPOINTS,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
     say: Callable[[str], None] = lambda text: None,
 ) -> ContactFit:
     """Widen the posterior draws of a fit if bootstrap fits scatter much more than the posterior.
@@ -44,7 +44,7 @@ def bootstrap(
         repeats: Number of bootstrap fits.
         seed: Seed of the random numbers.
         scheduler: Address of a cluster's scheduler whose workers compute the fits, or None.
-        kept: Checkpoints of finished chunks.
+        checkpoints: Checkpoints of finished chunks.
         say: Function that receives a progress message after every chunk except the last one.
 
     Returns:
@@ -59,7 +59,7 @@ def bootstrap(
             else f"{lanes} contacts, {MIN_CONTACTS_FOR_BOOTSTRAP} are needed"
         )
         return replace(fit, resampled=f"no bootstrap: {why}")
-    estimates = fit_bootstrap_samples(fit, repeats, seed, scheduler, kept, say)
+    estimates = fit_bootstrap_samples(fit, repeats, seed, scheduler, checkpoints, say)
     groups = len({*_find_contact_entries(fit)})
     spread = np.cov(estimates.T) * lanes / max(lanes - groups, 1)
     stated = posterior.covariance
@@ -94,7 +94,7 @@ def fit_bootstrap_samples(
     repeats: int,
     seed: int,
     scheduler: str | None,
-    kept: Checkpoints,
+    checkpoints: Checkpoints,
     say: Callable[[str], None],
 ) -> np.ndarray:
     """Fit the law to bootstrap samples and return the posterior means, shape (repeats, parameters)."""
@@ -105,7 +105,8 @@ def fit_bootstrap_samples(
     shared = fit.problem, fit.readings, seed, fit.posterior.best[:2]
     digest = compute_digest((_describe_problem(fit.problem), *shared[1:]))
     saved = {
-        begin: kept.read(f"fits {begin}", (digest, chunk), np.ndarray) for begin, chunk in chunks.items()
+        begin: checkpoints.read(f"fits {begin}", (digest, chunk), np.ndarray)
+        for begin, chunk in chunks.items()
     }
     results: dict[int, np.ndarray] = {begin: values for begin, values in saved.items() if values is not None}
     units = [WorkUnit(begin, (chunk, *shared)) for begin, chunk in chunks.items() if begin not in results]
@@ -117,7 +118,7 @@ def fit_bootstrap_samples(
         computed = run_on_workers(scheduler, fit_resampled_contacts, units, setting, task)
     for begin, values in computed:
         results[begin] = values
-        kept.write(f"fits {begin}", (digest, chunks[begin]), values)
+        checkpoints.write(f"fits {begin}", (digest, chunks[begin]), values)
         if len(results) < len(chunks):
             say(f"bootstrap fits: {sum(map(len, results.values()))} of {repeats}")
     return np.concatenate([results[begin] for begin in chunks])

@@ -23,7 +23,7 @@ from tuning.identification.deep_contact import summarized
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse
-from tuning.identification.noise import SensorNoise
+from tuning.identification.noise import NoiseEstimate
 from tuning.identification.press_bias import find_bias_prior
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
@@ -133,7 +133,7 @@ def fit_contact(
     runs: Sequence[LoggedRun],
     model: MotionModel,
     timing: CampaignTiming,
-    noise: SensorNoise | None,
+    noise: NoiseEstimate | None,
     law: Law | str | None = None,
     plane: float | None = None,
     seed: int = 0,
@@ -186,7 +186,7 @@ def fit_contact(
 def _prepare_readings(
     runs: Sequence[LoggedRun],
     motion: MotionResponse,
-    noise: SensorNoise | None,
+    noise: NoiseEstimate | None,
     plane: float | None,
     dead_zone: float,
 ) -> tuple[ForceReadings, float | None]:
@@ -298,7 +298,7 @@ def _fit_law(
     )
 
 
-def _make_readings(runs: Sequence[LoggedRun], noise: SensorNoise) -> ForceReadings:
+def _make_readings(runs: Sequence[LoggedRun], noise: NoiseEstimate) -> ForceReadings:
     return ForceReadings.of(
         runs, float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
     )
@@ -308,7 +308,7 @@ def _estimate_clock_drift(
     runs: Sequence[LoggedRun],
     model: MotionModel,
     timing: CampaignTiming,
-    noise: SensorNoise | None,
+    noise: NoiseEstimate | None,
     law: Law | str | None,
     plane,
 ) -> ClockDrift:

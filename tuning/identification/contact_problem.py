@@ -241,9 +241,9 @@ class ContactProblem:
             whitening: Whitening filter of the noise.
         """
         full, places = [], [where.places(part.rows) for part in near]
-        for columns, place in zip(tables, places, strict=True):
+        for columns, columns_in_table in zip(tables, places, strict=True):
             table = np.zeros((*columns.shape[:2], len(where.rows)))
-            table[:, :, place] = columns
+            table[:, :, columns_in_table] = columns
             full.append(table)
         if onsets is None or not len(where.rows):
             return _whitened(full[0], whitening)

@@ -99,7 +99,7 @@ class Summarized(ContactProblem):
                 return inner
         return super().at(delay, plane, pseudo)
 
-    def across(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None = None) -> list[Inner]:
+    def fit_surfaces(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None = None) -> list[Inner]:
         """Fit the coefficients at several planes at once, without derivatives by the plane."""
         table = self._table(delay, planes)
         if table is not None and pseudo is None:
@@ -244,8 +244,8 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return the weight of each node in the interpolation at each place, (places, nodes)."""
     away = at[:, None, None] - nodes
     apart = nodes[:, None] - nodes
-    own = np.eye(len(nodes), dtype=bool)
-    return np.prod(np.where(own, 1.0, away / np.where(own, 1.0, apart)), axis=2)
+    identity = np.eye(len(nodes), dtype=bool)
+    return np.prod(np.where(identity, 1.0, away / np.where(identity, 1.0, apart)), axis=2)
 
 
 def _lagrange_slopes(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -10,14 +10,14 @@ import numpy as np
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import numeric_keys
 from tuning.identification.contact_fit import ContactFit
-from tuning.identification.result import Estimate
+from tuning.identification.result import ParameterEstimate
 
 DAMPING_KEY, FORCE_DELAY_KEY = "contact.damping", "rig.force_sensor.delay"
 # Draws accumulate at 0 if more than this share of them lies within this number of standard deviations of 0.
 MAX_SHARE_AT_ZERO, ZERO_WIDTH_SIGMAS = 0.005, 0.1
 
 
-def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tuple[Estimate, ...]:
+def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tuple[ParameterEstimate, ...]:
     """Return the estimates of all parameters: those with draws, the sensors' noise, and the fixed parameters.
 
     Args:
@@ -57,7 +57,8 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
             _make_normal_estimate("rig.position_sensor.noise_std", std, std / np.sqrt(2.0 * max(count, 1)))
         )
     direct += [
-        Estimate(key, value, 0.0, value, value, get_unit(key), is_fixed=True) for key, value in fixed.items()
+        ParameterEstimate(key, value, 0.0, value, value, get_unit(key), is_fixed=True)
+        for key, value in fixed.items()
     ]
     return (*from_draws, *direct)
 
@@ -96,7 +97,9 @@ def find_shortest_interval(values: np.ndarray) -> tuple[float, float]:
     return float(ordered[first]), float(ordered[first + inside - 1])
 
 
-def _estimate_from_draws(key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}) -> Estimate:
+def _estimate_from_draws(
+    key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}
+) -> ParameterEstimate:
     """Return the estimate of a parameter from its draws.
 
     `at_bound` holds the draws of the damping coefficients that accumulate at 0. The interval of such a
@@ -111,13 +114,13 @@ def _estimate_from_draws(key: str, values: np.ndarray, at_bound: Mapping[str, np
     if at_bound and key.startswith(FORCE_DELAY_KEY):
         ends = np.quantile(shift_to_zero_damping(values, at_bound), (0.025, 0.975))
         low, high = min(low, ends[0]), max(high, ends[1])
-    return Estimate(
+    return ParameterEstimate(
         key, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), get_unit(key)
     )
 
 
-def _make_normal_estimate(key: str, value: float, std: float) -> Estimate:
-    return Estimate(key, value, std, value - 1.96 * std, value + 1.96 * std, get_unit(key))
+def _make_normal_estimate(key: str, value: float, std: float) -> ParameterEstimate:
+    return ParameterEstimate(key, value, std, value - 1.96 * std, value + 1.96 * std, get_unit(key))
 
 
 def get_unit(key: str) -> str:
@@ -130,7 +133,7 @@ def get_unit(key: str) -> str:
 
 def estimate_combinations(
     draws_by_key: Mapping[str, np.ndarray], contact: ContactFit | None
-) -> tuple[Estimate, ...]:
+) -> tuple[ParameterEstimate, ...]:
     """Return estimates of parameter combinations that the logs determine better than the single parameters.
 
     The combinations are sums of delays, and damping minus stiffness times force delay ("apparent damping").

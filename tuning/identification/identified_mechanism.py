@@ -16,7 +16,7 @@ from tuning.identification.options import IdentificationOptions
 from tuning.identification.parameters import SIMULATOR_PREFIX
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
-from tuning.identification.result import Estimate
+from tuning.identification.result import ParameterEstimate
 from tuning.identification.uncertainty_effect import IDENTIFIED_SOURCE_PREFIX
 
 
@@ -25,7 +25,7 @@ def make_mechanism(
     prior: Mechanism | None,
     model: MotionModel | None,
     contact: ContactFit | None,
-    estimates: Sequence[Estimate],
+    estimates: Sequence[ParameterEstimate],
     draws_by_key: Mapping[str, np.ndarray],
     options: IdentificationOptions,
 ) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from tuning.identification.identified_mechanism import compute_bound_excess, mak
 from tuning.identification.mechanism_check import check_against_mechanism as check_file
 from tuning.identification.mechanism_check import check_file_uncertainty
 from tuning.identification.mechanism_file import to_toml
-from tuning.identification.noise import SensorNoise, estimate_noise
+from tuning.identification.noise import NoiseEstimate, estimate_noise
 from tuning.identification.notes import collect_notes, note_absent_dead_zone
 from tuning.identification.options import KEYS_FIXED_BEFORE_FIT, IdentificationOptions, check_options
 from tuning.identification.parameters import SIMULATOR_PREFIX
@@ -222,7 +222,7 @@ def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
 
 def _estimate_sensor_noise(
     runs: Mapping[str, Sequence[LoggedRun]],
-) -> tuple[SensorNoise | None, SensorNoise | None]:
+) -> tuple[NoiseEstimate | None, NoiseEstimate | None]:
     """Return the noise of the force sensor and of the position sensor from runs at rest, or None.
 
     If no run is at rest, the noise of the force sensor comes from free motion.
@@ -248,7 +248,7 @@ def _fit_and_check_contact(
     runs: list[LoggedRun],
     model: MotionModel | None,
     campaign: Campaign,
-    force: SensorNoise | None,
+    force: NoiseEstimate | None,
     dead_zone: float,
     options: IdentificationOptions,
     say: ReportProgress,

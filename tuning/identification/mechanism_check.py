@@ -21,7 +21,7 @@ from tuning.identification.edge_check import check_contact_edges
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.motion import MotionResponse
-from tuning.identification.noise import SensorNoise, estimate_noise
+from tuning.identification.noise import NoiseEstimate, estimate_noise
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import Campaign, LoggedRun
 from tuning.identification.result import (
@@ -182,7 +182,7 @@ def _make_contact_fit(
     return ContactFit(law, (), problem, posterior, len(problem.kept), error, has_dead_zone)
 
 
-def _estimate_force_noise(runs: Sequence[LoggedRun]) -> SensorNoise | None:
+def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
     """Return the force sensor's noise from the first run at rest, or else in free motion, with 200 readings.
 
     Returns None if no run has as many readings.

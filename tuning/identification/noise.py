@@ -26,7 +26,7 @@ MIN_ZERO_SHARE = 0.5  # share of exact zeros that indicates a dead zone without 
 
 
 @dataclass(frozen=True)
-class SensorNoise:
+class NoiseEstimate:
     """Noise statistics of one sensor, estimated from readings at rest and in the unit of the readings."""
 
     mean: float  # mean of the readings; 0 if a dead zone hides it
@@ -51,13 +51,13 @@ class SensorNoise:
         return self.std * float(np.sqrt(compute_whitened_share(self.filter)))
 
 
-def estimate_noise(readings: np.ndarray) -> SensorNoise:
+def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     """Estimate the noise statistics of a sensor from at least 20 finite readings at successive ticks."""
     quantum = detect_quantum(readings)
     number = len(readings)
     if _has_excess_zeros(readings, quantum):
         std, dead_zone = _fit_dead_zone(readings)
-        return SensorNoise(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
+        return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
     drift = _estimate_drift(readings)
     readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
     rounded = quantum and not drift
@@ -68,7 +68,7 @@ def estimate_noise(readings: np.ndarray) -> SensorNoise:
     effective = 1.0 + 2.0 * np.sum(_autocorrelate(whitening) ** 2)
     # Rounding adds to the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
-    return SensorNoise(
+    return NoiseEstimate(
         float(mean),
         float(std),
         float(width * at_zero / np.sqrt(number)),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from tuning.identification import contact_fit as contacts
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.free_motion import FreeMotion
-from tuning.identification.noise import SensorNoise
+from tuning.identification.noise import NoiseEstimate
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
 
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
@@ -17,7 +17,7 @@ def collect_notes(
     motion: FreeMotion | None,
     contact: ContactFit | None,
     used: ContactFit | None,
-    force: SensorNoise | None,
+    force: NoiseEstimate | None,
     vague: Sequence[str],
 ) -> list[str]:
     """Return notes on missing runs, on undetermined parameters, and on the force sensor.

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxhil.errors import InputError, to_one_line
 from tuning.identification.motion import MotionResponse
-from tuning.identification.noise import SensorNoise
+from tuning.identification.noise import NoiseEstimate
 from tuning.identification.records import LoggedRun
 
 TYPICAL_FORCE_DELAY = 0.005  # s, typical delay of a force sensor; accurate enough to detect a release
@@ -25,7 +25,7 @@ MIN_BIAS_STD_RATIO = 0.1  # minimum standard deviation of the bias between runs,
 
 
 def find_bias_prior(
-    runs: Sequence[LoggedRun], motion: MotionResponse, noise: SensorNoise | None, plane: float | None
+    runs: Sequence[LoggedRun], motion: MotionResponse, noise: NoiseEstimate | None, plane: float | None
 ) -> tuple[float, float] | None:
     """Return a prior of the force sensor's bias if the runs in contact cannot determine the bias.
 

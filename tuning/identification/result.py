@@ -9,7 +9,7 @@ import numpy as np
 
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.free_motion import FreeMotion
-from tuning.identification.noise import SensorNoise
+from tuning.identification.noise import NoiseEstimate
 from tuning.identification.validation import CheckResult
 
 UNCERTAINTY_CHECK = "uncertainty of the numbers"  # name of the check of the parameters' uncertainty
@@ -34,7 +34,7 @@ EXPERIMENTS = {
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """Estimate of one parameter of the mechanism file, with its uncertainty.
 
     Attributes:
@@ -79,9 +79,9 @@ class Identification:
         position_noise: Noise of the position sensor at rest, or None.
     """
 
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[ParameterEstimate, ...]
     draws: np.ndarray
-    combinations: tuple[Estimate, ...]
+    combinations: tuple[ParameterEstimate, ...]
     confounded: tuple[tuple[str, str, float, str], ...]
     lines: tuple[CheckResult, ...]
     mechanism: dict[str, Any] | None
@@ -90,8 +90,8 @@ class Identification:
     missing: tuple[str, ...] = ()
     motion: FreeMotion | None = field(default=None, repr=False)
     contact: ContactFit | None = field(default=None, repr=False)
-    force_noise: SensorNoise | None = field(default=None, repr=False)
-    position_noise: SensorNoise | None = field(default=None, repr=False)
+    force_noise: NoiseEstimate | None = field(default=None, repr=False)
+    position_noise: NoiseEstimate | None = field(default=None, repr=False)
 
     @property
     def effect(self) -> float:
@@ -144,7 +144,7 @@ class Identification:
             f"all defects {change}, expected below {self.limit:g}"
         )
 
-    def __getitem__(self, key: str) -> Estimate:
+    def __getitem__(self, key: str) -> ParameterEstimate:
         """Return the estimate of the parameter or combination with this key."""
         for estimate in (*self.estimates, *self.combinations):
             if estimate.key == key:
@@ -177,9 +177,9 @@ def find_confounded_pairs(keys: list[str], draws: np.ndarray) -> tuple[tuple[str
     return tuple(pairs)
 
 
-def suggest_experiment(one: str, other: str) -> str:
+def suggest_experiment(first: str, other: str) -> str:
     """Return the experiment, in words, that separates two confounded parameters, given by their keys."""
-    one, other = (key.rstrip("0123456789").rstrip(".") for key in (one, other))
-    return EXPERIMENTS.get((one, other)) or EXPERIMENTS.get(
-        (other, one), "longer runs, or a wider range of speeds and frequencies"
+    first, other = (key.rstrip("0123456789").rstrip(".") for key in (first, other))
+    return EXPERIMENTS.get((first, other)) or EXPERIMENTS.get(
+        (other, first), "longer runs, or a wider range of speeds and frequencies"
     )

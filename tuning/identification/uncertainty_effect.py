@@ -137,7 +137,9 @@ def _compute_change(
         nominal = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
         name = key.removeprefix("contact.")
         contacts = [_replace_contact_value(mechanism.contact, name, value) for value in values.tolist()]
-        moved = np.array([mechanism_models.get_regression_coefficients(one, entry) for one in contacts])
+        moved = np.array(
+            [mechanism_models.get_regression_coefficients(contact_entry, entry) for contact_entry in contacts]
+        )
         return (moved - nominal) @ contact.coefficient_sensitivity, no_change
     if key in FORCE_DELAY_KEYS:
         added_delay = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])

@@ -263,24 +263,24 @@ def _replace_nonfinite(losses):
     return np.where(np.isfinite(losses), losses, FAILED_LOSS)
 
 
-def select_distant_points(ranked, known, number):
-    """Return `number` points: the `known` ones, then the best `ranked` ones at a distance from all others.
+def select_distant_points(ranked, fixed_points, number):
+    """Return `number` points: the `fixed_points`, then the best `ranked` ones at a distance from all others.
 
     The distance is a tenth of the box's diagonal, or less if there are not enough such points.
     """
-    known = np.zeros((0, ranked.shape[-1])) if known is None else known
+    fixed_points = np.zeros((0, ranked.shape[-1])) if fixed_points is None else fixed_points
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1])
     while True:
-        chosen = select_points_at_distance(ranked, known, number, distance)
+        chosen = select_points_at_distance(ranked, fixed_points, number, distance)
         if len(chosen) == number:
             return chosen
         distance = distance / 2 if len(ranked) > number and distance > 1e-9 else 0.0
 
 
-def select_points_at_distance(ranked, known, number, distance=None):
+def select_points_at_distance(ranked, fixed_points, number, distance=None):
     """Return points as `select_distant_points` does, or fewer if not enough have the `distance`."""
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
-    chosen = list(np.clip(known[:number], 0, 1))
+    chosen = list(np.clip(fixed_points[:number], 0, 1))
     for point in ranked:
         if len(chosen) == number:
             break

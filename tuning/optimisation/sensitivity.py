@@ -11,14 +11,14 @@ from jaxtyping import Float
 LOSS_RISE = 0.01  # relative rise of the loss
 
 
-class GainTolerance(NamedTuple):
+class GainTolerances(NamedTuple):
     """Tolerance of each gain, as a share of its range."""
 
     alone: Float[np.ndarray, "gains"]  # with all other gains fixed
     together: Float[np.ndarray, "gains"]  # with all other gains readjusted to their best values
 
 
-def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss: float) -> GainTolerance:
+def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss: float) -> GainTolerances:
     """Return the tolerance of each gain at the optimum of the objective L = |r|^2 / 2.
 
     `jacobian` is J = dr/du, with the gains u as shares of their ranges. Around the optimum
@@ -45,4 +45,4 @@ def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss:
     radius = 1 / np.hypot(values / np.sqrt(scale), 1)
     covariance = (directions.T * radius**2) @ directions
     alone = 1 / np.sqrt(np.sum(jacobian**2, axis=0) / scale + 1)
-    return GainTolerance(alone, np.sqrt(np.diag(covariance)))
+    return GainTolerances(alone, np.sqrt(np.diag(covariance)))

@@ -68,8 +68,12 @@ def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
     if positive:
         axes.set_yscale("log")
         axes.set_ylim(min(positive) / 2, max(positive) * 3)
-        place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 0.98), "borderaxespad": 0.2}
-        axes.legend(ncols=3, fontsize=8, frameon=False, **place)
+        legend_place: dict[str, Any] = {
+            "loc": "lower left",
+            "bbox_to_anchor": (0, 0.98),
+            "borderaxespad": 0.2,
+        }
+        axes.legend(ncols=3, fontsize=8, frameon=False, **legend_place)
 
 
 def _error_groups(metrics: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:

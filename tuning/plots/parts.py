@@ -34,8 +34,8 @@ def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2
 
 def legend_above(axes: Axes, columns: int, **style: Any) -> Any:
     """Draw the legend above the axes instead of inside them, where data would hide it."""
-    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
-    return axes.legend(ncols=columns, fontsize=8, frameon=False, **place, **style)
+    legend_place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    return axes.legend(ncols=columns, fontsize=8, frameon=False, **legend_place, **style)
 
 
 def name_rows(axes: Axes, names: list[str]) -> None:

@@ -19,7 +19,7 @@ from jaxhil.simulation.contact_plot import (
     plot_contacts,
 )
 from tuning.plots.parts import draw_limit, set_plain_ticks, set_scale
-from tuning.sweeps.chunks import Sweep
+from tuning.sweeps.chunks import SweepProgram
 from tuning.sweeps.manifest import Manifest
 from tuning.sweeps.plot_statistics import PlotInput, PlotPlan, PlotPoints, PlotStatistics
 from tuning.sweeps.replay import compute_motion, record_six_axes
@@ -28,7 +28,7 @@ from tuning.sweeps.replay import compute_motion, record_six_axes
 FAILED, UNENDED = "failed", "failed, a contact did not end (drawn at the upper edge)"
 
 
-def scenario_plot(sweep: Sweep, index: int, title: str) -> Figure:
+def scenario_plot(sweep: SweepProgram, index: int, title: str) -> Figure:
     """Plot the run of one scenario of a sweep, with one or six axes, over time."""
     if sweep.model.axes == 1:
         return plot_contacts(compute_motion(sweep, index), title, sensors="rig")

@@ -29,7 +29,7 @@ MIN_STUDENT_FAILURES = 100
 _BISECTION_STEPS = 62  # number of bisections; they reduce an interval of the length 1500 to a rounding error
 
 
-class Estimate(NamedTuple):
+class IntervalEstimate(NamedTuple):
     """Estimated value with its confidence interval, as numbers or as arrays of the same shape."""
 
     value: Any  # estimated value
@@ -52,7 +52,9 @@ class SequentialState(NamedTuple):
     level: float = CONFIDENCE_LEVEL  # confidence level of the interval
 
 
-def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL) -> Estimate:
+def binomial_interval(
+    failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL
+) -> IntervalEstimate:
     """Return the exact interval of the probability for `failures` among `number` independent scenarios.
 
     This is the interval of Clopper and Pearson (1934), whose bounds are quantiles of beta distributions. If
@@ -67,10 +69,12 @@ def binomial_interval(failures: ArrayLike, number: ArrayLike, level: float = CON
     # A beta distribution with the parameter 0 does not exist. Then the bound is 0 or 1.
     low = np.where(failures > 0, special.betaincinv(np.maximum(failures, 1.0), passes + 1.0, tail), 0.0)
     high = np.where(passes > 0, special.betainccinv(failures + 1.0, np.maximum(passes, 1.0), tail), 1.0)
-    return Estimate(_compute_share(failures, number), low, high)
+    return IntervalEstimate(_compute_share(failures, number), low, high)
 
 
-def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL) -> Estimate:
+def confidence_sequence(
+    failures: ArrayLike, number: ArrayLike, level: float = CONFIDENCE_LEVEL
+) -> IntervalEstimate:
     """Return an interval of the probability of failure that is valid for every stopping rule.
 
     The intervals for all numbers of scenarios cover the true probability simultaneously, with at least the
@@ -108,7 +112,7 @@ def confidence_sequence(failures: ArrayLike, number: ArrayLike, level: float = C
     high = np.where(
         passes > 0, special.expit(_bisect_boundary(outside, np.full_like(middle, 750.0), middle)), 1.0
     )
-    return Estimate(share, low, high)
+    return IntervalEstimate(share, low, high)
 
 
 def update_sequence(running: SequentialState, failures: int, number: int) -> SequentialState:
@@ -169,7 +173,7 @@ def estimate_deciding_scenarios(
     return int(numbers[index]) if index < len(numbers) else None
 
 
-def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDENCE_LEVEL) -> Estimate:
+def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDENCE_LEVEL) -> IntervalEstimate:
     """Return the interval of the probability of failure from independent scramblings of a Sobol sequence.
 
     `failures`, (..., R), are the numbers of failures in R scramblings (replicates) with n = `number` points
@@ -218,7 +222,7 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDEN
     unseen = odds / (number + odds)
     high = np.where(total == 0, np.maximum(high, unseen), high)
     low = np.where(total == points, np.minimum(low, 1.0 - unseen), low)
-    return Estimate(mean, low, high)
+    return IntervalEstimate(mean, low, high)
 
 
 def lognormal_interval(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from tuning.statistics.intervals import BETA_PRIOR, CONFIDENCE_LEVEL, Estimate, replicate_interval
+from tuning.statistics.intervals import BETA_PRIOR, CONFIDENCE_LEVEL, IntervalEstimate, replicate_interval
 
 BIN_RESOLUTION = 0.01  # relative distance between successive edges of bins [1]
 _DECADES = -9, 3  # the first edge is 1e-9, and the last edge is about 1e3
@@ -91,7 +91,7 @@ def count_in_bins(values: ArrayLike) -> np.ndarray:
 
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL, sequential: bool = False
-) -> Estimate:
+) -> IntervalEstimate:
     """Return a quantile of the magnitudes of values with its interval, from the counts of `count_in_bins`.
 
     The bounds are the order statistics of `compute_order_ranks`, rounded outward to the edges of their bins.
@@ -106,7 +106,7 @@ def binned_quantile(
     low, high = compute_order_ranks(number, order, level, sequential)
     lower = bounds[np.searchsorted(below, low)] if low > 0 else 0.0
     upper = bounds[np.searchsorted(below, high) + 1] if high <= number else np.inf
-    return Estimate(binned_estimate(counted, order), np.asarray(lower), np.asarray(upper))
+    return IntervalEstimate(binned_estimate(counted, order), np.asarray(lower), np.asarray(upper))
 
 
 def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
@@ -121,7 +121,9 @@ def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
     return np.where(number > 0, middles[index], np.nan)
 
 
-def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL) -> Estimate:
+def replicate_quantile(
+    counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL
+) -> IntervalEstimate:
     """Return a quantile with its interval from independent scramblings of a Sobol sequence.
 
     For each edge of a bin, `tuning.statistics.intervals.replicate_interval` yields an interval of the
@@ -148,7 +150,7 @@ def replicate_quantile(counted: np.ndarray, order: float, level: float = CONFIDE
     _, low, high = replicate_interval(np.cumsum(counted, axis=-1).T, int(numbers[0]), level)
     first = int(np.argmax(high >= order))
     last = int(np.max(np.nonzero(low[:-1] <= order)[0], initial=-1))
-    return Estimate(estimate, bounds[first], bounds[last + 2])
+    return IntervalEstimate(estimate, bounds[first], bounds[last + 2])
 
 
 def _compute_rank(number: ArrayLike, order: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuning.statistics.intervals import CONFIDENCE_LEVEL, Estimate
+from tuning.statistics.intervals import CONFIDENCE_LEVEL, IntervalEstimate
 
 SOBOL_RESAMPLES = 1000  # number of bootstrap resamples
 _MAX_NUMBERS_IN_MEMORY = 2**22  # largest number of random numbers that are drawn together
@@ -31,8 +31,8 @@ _MAX_NUMBERS_IN_MEMORY = 2**22  # largest number of random numbers that are draw
 class SobolIndices(NamedTuple):
     """Sobol indices of all inputs, with their intervals."""
 
-    first_order: Estimate  # fraction of the variance that each input alone explains [1], (inputs,)
-    total: Estimate  # fraction of the variance that each input and its interactions explain [1], (inputs,)
+    first_order: IntervalEstimate  # fraction of the variance that each input alone explains [1], (inputs,)
+    total: IntervalEstimate  # fraction of the variance that each input with its interactions explains [1]
 
 
 def count_evaluations(inputs: int | Sequence[int], number: int) -> int:
@@ -125,7 +125,7 @@ def sobol_indices(
         raise ValueError("values: found values that are not finite, expected finite values or a cap")
     rows = values.reshape(count + 2, number)
     if np.all(rows[:2] == rows[0, 0]):
-        unknown = Estimate(np.full(count, np.nan), np.zeros(count), np.ones(count))
+        unknown = IntervalEstimate(np.full(count, np.nan), np.zeros(count), np.ones(count))
         return SobolIndices(unknown, unknown)
     # The scale cancels in the indices. With values of at most 1, squares cannot overflow.
     rows = rows / np.max(np.abs(rows))
@@ -140,8 +140,8 @@ def sobol_indices(
     tail = (1.0 - level) / 2.0
     low, high = np.nanquantile(resampled, [tail, 1.0 - tail], axis=0)
     return SobolIndices(
-        Estimate(estimate[:count], low[:count], high[:count]),
-        Estimate(estimate[count:], low[count:], high[count:]),
+        IntervalEstimate(estimate[:count], low[:count], high[:count]),
+        IntervalEstimate(estimate[count:], low[count:], high[count:]),
     )
 
 

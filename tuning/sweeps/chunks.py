@@ -26,7 +26,7 @@ Rows = dict[str, np.ndarray]
 CONTROL_PERIOD_KEY = "rig.control_period"
 
 
-class Sweep(NamedTuple):
+class SweepProgram(NamedTuple):
     """Sweep of a manifest with its loop, ready to run."""
 
     manifest: Manifest
@@ -48,10 +48,10 @@ class _ScenarioBatch(NamedTuple):
     scenarios: Any
 
 
-def build_sweep(manifest: Manifest) -> Sweep:
+def build_sweep(manifest: Manifest) -> SweepProgram:
     """Build the sweep of a manifest; raise `InputError` if its gain file is invalid."""
     loaded = load_gains(manifest)
-    return Sweep(manifest, loaded.mechanism, build_widest_loop(loaded, manifest.works), loaded.gains)
+    return SweepProgram(manifest, loaded.mechanism, build_widest_loop(loaded, manifest.works), loaded.gains)
 
 
 def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
@@ -65,7 +65,7 @@ def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
     return model.loop(loaded.mechanism, loaded.compensator, scenarios, energies=works, exact=works)
 
 
-def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = None) -> Rows:
+def run_chunk(sweep: SweepProgram, first: int, number: int, precision: str | None = None) -> Rows:
     """Compute the rows of scenarios `first` to `first + number - 1`; `number` is at most that of a chunk.
 
     A run that fails or becomes non-finite gives a row with that status.
@@ -73,7 +73,7 @@ def run_chunk(sweep: Sweep, first: int, number: int, precision: str | None = Non
     return _begin_evaluation(sweep, _draw_batch(sweep, first, number, precision))()
 
 
-def run_chunks(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
+def run_chunks(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
     """Yield the number and rows of each part; the next part is computed while the caller uses them."""
     running = None
     for part in parts:
@@ -105,13 +105,13 @@ def convert_precision(scenarios: Any, precision: str) -> Any:
     return jax.tree.map(cast, scenarios)
 
 
-def _draw_batch(sweep: Sweep, first: int, number: int, precision: str | None) -> _ScenarioBatch:
+def _draw_batch(sweep: SweepProgram, first: int, number: int, precision: str | None) -> _ScenarioBatch:
     manifest = sweep.manifest
     draws, scenarios = draw_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, first, number)
     return _ScenarioBatch(first, draws, convert_precision(scenarios, precision or manifest.precision))
 
 
-def _begin_evaluation(sweep: Sweep, batch: _ScenarioBatch) -> Callable[[], Rows]:
+def _begin_evaluation(sweep: SweepProgram, batch: _ScenarioBatch) -> Callable[[], Rows]:
     """Start the computation of a batch; return a function that waits for its rows."""
     manifest = sweep.manifest
     limit, works = manifest.error_limit, manifest.works

@@ -8,7 +8,7 @@ import numpy as np
 from tuning.caches.cluster import ClusterWorkers, WorkUnit
 from tuning.caches.worker import build_setting_error
 from tuning.sweeps import point_batches
-from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk
+from tuning.sweeps.chunks import Rows, SweepProgram, build_sweep, run_chunk
 from tuning.sweeps.manifest import decode_manifest, encode_manifest, list_process_differences
 from tuning.sweeps.run_sweep import ChunkComputer
 
@@ -18,7 +18,7 @@ BATCHES_PER_STUDY = 64  # number of pieces into which points are divided, for an
 def build_chunk_computer(workers: ClusterWorkers) -> ChunkComputer:
     """Return a function that computes parts on these workers."""
 
-    def run(sweep: Sweep, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
+    def run(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
         content = encode_manifest(sweep.manifest)
         pieces = (WorkUnit(part, (content, part)) for part in parts)
         # No setting is passed: each worker compares its own with the manifest.
@@ -31,7 +31,7 @@ def build_point_computer(workers: ClusterWorkers) -> point_batches.PointComputer
     """Return a function that computes points on these workers."""
 
     def run(
-        sweep: Sweep, pieces: Iterable[point_batches.PointBatch]
+        sweep: SweepProgram, pieces: Iterable[point_batches.PointBatch]
     ) -> Generator[tuple[str, Rows], None, None]:
         content = encode_manifest(sweep.manifest)
         tasks = (WorkUnit(piece.name, (content, piece.points, piece.noise)) for piece in pieces)
@@ -52,7 +52,7 @@ def run_manifest_points(content: bytes, at: np.ndarray, noise: np.ndarray) -> Ro
 
 
 @lru_cache(maxsize=2)
-def _load_sweep(content: bytes) -> Sweep:
+def _load_sweep(content: bytes) -> SweepProgram:
     manifest = decode_manifest(content, "sweep")
     for difference in list_process_differences(manifest):
         raise build_setting_error(difference, difference.startswith("xla_flags"))

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxhil.mechanism.uncertainty import draw_at_points
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints
-from tuning.sweeps.chunks import Rows, Sweep, convert_precision
+from tuning.sweeps.chunks import Rows, SweepProgram, convert_precision
 from tuning.sweeps.columns import build_rows
 
 MIN_POINTS_PER_BATCH = 256  # least number of points per piece if there are several
@@ -31,10 +31,10 @@ class PointBatch(NamedTuple):
 
 
 # Runs pieces and yields their names and rows in any order.
-PointComputer = Callable[[Sweep, Iterable[PointBatch]], Iterator[tuple[str, Rows]]]
+PointComputer = Callable[[SweepProgram, Iterable[PointBatch]], Iterator[tuple[str, Rows]]]
 
 
-def run_batch(sweep: Sweep, points: np.ndarray, noise: np.ndarray) -> Rows:
+def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Rows:
     """Compute `POINT_COLUMNS` of the scenarios at the points, at most a chunk, in order."""
     manifest = sweep.manifest
     scenarios = sweep.model.scenarios(sweep.mechanism, draw_at_points(sweep.mechanism, points), manifest.seed)
@@ -45,7 +45,7 @@ def run_batch(sweep: Sweep, points: np.ndarray, noise: np.ndarray) -> Rows:
     return {name: rows[name] for name in POINT_COLUMNS}
 
 
-def run_locally(sweep: Sweep, pieces: Iterable[PointBatch]) -> Iterator[tuple[str, Rows]]:
+def run_locally(sweep: SweepProgram, pieces: Iterable[PointBatch]) -> Iterator[tuple[str, Rows]]:
     """Run pieces one after the other in this process."""
     return ((piece.name, run_batch(sweep, piece.points, piece.noise)) for piece in pieces)
 
@@ -64,7 +64,7 @@ LOCAL_RUN = PointRunSettings()
 
 
 def run_points(
-    sweep: Sweep, points: np.ndarray, noise: np.ndarray, running: PointRunSettings = LOCAL_RUN
+    sweep: SweepProgram, points: np.ndarray, noise: np.ndarray, running: PointRunSettings = LOCAL_RUN
 ) -> Rows:
     """Compute `POINT_COLUMNS` of the scenarios at points (number, inputs) of the unit box, in order.
 

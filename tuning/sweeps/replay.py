@@ -9,7 +9,7 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.motion_curves import RunMotion, compute_scenario_motion
 from tuning.sweeps.chunk_file import list_different_columns
-from tuning.sweeps.chunks import Sweep, build_sweep, run_chunk
+from tuning.sweeps.chunks import SweepProgram, build_sweep, run_chunk
 from tuning.sweeps.draws import draw_scenarios
 from tuning.sweeps.manifest import load_gains
 from tuning.sweeps.store import SweepStore, read_row
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class ScenarioReplay(NamedTuple):
     """Stored and recomputed row of a scenario."""
 
-    sweep: Sweep
+    sweep: SweepProgram
     stored: dict[str, np.ndarray]  # stored row, arrays of length 1
     again: dict[str, np.ndarray]  # recomputed row
     different_columns: list[str]  # names of the columns that differ
@@ -38,7 +38,7 @@ def replay_scenario(store: SweepStore, index: int) -> ScenarioReplay:
     return ScenarioReplay(sweep, stored, again, list_different_columns(stored, again))
 
 
-def compute_motion(sweep: Sweep, index: int) -> list[RunMotion]:
+def compute_motion(sweep: SweepProgram, index: int) -> list[RunMotion]:
     """Return the motion of a one-axis scenario at every tick, for plots, in float64."""
     loaded = load_gains(sweep.manifest)
     gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
@@ -46,7 +46,7 @@ def compute_motion(sweep: Sweep, index: int) -> list[RunMotion]:
     return compute_scenario_motion(loaded._replace(gains=gains), lane)
 
 
-def record_six_axes(sweep: Sweep, index: int) -> "Recorded":
+def record_six_axes(sweep: SweepProgram, index: int) -> "Recorded":
     """Record every tick of a six-axis scenario."""
     from jaxhil.sixdof.recording import record_scenario
 
@@ -55,7 +55,7 @@ def record_six_axes(sweep: Sweep, index: int) -> "Recorded":
     return record_scenario(sweep.mechanism, sweep.loop, sweep.gains, lane)
 
 
-def _draw_scenario(sweep: Sweep, index: int) -> Any:
+def _draw_scenario(sweep: SweepProgram, index: int) -> Any:
     """Return the scenario as a batch of one lane, in float64."""
     manifest = sweep.manifest
     return draw_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tuning.statistics.intervals import is_narrow_enough
-from tuning.sweeps.chunks import Rows, Sweep, build_sweep, run_chunk, run_chunks
+from tuning.sweeps.chunks import Rows, SweepProgram, build_sweep, run_chunk, run_chunks
 from tuning.sweeps.columns import SCENARIO_OUTCOMES, list_contact_columns
 from tuning.sweeps.store import SweepStore, read_chunk, remove_chunks, write_chunk
 from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally
@@ -25,7 +25,7 @@ COMPARED_SCENARIOS = 4096  # number of scenarios that a float32 sweep also runs 
 # Called with the number of rows of a part, found or computed, and the tally so far.
 ChunkProgress = Callable[[int, Tally], None]
 # Computes parts of a sweep and yields their numbers and rows in any order.
-ChunkComputer = Callable[[Sweep, Iterable[int]], Generator[tuple[int, Rows], None, None]]
+ChunkComputer = Callable[[SweepProgram, Iterable[int]], Generator[tuple[int, Rows], None, None]]
 
 
 class PrecisionComparison(NamedTuple):
@@ -41,7 +41,7 @@ class PrecisionComparison(NamedTuple):
 
 def run_sweep(
     store: SweepStore, found: ChunkProgress, computed: ChunkProgress, computer: ChunkComputer = run_chunks
-) -> tuple[Sweep, Tally]:
+) -> tuple[SweepProgram, Tally]:
     """Compute and write every missing part, up to the end of the sweep; return the sweep and its tally.
 
     `found` is called for stored parts, `computed` for new ones. Raise `InputError` if a part cannot be
@@ -66,7 +66,7 @@ def run_sweep(
     return sweep, tally
 
 
-def compare_precisions(sweep: Sweep, number: int = COMPARED_SCENARIOS) -> PrecisionComparison:
+def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) -> PrecisionComparison:
     """Compare float32 with float64 on the first `number` scenarios."""
     number = min(number, sweep.manifest.chunk, sweep.manifest.scenarios)
     single, double = (run_chunk(sweep, 0, number, precision) for precision in ("float32", "float64"))
@@ -89,7 +89,11 @@ def count_outcomes(tally: Tally) -> dict[str, int]:
 
 
 def _run_until_narrow(
-    store: SweepStore, sweep: Sweep, found: ChunkProgress, computed: ChunkProgress, computer: ChunkComputer
+    store: SweepStore,
+    sweep: SweepProgram,
+    found: ChunkProgress,
+    computed: ChunkProgress,
+    computer: ChunkComputer,
 ) -> Tally:
     """Run a sweep with `until_width`; return the tally of the parts up to its end."""
     manifest = store.manifest

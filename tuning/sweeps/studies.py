@@ -19,7 +19,7 @@ from tuning.statistics.subset_simulation import (
     convert_to_uniform,
     subset_simulation,
 )
-from tuning.sweeps.chunks import Sweep
+from tuning.sweeps.chunks import SweepProgram
 from tuning.sweeps.columns import SCENARIO_OUTCOMES, UNLIKE_IDEAL
 from tuning.sweeps.point_batches import LOCAL_RUN, PointRunSettings, run_points
 from tuning.sweeps.tally import compute_error_sizes
@@ -58,7 +58,9 @@ class ErrorIndices(NamedTuple):
     capped: int  # number of scenarios that reached the cap or had no error
 
 
-def compute_error_indices(sweep: Sweep, number: int, running: PointRunSettings = LOCAL_RUN) -> ErrorIndices:
+def compute_error_indices(
+    sweep: SweepProgram, number: int, running: PointRunSettings = LOCAL_RUN
+) -> ErrorIndices:
     """Compute Sobol indices of the worst |error| from `number` (a power of two) x (inputs + 2) scenarios.
 
     An input is a key of the mechanism's uncertainty with all its entries. Correlated keys are one input,
@@ -108,7 +110,7 @@ def count_most_scenarios(samples: int = SUBSET_SAMPLES, replicates: int = SUBSET
 
 
 def estimate_rare_failure(
-    sweep: Sweep,
+    sweep: SweepProgram,
     limit: float,
     running: PointRunSettings = LOCAL_RUN,
     samples: int = SUBSET_SAMPLES,
@@ -138,5 +140,5 @@ def is_spread_beyond_formula(rare: SubsetSimulation) -> bool:
     return rare.coefficient_of_variation > MAX_SPREAD_RATIO * rare.formula_coefficient_of_variation
 
 
-def _has_noise(sweep: Sweep) -> bool:
+def _has_noise(sweep: SweepProgram) -> bool:
     return any(getattr(sweep.loop, f"has_{kind}noise", False) for kind in ("", "force_", "position_"))

@@ -24,7 +24,7 @@ from scipy.stats import binomtest, bootstrap
 
 from jaxhil.simulation.outcome import Outcome
 from tuning.statistics.bootstrap import ErrorIntervals, Interval, compute_error_intervals
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 
 METRIC_RESAMPLES = 999  # number of bootstrap resamples
 CONFIDENCE_LEVEL = 0.95
@@ -50,7 +50,7 @@ def compute_metrics(
     amplification: float,
     limit: float,
     seed: int,
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Compute all metrics of a compensator, by name (see the module's list).
 
     Args:
@@ -74,9 +74,9 @@ def compute_metrics(
     beyond = good & ((np.abs(plain.error) > limit) | plain.unlike)
     has_failed = np.any((plain.wanted & ~good) | beyond, axis=0)
     metrics = {
-        "rms": Estimate(_compute_rms(magnitudes), *ends.rms),
-        "p99": Estimate(_compute_percentile(magnitudes, 99), *ends.p99),
-        "worst": Estimate(float(np.max(magnitudes)) if len(magnitudes) else np.nan, np.nan, np.nan),
+        "rms": IntervalEstimate(_compute_rms(magnitudes), *ends.rms),
+        "p99": IntervalEstimate(_compute_percentile(magnitudes, 99), *ends.p99),
+        "worst": IntervalEstimate(float(np.max(magnitudes)) if len(magnitudes) else np.nan, np.nan, np.nan),
         "failures": estimate_share(has_failed),
     }
     metrics |= compute_transparency_metrics(outcomes, pushed, unpushed, seed)
@@ -87,7 +87,7 @@ def compute_metrics(
     metrics["trajectory"] = bootstrap_metric(
         _compute_resampled_rms, seed, good, plain.metrics.trajectory_error / depth
     )
-    metrics["noise"] = Estimate(amplification, np.nan, np.nan)
+    metrics["noise"] = IntervalEstimate(amplification, np.nan, np.nan)
     return metrics
 
 
@@ -96,7 +96,7 @@ def compute_transparency_metrics(
     pushed: tuple[Float[np.ndarray, "scenarios"], Float[np.ndarray, "scenarios"]],
     unpushed: Float[np.ndarray, "scenarios"],
     seed: int,
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Compute the metrics `early`, `late`, `slope` and `peak`, with the arguments of `compute_metrics`."""
     plain: Any = outcomes.plain
     damped: Any = outcomes.damped
@@ -134,10 +134,10 @@ def fit_slope(
     return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 
 
-def estimate_share(yes: Bool[np.ndarray, "scenarios"]) -> Estimate:
+def estimate_share(yes: Bool[np.ndarray, "scenarios"]) -> IntervalEstimate:
     """Return the fraction of true values, with its Clopper-Pearson interval."""
     ends = binomtest(int(np.sum(yes)), len(yes)).proportion_ci(CONFIDENCE_LEVEL, method="exact")
-    return Estimate(float(np.mean(yes)), float(ends.low), float(ends.high))
+    return IntervalEstimate(float(np.mean(yes)), float(ends.low), float(ends.high))
 
 
 def bootstrap_metric(
@@ -145,7 +145,7 @@ def bootstrap_metric(
     seed: int,
     good: Bool[np.ndarray, "slots scenarios"],
     *data: Float[np.ndarray, "slots scenarios"],
-) -> Estimate:
+) -> IntervalEstimate:
     """Compute a metric of contacts with its percentile bootstrap interval.
 
     The bootstrap resamples whole scenarios, because the contacts of a scenario are not independent.
@@ -160,7 +160,7 @@ def bootstrap_metric(
     """
     slots, scenarios = np.any(good, axis=1), np.any(good, axis=0)
     if np.sum(scenarios) < 2:
-        return Estimate(np.nan, np.nan, np.nan)
+        return IntervalEstimate(np.nan, np.nan, np.nan)
     samples = [np.where(good, values, np.nan)[slots][:, scenarios] for values in data]
 
     def evaluate_contacts(*resamples: np.ndarray, axis: int) -> np.ndarray:
@@ -180,10 +180,10 @@ def bootstrap_metric(
             method="percentile",
             rng=np.random.default_rng(seed),
         ).confidence_interval
-    return Estimate(float(value), float(ends.low), float(ends.high))
+    return IntervalEstimate(float(value), float(ends.low), float(ends.high))
 
 
-def compute_distance_from_best(name: str, metric: Estimate) -> Estimate:
+def compute_distance_from_best(name: str, metric: IntervalEstimate) -> IntervalEstimate:
     """Return the distance of a metric from its best value, which is 1 for `BEST_AT_ONE` and otherwise 0.
 
     The bounds of the distance are NaN if the metric has no interval.
@@ -192,10 +192,10 @@ def compute_distance_from_best(name: str, metric: Estimate) -> Estimate:
         return metric
     ends = sorted((abs(metric.low - 1), abs(metric.high - 1)))
     straddles = metric.low <= 1 <= metric.high
-    return Estimate(abs(metric.value - 1), 0.0 if straddles else ends[0], ends[1])
+    return IntervalEstimate(abs(metric.value - 1), 0.0 if straddles else ends[0], ends[1])
 
 
-def find_winner(name: str, figures: dict[str, Estimate]) -> str | None:
+def find_winner(name: str, figures: dict[str, IntervalEstimate]) -> str | None:
     """Return the compensator whose metric is significantly the best, or None.
 
     Its interval must not overlap with the interval of any other compensator. `figures` contains the metric

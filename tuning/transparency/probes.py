@@ -27,7 +27,7 @@ from jaxhil.laws.compensators import get_compensator
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
-from tuning.statistics.intervals import Estimate
+from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.damping_perturbations import perturb_damping
 from tuning.transparency.metrics import PerturbedOutcomes, compute_transparency_metrics
 from tuning.transparency.pushes import EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE, add_probe, compute_ideal_contacts
@@ -107,7 +107,9 @@ def _add_push(
     return pushed._replace(reference=reference)
 
 
-def compute_probe_metrics(probed: ProbedScenarios, outcome: Outcome, seed: int = 0) -> dict[str, Estimate]:
+def compute_probe_metrics(
+    probed: ProbedScenarios, outcome: Outcome, seed: int = 0
+) -> dict[str, IntervalEstimate]:
     """Compute the metrics `early`, `late`, `slope` and `peak` from the outcome of probed scenarios.
 
     The leaves of `outcome` have the shape (slots, scenarios, `LANES_PER_SCENARIO`).

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from jaxhil.simulation.metrics import OK
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.audit import AuditedContacts, AuditRules, audit_contacts, find_first_true
-from tuning.watchdog.expectation import ContactFeatures, Expectation, expected_restitution
+from tuning.watchdog.expectation import ContactFeatures, ExpectationFit, expected_restitution
 from tuning.watchdog.recording import RecordedRuns
 from tuning.watchdog.signal_extremes import SignalExtremes, find_signal_extremes
 
@@ -72,7 +72,7 @@ def extract_features(audited: AuditedContacts) -> ContactFeatures:
 
 def compute_alarm_rates(
     runs: EvaluatedRuns,
-    expectation: Expectation,
+    expectation: ExpectationFit,
     limits: Mapping[str, float | None],
     limit: float,
     mass: float,
@@ -118,7 +118,7 @@ def compute_alarm_rates(
 
 
 def find_alarms(
-    runs: EvaluatedRuns, expectation: Expectation, limits: Mapping[str, float | None], mass: float
+    runs: EvaluatedRuns, expectation: ExpectationFit, limits: Mapping[str, float | None], mass: float
 ) -> Bool[np.ndarray, "slots lanes"]:
     """Return whether the watchdog raises an alarm, for each contact."""
     audited = runs.audited

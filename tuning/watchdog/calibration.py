@@ -30,7 +30,7 @@ from tuning.watchdog.alarms import (
     find_reached_contacts,
 )
 from tuning.watchdog.audit import AuditRules
-from tuning.watchdog.expectation import ContactFeatures, Expectation, fit_expectation
+from tuning.watchdog.expectation import ContactFeatures, ExpectationFit, fit_expectation
 from tuning.watchdog.fault_injection import compute_fault_rates
 from tuning.watchdog.margin import choose_restitution_margin
 from tuning.watchdog.recording import LANES_PER_RECORDING, ScenarioSelection, record_selection
@@ -170,7 +170,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
 
 def fit_reached_contacts(
     runs: EvaluatedRuns, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
-) -> Expectation:
+) -> ExpectationFit:
     """Fit the expected restitution to the contacts that the rig would reach in the chosen runs."""
     use = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     run = np.broadcast_to(np.cumsum(chosen), use.shape)[use]

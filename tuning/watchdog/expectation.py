@@ -21,7 +21,7 @@ RANGE_EXTENSION = 0.1  # extension of a fitted range on each side, divided by it
 SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the largest, count as 0 [1]
 
 
-class Expectation(NamedTuple):
+class ExpectationFit(NamedTuple):
     """Fitted polynomial of the expected restitution in p, w and z (see the module's text)."""
 
     coefficients: dict[str, float]  # coefficient of each of `POLYNOMIAL_TERMS` [1]
@@ -51,7 +51,7 @@ class ContactFeatures(NamedTuple):
     velocity: Float[np.ndarray, "*shape"]  # approach speed [m/s]
 
 
-def expected_restitution(expectation: Expectation, features: ContactFeatures, mass: float) -> np.ndarray:
+def expected_restitution(expectation: ExpectationFit, features: ContactFeatures, mass: float) -> np.ndarray:
     """Return the expected restitution of contacts [1], as `jaxhil.rig.watchdog.Expectation` computes it."""
     p, w, z = _normalise_features(features, expectation.stiffness, expectation.velocity, mass)
     p = _clip_to_range(np.where(features.stiffness > 0, p, np.inf), expectation.softness)
@@ -68,7 +68,7 @@ def fit_expectation(
     run: np.ndarray,
     mass: float,
     sufficient: float,
-) -> Expectation:
+) -> ExpectationFit:
     """Fit the expected restitution to the ideal restitution e* of contacts, by least squares.
 
     Every set of `TERM_SETS` is first fitted to half of the runs. The simplest set is selected whose rms
@@ -88,7 +88,7 @@ def fit_expectation(
     if not np.any(observable):
         mean = float(np.mean(reference)) if len(reference) else 1.0
         span = (0.0, 0.0)
-        return Expectation({**dict.fromkeys(POLYNOMIAL_TERMS, 0.0), "1": mean}, 1.0, 1.0, span, span, span)
+        return ExpectationFit({**dict.fromkeys(POLYNOMIAL_TERMS, 0.0), "1": mean}, 1.0, 1.0, span, span, span)
     features = ContactFeatures(*(leaf[observable] for leaf in features))
     reference, run = reference[observable], run[observable]
     stiffness, velocity = float(np.median(features.stiffness)), float(np.median(features.velocity))
@@ -104,7 +104,7 @@ def fit_expectation(
         **dict.fromkeys(POLYNOMIAL_TERMS, 0.0),
         **dict(zip(terms, map(float, solved), strict=True)),
     }
-    return Expectation(coefficients, stiffness, velocity, *(_find_range(share) for share in (p, w, z)))
+    return ExpectationFit(coefficients, stiffness, velocity, *(_find_range(share) for share in (p, w, z)))
 
 
 def _compute_validation_rms(columns, terms, reference, fitted: Bool[np.ndarray, "contacts"]) -> float:

@@ -32,7 +32,7 @@ from tuning.statistics.intervals import binomial_interval, estimate_deciding_sce
 from tuning.sweeps.draws import draw_scenarios
 from tuning.watchdog.alarms import BAD_ERROR_FACTOR, evaluate_runs, find_alarms
 from tuning.watchdog.audit import AuditRules, find_first_true
-from tuning.watchdog.expectation import Expectation
+from tuning.watchdog.expectation import ExpectationFit
 from tuning.watchdog.recording import record_runs
 
 MAX_FAULT_ERROR = 1.25  # largest restitution error of a used scenario, divided by the limit [1]
@@ -77,7 +77,7 @@ def compute_fault_rates(
     loaded: LoadedGains,
     rules: AuditRules,
     free_distance: float,
-    expectation: Expectation,
+    expectation: ExpectationFit,
     limits: Mapping[str, float | None],
     limit: float,
     number: int,
@@ -240,7 +240,7 @@ def _compute_missed_rate(
     usable: np.ndarray,
     rules: AuditRules,
     free_distance: float,
-    expectation: Expectation,
+    expectation: ExpectationFit,
     limits: Mapping[str, float | None],
     limit: float,
 ) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from tuning.watchdog.alarms import (
     find_good_runs,
     find_reached_contacts,
 )
-from tuning.watchdog.expectation import Expectation, expected_restitution
+from tuning.watchdog.expectation import ExpectationFit, expected_restitution
 
 UNSEEN_RUN_FACTOR = 1.25  # bound for other runs, divided by the largest value in the used runs [1]
 # Smallest margin, and margin for an accurate expectation, divided by the limit [1].
@@ -38,7 +38,7 @@ class RestitutionMargin(NamedTuple):
 
 def choose_restitution_margin(
     runs: EvaluatedRuns,
-    expectation: Expectation,
+    expectation: ExpectationFit,
     limit: float,
     mass: float,
     fitted: Bool[np.ndarray, "lanes"],

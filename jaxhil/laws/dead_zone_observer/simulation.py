@@ -78,7 +78,7 @@ class DeadZoneObserverState(NamedTuple):
     line: DelayLine  # measured positions
 
 
-class Prepared(NamedTuple):
+class PreparedObserver(NamedTuple):
     """Gains and filter coefficients, computed once per run."""
 
     gains: Gains
@@ -120,7 +120,7 @@ class DeadZoneObserver(Compensator):
         period = constants.control_period
         corner = (2 * math.pi) * gains["observer_bandwidth"] * period
         scale = 1 / (2 + corner)
-        return Prepared(
+        return PreparedObserver(
             gains,
             constants.clearance,
             build_lead_filter(gains, constants),

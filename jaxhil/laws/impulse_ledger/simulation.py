@@ -11,12 +11,12 @@ from jaxhil.laws.impulse_ledger import rig, specified
 from jaxhil.laws.impulse_ledger.alignment.simulation import Aligned, align
 from jaxhil.laws.impulse_ledger.contact_model import simulation as contact_model
 from jaxhil.laws.impulse_ledger.contact_model.rig import HINGES
-from jaxhil.laws.impulse_ledger.contact_model.simulation import Estimate, dot, features
+from jaxhil.laws.impulse_ledger.contact_model.simulation import ContactModelEstimate, dot, features
 from jaxhil.laws.impulse_ledger.onset_detection import simulation as onset_detection
 from jaxhil.laws.impulse_ledger.onset_detection.rig import LEVEL, SETTLING
 from jaxhil.laws.impulse_ledger.onset_detection.simulation import FreeFlight
 from jaxhil.laws.impulse_ledger.reference_trajectory import simulation as reference_trajectory
-from jaxhil.laws.impulse_ledger.reference_trajectory.simulation import Reference
+from jaxhil.laws.impulse_ledger.reference_trajectory.simulation import ReferenceTrajectory
 from jaxhil.laws.shared import nominal_values
 from jaxhil.laws.shared.delay_line import (
     DelayInPeriods,
@@ -78,7 +78,7 @@ GAINS: tuple[Gain, ...] = (
 )  # fmt: skip
 
 
-class Contact(NamedTuple):
+class LedgerContact(NamedTuple):
     """State of one contact."""
 
     side: Float[Array, "*batch"]  # direction in which the surface is approached, 1 or -1
@@ -88,8 +88,8 @@ class Contact(NamedTuple):
     deepest: Float[Array, "*batch"]  # largest depth of the hardware [s]
     peak: Float[Array, "*batch"]  # largest reading so far [1/s]
     outside: Float[Array, "*batch"]  # ticks since the hardware left the surface
-    estimate: Estimate  # of the contact model
-    reference: Reference
+    estimate: ContactModelEstimate  # of the contact model
+    reference: ReferenceTrajectory
     delay: Float[Array, "*batch"]  # mean of the delay after this contact [s]
     variance: Float[Array, "*batch"]  # its variance [s^2]
 
@@ -101,12 +101,12 @@ class LedgerState(NamedTuple):
     aligned: Aligned  # measured positions as old as the force
     flight: FreeFlight  # readings in free flight
     in_contact: Bool[Array, "*batch"]
-    contact: Contact
+    contact: LedgerContact
     delay: Float[Array, "*batch"]  # estimated delay of the force beyond the specified one [s]
     variance: Float[Array, "*batch"]  # of the delay [s^2]
 
 
-class Prepared(NamedTuple):
+class PreparedLedger(NamedTuple):
     """Gains and constants, computed once per run."""
 
     gains: Gains  # of the batch shape
@@ -134,7 +134,7 @@ class ImpulseLedger(Compensator):
         full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
         delay = full["identification_delay"]
         line = split_delay(jnp.where(delay > period, delay - period, 0), period)
-        return Prepared(full, constants, line, jnp.where(delay > period, 1, delay / period))
+        return PreparedLedger(full, constants, line, jnp.where(delay > period, 1, delay / period))
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
@@ -145,7 +145,7 @@ class ImpulseLedger(Compensator):
             aligned=Aligned(zeros, zeros),
             flight=FreeFlight(*[zeros] * len(FreeFlight._fields)),
             in_contact=zeros > 0,
-            contact=Contact(
+            contact=LedgerContact(
                 zeros, zeros, zeros, zeros, zeros, zeros, zeros, estimate, reference, zeros, zeros
             ),
             delay=zeros,
@@ -230,7 +230,7 @@ class ImpulseLedger(Compensator):
         zeros = jnp.zeros_like(speed)
         prior = self._prior(gains, state.variance)
         reference = reference_trajectory.begin((side * position - origin) / divisor, prior[0])
-        fresh = Contact(
+        fresh = LedgerContact(
             side, speed, origin, lag, zeros, zeros + rig.LEAST_PEAK, zeros,
             contact_model.begin(*prior), reference, zeros, state.variance,
         )  # fmt: skip

@@ -14,7 +14,7 @@ from jaxhil.laws.impulse_ledger.six_axes.booking.simulation import follow, onset
 from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
 from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
 from jaxhil.laws.impulse_ledger.six_axes.simulation import select, wrench_at_target
-from jaxhil.laws.impulse_ledger.six_axes.state import Contact, Flight, LedgerState, Prepared
+from jaxhil.laws.impulse_ledger.six_axes.state import FreeFlightState, LedgerState, Prepared, SixAxisContact
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import begin_estimate
 from jaxhil.laws.shared import nominal_values
 from jaxhil.laws.simulation_base import Gain
@@ -63,9 +63,9 @@ class ImpulseLedger(SixAxisCompensator):
             first=zeros,
             aligned=zeros,
             impulse=zeros,
-            flight=Flight(zeros, zero, zeros, zeros, zero, zero + LONG_AGO),
+            flight=FreeFlightState(zeros, zero, zeros, zeros, zero, zero + LONG_AGO),
             in_contact=zero > 0,
-            contact=Contact(zero, zero + 1, zeros, zeros, zeros, zeros, zero, zero, zero),
+            contact=SixAxisContact(zero, zero + 1, zeros, zeros, zeros, zeros, zero, zero, zero),
             estimate=prepared.prior,
         )
 

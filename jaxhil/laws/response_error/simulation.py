@@ -79,7 +79,7 @@ class ResponseErrorState(NamedTuple):
     line: DelayLine  # measured positions
 
 
-class Prepared(NamedTuple):
+class PreparedResponseError(NamedTuple):
     """Gains and filter coefficients, computed once per run."""
 
     gains: Gains
@@ -136,7 +136,7 @@ class ResponseError(Compensator):
         period = constants.control_period
         smoothing = 2 * gains["velocity_filter"]
         scale = 1 / (smoothing + period)
-        return Prepared(
+        return PreparedResponseError(
             gains,
             period,
             constants.clearance,

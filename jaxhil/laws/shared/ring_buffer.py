@@ -17,12 +17,13 @@ def look_back(
     ring: Float[Array, "samples *batch"],
     tick: Int[Array, ""],
     ticks: Int[Array, "*batch"],
-    known: Bool[Array, "*batch"] | bool = True,
+    is_available: Bool[Array, "*batch"] | bool = True,
     otherwise: Any = 0,
 ) -> Float[Array, "*batch"]:
-    """Return the sample written `ticks` before `tick`, less than `samples`; where not `known`, `otherwise`.
+    """Return the sample written `ticks` before `tick`, or `otherwise` where `is_available` is false.
 
-    If all lanes look back equally far, the result is one row of the ring, which is much faster than a gather.
+    `ticks` is less than `samples`. If all lanes look back equally far, the result is one row of the ring,
+    which is much faster than a gather.
     """
     first, mask = ticks.reshape(-1)[0], ring.shape[0] - 1
 
@@ -34,7 +35,9 @@ def look_back(
         return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]
 
     def chosen(read):
-        return lambda ring: read(ring) if known is True else jnp.where(known, read(ring), otherwise)
+        if is_available is True:
+            return read
+        return lambda ring: jnp.where(is_available, read(ring), otherwise)
 
     return lax.cond(jnp.all(ticks == first), chosen(row), chosen(lane_by_lane), ring)
 

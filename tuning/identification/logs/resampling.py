@@ -27,11 +27,11 @@ FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading tha
 EQUAL_RATE_TOLERANCE = 0.01  # relative difference; two rates with a smaller difference are equal
 
 
-def has_same_stamps(one: np.ndarray | None, other: np.ndarray | None) -> bool:
+def has_same_stamps(first: np.ndarray | None, other: np.ndarray | None) -> bool:
     """Return whether two channels have the same time stamps; None means that there are no stamps."""
-    if one is None or other is None:
-        return one is other
-    return one is other or np.array_equal(one, other)
+    if first is None or other is None:
+        return first is other
+    return first is other or np.array_equal(first, other)
 
 
 def check_lengths(label: str, columns: Mapping[str, np.ndarray], named: Mapping[str, str]) -> None:

@@ -17,7 +17,7 @@ from jaxhil.laws.impulse_ledger.contact_model import rig
 from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DELAY, DISSIPATIVE, PARAMETERS, PRELOAD
 
 
-class Estimate(NamedTuple):
+class ContactModelEstimate(NamedTuple):
     """Estimate of the parameters theta; attributes as of `ContactModel`."""
 
     mean: Float[Array, "parameters *batch"]
@@ -34,11 +34,11 @@ def prior(stiffness: Array, spreads: Sequence[Array], delay_variance: Array) -> 
     return mean, jnp.stack([*variances, delay_variance])
 
 
-def begin(mean: Array, variances: Array) -> Estimate:
+def begin(mean: Array, variances: Array) -> ContactModelEstimate:
     """Return the estimate before contact, from the prior's mean and variances."""
     zeros = jnp.zeros_like(mean[0])
     identity = np.eye(PARAMETERS, dtype=bool).reshape(PARAMETERS, PARAMETERS, *[1] * zeros.ndim)
-    return Estimate(mean, jnp.where(identity, variances[None], 0), mean, zeros, zeros)
+    return ContactModelEstimate(mean, jnp.where(identity, variances[None], 0), mean, zeros, zeros)
 
 
 def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) -> Array:
@@ -62,14 +62,16 @@ def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
     return jnp.where(total > 0, total, 0)
 
 
-def learn(old: Estimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]) -> Estimate:
+def learn(
+    old: ContactModelEstimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
+) -> ContactModelEstimate:
     """Update the estimate, where `used`, with one reading of the force [1/s] of this variance [1/s^2]."""
     column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
     used = used & (total > 0)  # unless rounding has spoilt the covariance
     share = jnp.where(used, 1 / jnp.where(used, total, 1), 0)
     error = force - dot(phi, old.mean)
-    return Estimate(
+    return ContactModelEstimate(
         old.mean + column * (share * error)[None],
         old.covariance - (share[None] * column)[:, None] * column[None],
         old.theta,
@@ -78,7 +80,9 @@ def learn(old: Estimate, phi: Array, force: Array, variance: Array, used: Bool[A
     )
 
 
-def conclude(estimate: Estimate, prior_variances: Array, delay: Array) -> Float[Array, "parameters *batch"]:
+def conclude(
+    estimate: ContactModelEstimate, prior_variances: Array, delay: Array
+) -> Float[Array, "parameters *batch"]:
     """Return theta for a known delay [s], with dissipative parameters zero or positive."""
     rows = [estimate.covariance[j] for j in rig.CONCLUDED]
     mean, rows = _observe(estimate.mean, rows, len(DISSIPATIVE), DELAY, rig.EXACT * delay, rig.EXACT)
@@ -88,7 +92,7 @@ def conclude(estimate: Estimate, prior_variances: Array, delay: Array) -> Float[
 
 
 def estimate_delay(
-    estimate: Estimate, prior_mean: Array, variances: Array, preload: Array, preload_spread: Array
+    estimate: ContactModelEstimate, prior_mean: Array, variances: Array, preload: Array, preload_spread: Array
 ) -> tuple[Array, Array]:
     """Return mean [s] and variance [s^2] of the delay after a contact."""
     mean = jnp.stack([estimate.mean[j] for j in rig.DELAY_PARAMETERS])

@@ -14,7 +14,7 @@ from jaxhil.laws.impulse_ledger.contact_model.simulation import dot, features, f
 from jaxhil.laws.impulse_ledger.reference_trajectory.rig import FARTHEST, FASTEST, STEPS
 
 
-class Reference(NamedTuple):
+class ReferenceTrajectory(NamedTuple):
     """State of the reference trajectory at the time of the last reading."""
 
     depth: Float[Array, "*batch"]  # x_r [s]
@@ -26,20 +26,24 @@ class Reference(NamedTuple):
     speeds: Float[Array, "parameters *batch"]  # sensitivities s' of the speed
 
 
-def begin(depth: Array, like: Array) -> Reference:
+def begin(depth: Array, like: Array) -> ReferenceTrajectory:
     """Return the trajectory at the onset, at a depth [s]; `like` has the shape of the parameters."""
     zeros = jnp.zeros_like(depth)
-    return Reference(depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like))
+    return ReferenceTrajectory(
+        depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)
+    )
 
 
-def correct(old: Reference, changes: Array) -> Reference:
+def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
     """Return the trajectory corrected for these `changes` of the parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
     speed = jnp.clip(old.speed + dot(old.speeds, changes), -FASTEST, FASTEST)
     return old._replace(depth=jnp.clip(old.depth + moved, -FARTHEST, FARTHEST), speed=speed)
 
 
-def advance(old: Reference, theta: Array, period: Array, reading: Array, measured: Array) -> Reference:
+def advance(
+    old: ReferenceTrajectory, theta: Array, period: Array, reading: Array, measured: Array
+) -> ReferenceTrajectory:
     """Return the trajectory one control period [s] later, at a reading [1/s] with the features `measured`."""
     depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
     speed = old.speed - period * old.force
@@ -59,10 +63,10 @@ def advance(old: Reference, theta: Array, period: Array, reading: Array, measure
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
     speed = jnp.clip(old.speed - 0.5 * period * (old.force + push), -FASTEST, FASTEST)
-    return Reference(depth, speed, push, deepest, released, depths, speeds)
+    return ReferenceTrajectory(depth, speed, push, deepest, released, depths, speeds)
 
 
-def bridge(now: Reference, theta: Array, duration: Array) -> tuple[Array, Array]:
+def bridge(now: ReferenceTrajectory, theta: Array, duration: Array) -> tuple[Array, Array]:
     """Return force [1/s] and speed after a `duration` [s] under the contact model."""
     step = duration / STEPS
 

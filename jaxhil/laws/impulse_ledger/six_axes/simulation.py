@@ -16,14 +16,14 @@ def product(matrix: Array, vector: Array) -> Float[Array, "6 *batch"]:
     return jnp.sum(matrix * vector[None], axis=1)
 
 
-def dot(one: Array, other: Array) -> Float[Array, "*batch"]:
+def dot(left: Array, other: Array) -> Float[Array, "*batch"]:
     """Return the scalar product."""
-    return jnp.sum(one * other, axis=0)
+    return jnp.sum(left * other, axis=0)
 
 
-def cross(one: Array, other: Array) -> Float[Array, "3 *batch"]:
+def cross(left: Array, other: Array) -> Float[Array, "3 *batch"]:
     """Return the vector product."""
-    (a, b, c), (x, y, z) = one, other
+    (a, b, c), (x, y, z) = left, other
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
@@ -54,8 +54,8 @@ def look_back(
 def select(condition: Bool[Array, "*batch"], new: Any, old: Any) -> Any:
     """Return the new leaves where the condition holds, else the old ones; lanes are the last axes."""
 
-    def either(one: Array, other: Array) -> Array:
-        return lax.select(jnp.broadcast_to(condition, one.shape), one, other)
+    def either(chosen: Array, other: Array) -> Array:
+        return lax.select(jnp.broadcast_to(condition, chosen.shape), chosen, other)
 
     return jax.tree.map(either, new, old)
 

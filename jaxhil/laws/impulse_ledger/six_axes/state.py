@@ -21,7 +21,7 @@ class Prepared(NamedTuple):
     prior: Estimate  # of the tangent model
 
 
-class Flight(NamedTuple):
+class FreeFlightState(NamedTuple):
     """Means over free flight."""
 
     bias: Six  # of the readings
@@ -32,7 +32,7 @@ class Flight(NamedTuple):
     quiet: Float[Array, "*batch"]  # ticks since the last reading in contact; many before the first one
 
 
-class Contact(NamedTuple):
+class SixAxisContact(NamedTuple):
     """State of one contact."""
 
     delay: Float[Array, "*batch"]  # D [ticks]
@@ -54,9 +54,9 @@ class LedgerState(NamedTuple):
     first: Six  # the same on the first tick
     aligned: Six  # measured pose as old as the reading of the last tick
     impulse: Six  # I_c, impulse commanded so far [N s, N m s]
-    flight: Flight
+    flight: FreeFlightState
     in_contact: Bool[Array, "*batch"]
-    contact: Contact
+    contact: SixAxisContact
     estimate: Estimate
 
 

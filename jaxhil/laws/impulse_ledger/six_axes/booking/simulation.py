@@ -9,10 +9,10 @@ from jaxhil.laws.impulse_ledger.six_axes.state import (
     DESIRED,
     IMPULSE,
     TWIST,
-    Contact,
     LedgerState,
     Prepared,
     Reading,
+    SixAxisContact,
 )
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
     Estimate,
@@ -24,7 +24,9 @@ from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
 from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
 
-def onset(prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals) -> Contact:
+def onset(
+    prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals
+) -> SixAxisContact:
     """Return the contact that begins with this reading (b).
 
     Its impulse is set when the delay line is read.
@@ -46,7 +48,7 @@ def onset(prepared: Prepared, state: LedgerState, reading: Reading, signals: Six
     delay = jnp.clip(delay, prepared.gains["identification_delay"] / period, longest)
     is_recent = flight.quiet * period < fixed.RECENT
     zeros = jnp.zeros_like(lag)
-    return Contact(
+    return SixAxisContact(
         delay=jnp.where(is_recent, last.delay, delay),
         speed=jnp.where(is_recent, last.speed, jnp.maximum(closing, slowest)),
         impulse=zeros,
@@ -63,9 +65,9 @@ def follow(
     prepared: Prepared,
     state: LedgerState,
     reading: Reading,
-    contact: tuple[Contact, Estimate, Bool[Array, "*batch"]],
+    contact: tuple[SixAxisContact, Estimate, Bool[Array, "*batch"]],
     tick: Int[Array, ""],
-) -> tuple[Six, Contact, Estimate]:
+) -> tuple[Six, SixAxisContact, Estimate]:
     """Return the command about C's origin, and the contact after a reading.
 
     Args:
@@ -146,7 +148,7 @@ def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
 
 
 def _direction(
-    prepared: Prepared, contact: Contact, reading: Reading, begins: Bool[Array, "*batch"]
+    prepared: Prepared, contact: SixAxisContact, reading: Reading, begins: Bool[Array, "*batch"]
 ) -> tuple[Six, Six]:
     """Return the contact's direction, and the filtered wrench that determines it.
 
@@ -161,7 +163,7 @@ def _direction(
 
 def _learned(
     prepared: Prepared,
-    contact: Contact,
+    contact: SixAxisContact,
     reading: Reading,
     estimate: Estimate,
     along: tuple[Six, Float[Array, "*batch"], Float[Array, "*batch"]],

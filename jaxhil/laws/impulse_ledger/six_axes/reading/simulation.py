@@ -11,7 +11,7 @@ from jaxhil.laws.impulse_ledger.six_axes.simulation import (
     running_mean,
     wrench_at_chaser,
 )
-from jaxhil.laws.impulse_ledger.six_axes.state import POSE, Flight, LedgerState, Prepared, Reading
+from jaxhil.laws.impulse_ledger.six_axes.state import POSE, FreeFlightState, LedgerState, Prepared, Reading
 from jaxhil.laws.shared.ring_buffer import write_sample
 from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
@@ -88,14 +88,14 @@ def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, ti
 
 
 def _fly(
-    flight: Flight,
+    flight: FreeFlightState,
     wrench: Six,
     signals: SixAxisSignals,
     pose: Six,
     free: Bool[Array, "*batch"],
     uniform: Bool[Array, "*batch"],
     period: Float[Array, "*batch"],
-) -> Flight:
+) -> FreeFlightState:
     """Update the bias where the tick is `free`, and lag and twist where the motion is `uniform` as well."""
     readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.LONGEST_MEAN)
     ticks = jnp.minimum(flight.ticks + 1, fixed.LONGEST_FLIGHT / period)

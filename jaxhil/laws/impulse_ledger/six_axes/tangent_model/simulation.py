@@ -60,8 +60,8 @@ def learn(
         variance: variance of the force's noise, over the squared speed [1/s^2].
         growth: factor by which forgetting increases the covariance in a tick.
     """
-    one = jnp.ones_like(path)
-    features = jnp.stack([path, rate, one, path * jnp.abs(path) / BEND])
+    unit = jnp.ones_like(path)
+    features = jnp.stack([path, rate, unit, path * jnp.abs(path) / BEND])
     column = jnp.sum(old.covariance * features[None], axis=1)
     error = variance + (MISFIT * force) ** 2 + LEAST_ERROR**2
     share = column / (error + dot(features, column))[None]
