@@ -58,7 +58,7 @@ def made(results):
     """Return fronts, and the number of programs needed to solve them."""
     cached_programs._programs.clear()
     every = dict(compute_fronts(results, POINTS))
-    count = sum(key[0].__name__ == "_advance" for key in cached_programs._programs)
+    count = sum(key[0].__name__ == "_solve_call" for key in cached_programs._programs)
     return [every[index] for index in range(len(MECHANISMS))], count
 
 
