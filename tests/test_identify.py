@@ -130,6 +130,23 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
     assert not result.good and any("--fix rig.contact_plane" in note for note in result.notes)
 
 
+def test_identify_finds_dead_zone_behind_a_surface_that_is_nearer_than_assumed():
+    """The readings then lack no force: a fit without a dead zone erred by 0.018 in e - e*, verdict good."""
+    campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
+    moved = [
+        replace(
+            run,
+            position_desired=run.position_desired - 6e-5,
+            position_measured=run.position_measured - 6e-5,
+        )
+        for run in campaign.runs
+    ]
+    result = identify(replace(campaign, runs=tuple(moved)), options=IdentificationOptions(law="kelvin_voigt"))
+    dead = result["rig.force_sensor.dead_zone"]
+    assert not result.good and dead.low <= 4.0 <= dead.high
+    assert any("--fix rig.contact_plane" in note for note in result.notes)
+
+
 @pytest.mark.parametrize("law", ["hunt_crossley", "piecewise_linear"])
 def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
     """Expect an interval of several newtons: 4 N of dead zone are as likely as a surface 33 um off."""

@@ -23,7 +23,7 @@ from tuning.identification.deep_contact import summarized
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse
-from tuning.identification.noise import NoiseEstimate
+from tuning.identification.noise import MIN_ZERO_SHARE, NoiseEstimate
 from tuning.identification.press_bias import find_bias_prior
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
@@ -166,7 +166,7 @@ def fit_contact(
     laws = (law, kelvin_voigt()) if evaluated and law.pulls else (law,)
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
     law = problem.law
-    if noise_is_hidden and not _has_dead_zone(posterior):
+    if noise_is_hidden and not _has_dead_zone(posterior) and not _is_silent_outside(runs, problem, posterior):
         # Without a dead zone, readings of 0 at rest do not show the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed)
     if noise_is_hidden and readings.bias is None and plane_option is None:
@@ -262,8 +262,7 @@ def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> 
 def _add_surface_uncertainty(posterior: Posterior, seed: int) -> Posterior:
     """Add the uncertainty of an assumed surface position to the posterior.
 
-    A shift of the surface and a change of the dead zone compensate for each other: both change the force by a
-    constant.
+    A surface further away lacks as much force as a dead zone removes: the readings determine only their sum.
     """
     names, draws = posterior.names, posterior.draws.copy()
     # The first coefficient of every law is its stiffness at the surface.
@@ -271,9 +270,9 @@ def _add_surface_uncertainty(posterior: Posterior, seed: int) -> Posterior:
     missing_force = -draws[:, names.index("bias")]
     surface = UNKNOWN_SURFACE_STD * np.random.default_rng(seed).standard_normal(len(draws))
     # The dead zone must not become negative.
-    surface = np.maximum(surface, -missing_force / slope)
+    surface = np.minimum(surface, missing_force / slope)
     draws[:, names.index("plane")] += surface
-    draws[:, names.index("bias")] -= slope * surface
+    draws[:, names.index("bias")] += slope * surface
     return replace(posterior, draws=draws)
 
 
@@ -325,6 +324,23 @@ def _has_dead_zone(posterior: Posterior) -> bool:
     """Return whether the measured force is significantly smaller than predicted, as with a dead zone."""
     missing_force = -posterior.draws[:, posterior.names.index("bias")]
     return bool(missing_force.mean() > MIN_DEAD_ZONE_SIGMAS * missing_force.std())
+
+
+def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
+    """Return whether most readings before and after the contacts are exactly 0.
+
+    Then the sensor has a dead zone. A fit does not show it if the surface is nearer than assumed, because the
+    readings then lack no force.
+    """
+    delay, plane, _ = posterior.best
+    position, _ = problem.motion.at(delay)
+    readings = [
+        run.force_measured[run.valid & (position[: len(run.tick), lane] < plane - 3.0 * UNKNOWN_SURFACE_STD)]
+        for lane, run in enumerate(runs)
+        if run.force_measured is not None
+    ]
+    outside = np.concatenate(readings)
+    return bool(len(outside) and np.mean(outside == 0.0) > MIN_ZERO_SHARE)
 
 
 def _estimate_noise_from_contact(

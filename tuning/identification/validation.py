@@ -308,6 +308,9 @@ def estimate_restitution_errors(
         if before <= 0.0 or after >= 0.0 or not run.valid[0] or run.position_desired[-1] > plane:
             continue
         touching = counts & (run.position_desired > plane - abs(before) * 0.02)
+        if not touching.any():
+            # All readings lie within a dead zone.
+            continue
         residual = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
         errors[lane] = -float(np.sum(residual * speed)) * period / scale / before
