@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.contact.dormand_prince import StepEnd, interpolate_step, take_step
+from jaxhil.lanes import select_lanes
 
 STEP_TOLERANCE = 1e-10  # error of a step relative to approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s; first step that is tried
@@ -254,7 +255,7 @@ def _integrate_phases(problem, records):
         search = _update_search(search, step, step * growth, value, at_start, crosses, is_located)
         # A batch element that is not finite ends here.
         after = after._replace(phase=jnp.where(jnp.isfinite(ratio), after.phase, ENDED))
-        return _select_lanes(is_accepted | ~jnp.isfinite(ratio), after, state), search, count + 1, nodes
+        return select_lanes(is_accepted | ~jnp.isfinite(ratio), after, state), search, count + 1, nodes
 
     def is_running(carry):
         state, _, count, _ = carry
@@ -303,7 +304,7 @@ def _update_search(search, step, proposed, value, at_start, crosses, is_located)
         side=side,
     )
     started = _Search(step, jnp.ones_like(search.tries), zeros, step, at_start, value, zeros)
-    return lax.stop_gradient(_select_lanes(crosses, started, narrowed))
+    return lax.stop_gradient(select_lanes(crosses, started, narrowed))
 
 
 def _update_state(problem, state, step, trial, rest, is_located):
@@ -370,8 +371,3 @@ def _interpolate_nodes(nodes, end, approach, times):
     rate = jnp.where(before, approach, jnp.where(after, last[2], rate))
     position = jnp.where(before, approach * requested, position)
     return position.reshape(times.shape), rate.reshape(times.shape)
-
-
-def _select_lanes(condition, when_true, when_false):
-    """Select between two trees of arrays, per batch element."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxhil.lanes import safe_sqrt
+
 
 class Push(NamedTuple):
     """Push on the hardware with the shape of a half-sine.
@@ -165,7 +167,7 @@ def update_deviation(
 def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
     """Return the root mean square of the deviation [m]; 0 before the first touch."""
     mean = deviation.squares / jnp.maximum(deviation.count, 1)
-    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
+    return safe_sqrt(mean)
 
 
 def _periods_since_touch(depth, rate, period):

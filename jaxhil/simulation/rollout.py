@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxhil.lanes import select_lanes
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.cells import IntervalInputs
 from jaxhil.simulation.contact_force import MotionSample, PlantSignals, SamplingInterval, no_contact
@@ -190,27 +191,27 @@ def begin_next_contacts(
             "recent_forces": watch.recent_forces,
             "command": watch.command,
         }
-        watch = _select_lanes(over, blank._replace(remaining_command=remaining_command, **unchanged), watch)
+        watch = select_lanes(over, blank._replace(remaining_command=remaining_command, **unchanged), watch)
         # A damped contact may end before the penetration does. The parameters of this contact apply until the
         # mechanism has left the surface.
         free = state.sensed.last.distance <= 0
-        state = state._replace(parameters=_select_lanes(free, entry, state.parameters))
+        state = state._replace(parameters=select_lanes(free, entry, state.parameters))
         if state.first_contact is not None:
             state = state._replace(
-                first_contact=_select_lanes(over, initial_first_contact(watch.approach), state.first_contact)
+                first_contact=select_lanes(over, initial_first_contact(watch.approach), state.first_contact)
             )
         if skip_flight:
             arrived, skipped = advance_to_surface(loop, rig, gains, state, watch, watch.command, run.tick)
             state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:
-        state = state._replace(parameters=_select_lanes(over, entry, state.parameters))
+        state = state._replace(parameters=select_lanes(over, entry, state.parameters))
         phase = _select_entry(scenario.phase, _select_slot(rig, index))
         entered, skipped = begin_approach(
             loop, rig, gains, state, phase, watch.rebound, run.tick, skip_flight
         )
         run = run._replace(skipped=run.skipped + jnp.where(over, skipped, 0))
         state = _restart(loop, gains, state, entered, over, over)
-        watch = _select_lanes(over, blank, watch)
+        watch = select_lanes(over, blank, watch)
     return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
 
 
@@ -260,16 +261,16 @@ def _restart(loop, gains, state, entered, begins, fresh):
         lagged=entered.sensed.lagged,
         first_position=entered.sensed.first_position,
     )
-    chosen = _select_lanes(
+    chosen = select_lanes(
         begins,
         entered._replace(sensed=None, controller=None, parameters=None),
         state._replace(sensed=None, controller=None, parameters=None),
     )
     sensed = sensed_at_entry._replace(
-        last=_select_lanes(begins, sensed_at_entry.last, state.sensed.last),
-        contact_time=_select_lanes(begins, sensed_at_entry.contact_time, state.sensed.contact_time),
+        last=select_lanes(begins, sensed_at_entry.last, state.sensed.last),
+        contact_time=select_lanes(begins, sensed_at_entry.contact_time, state.sensed.contact_time),
         lagged=jnp.where(begins, sensed_at_entry.lagged, state.sensed.lagged),
-        first_position=_select_lanes(begins, sensed_at_entry.first_position, state.sensed.first_position),
+        first_position=select_lanes(begins, sensed_at_entry.first_position, state.sensed.first_position),
     )
     return chosen._replace(
         sensed=sensed,
@@ -291,8 +292,3 @@ def _select_entry(table, index):
         return jnp.take_along_axis(leaf, indices, axis=0, mode="promise_in_bounds")[0]
 
     return jax.tree.map(pick, table)
-
-
-def _select_lanes(condition, when_true, when_false):
-    """Apply `jnp.where` to every array of two pytrees; the condition has the batch shape."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)

@@ -47,11 +47,11 @@ def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> t
     return solution, solve(matrix, right_slope - product(slope, solution))
 
 
-def product(left: Float[Array, "rows inner *batch"], other: Float[Array, "inner columns *batch"]) -> Array:
-    """Return the matrix product one @ other."""
-    total = left[:, 0, None] * other[None, 0]
-    for k in range(1, len(other)):
-        total = total + left[:, k, None] * other[None, k]
+def product(left: Float[Array, "rows inner *batch"], right: Float[Array, "inner columns *batch"]) -> Array:
+    """Return the matrix product left @ right."""
+    total = left[:, 0, None] * right[None, 0]
+    for k in range(1, len(right)):
+        total = total + left[:, k, None] * right[None, k]
     return total
 
 

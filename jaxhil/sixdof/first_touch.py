@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.bodies import Load, kick_drift
 from jaxhil.sixdof.candidates import Touch, motion_at
 from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
-from jaxhil.sixdof.space import Space, choose
+from jaxhil.sixdof.space import Space
 from jaxhil.sixdof.vectors import Vector
 
 TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
@@ -87,6 +88,6 @@ def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -
             return jnp.take_along_axis(jnp.broadcast_to(leaf, like.shape), index, axis=0)[0]
 
         deepest = jax.tree.map(pick, candidate), pick(depth)
-        best = deepest if best is None else choose(deepest[1] > best[1], deepest, best)
+        best = deepest if best is None else select_lanes(deepest[1] > best[1], deepest, best)
     assert best is not None
     return best[0]

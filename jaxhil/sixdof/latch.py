@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.relative import Pose, Twist, Wrench
 from jaxhil.sixdof.rotations import (
     Quaternion,
@@ -60,7 +61,7 @@ def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[
     first = fires & ~memory.caught
     now = Held(memory.caught | fires, point, attitude)
     memory = Held(
-        now.caught, *(_either(first, new, old) for new, old in zip(now[1:], memory[1:], strict=True))
+        now.caught, *(select_lanes(first, new, old) for new, old in zip(now[1:], memory[1:], strict=True))
     )
 
     displaced = point - memory.point
@@ -85,11 +86,6 @@ def _sine(attitude: Quaternion) -> Array:
     """Return the sine of half the angle of a rotation, without derivative."""
     v = attitude.v
     return jax.lax.stop_gradient(jnp.sqrt(v.x**2 + v.y**2 + v.z**2))
-
-
-def _either(condition: Array, when_true, when_false):
-    """Select leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), when_true, when_false)
 
 
 def _product(matrix: Array, linear: Vector, angular: Vector) -> tuple[Vector, Vector]:

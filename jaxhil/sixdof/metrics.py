@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import safe_sqrt
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.equations import square_root
@@ -21,7 +22,7 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relat
 from jaxhil.sixdof.rollout import CAPTURED, MISS, Episode, rollout
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, fly, scale, start_flight
-from jaxhil.sixdof.vectors import components, cross, dot, root
+from jaxhil.sixdof.vectors import components, cross, dot
 
 LEAST_SHARE = 0.05  # least energy of a first touch to which errors are related, over that of the approach
 
@@ -154,14 +155,14 @@ def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
     """Return the error of a twist in the norm of M, and its normal, lateral and rotational parts."""
     error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
-    size = root(_square(matrix, impulse))
+    size = safe_sqrt(_square(matrix, impulse))
     scale_ = 1 / jnp.where(size > 0, size, jnp.nan)
     half = square_root(matrix)
     weighed, along = (jnp.sum(half * vector[None], axis=1) for vector in (error, scale_[None] * impulse))
     normal = jnp.sum(weighed * along, axis=0)
     rest = weighed - normal[None] * along
-    lateral, rotational = (root(jnp.sum(part**2, axis=0)) for part in (rest[:3], rest[3:]))
-    total = root(_square(matrix, error))
+    lateral, rotational = (safe_sqrt(jnp.sum(part**2, axis=0)) for part in (rest[:3], rest[3:]))
+    total = safe_sqrt(_square(matrix, error))
     return total * scale_, normal * scale_, lateral * scale_, rotational * scale_
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.first_touch import Meeting, meet
 from jaxhil.sixdof.peaks import Peak, higher, no_peak
 from jaxhil.sixdof.relative import Pair, States, Twist, mass_matrix, relative
@@ -20,7 +21,6 @@ from jaxhil.sixdof.space import (
     Instant,
     Space,
     advance_flight,
-    choose,
     fly,
     scale,
     start_flight,
@@ -106,10 +106,10 @@ def follow_contact(space: Space, states: States, quiet: Array, until: Array, per
         left = until - passage.flight.time
         after, step = advance_flight(space, passage.flight, left, longest, approach.speed)
         # A rejected step changes only the length of the next one.
-        going = choose(step.accepted, _updated(passage, approach, after, step.now), passage)
+        going = select_lanes(step.accepted, _updated(passage, approach, after, step.now), passage)
         going = going._replace(flight=after)
         done = (until - after.time <= 1e-13 * until) | ~jnp.isfinite(after.time)
-        return choose(passage.active, going._replace(active=~done), passage)
+        return select_lanes(passage.active, going._replace(active=~done), passage)
 
     start = _start(space, states, jnp.minimum(FIRST, until))._replace(active=until > 0)
     passage = lax.while_loop(lambda passage: jnp.any(passage.active), body, start)
@@ -127,7 +127,7 @@ def past_at(reference: Reference, time: Array, common: Bool[Array, "*batch"]) ->
     past = reference.last
     for slot in range(GAPS):
         begin = jax.tree.map(lambda leaf, slot=slot: leaf[slot], reference.gaps.begin)
-        past = choose(common & (begin.time <= time) & (time < reference.gaps.end[slot]), begin, past)
+        past = select_lanes(common & (begin.time <= time) & (time < reference.gaps.end[slot]), begin, past)
     return past
 
 
@@ -220,8 +220,8 @@ def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) 
     touched = passage.touched + jnp.where(_touches(passage), step, 0)
     ahead = ahead._replace(
         touched=touched,
-        before=choose(touches == 0, now.states, passage.before),
-        depths=choose(first, depths, passage.depths),
+        before=select_lanes(touches == 0, now.states, passage.before),
+        depths=select_lanes(first, depths, passage.depths),
         force=higher(passage.force, norm(now.wrench.force), step, bends),
         moment=higher(passage.moment, norm(now.wrench.moment), step, bends),
     )

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import select_lanes
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.watch import DIVERGENCE_SPEED_RATIO
 from jaxhil.sixdof.first_touch import Meeting
@@ -19,7 +20,7 @@ from jaxhil.sixdof.loop import Loop, Rig, RunState, begin, build_rig, tick
 from jaxhil.sixdof.reference import Past, Reference, follow_contact, past_at
 from jaxhil.sixdof.relative import States
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.space import Space, choose
+from jaxhil.sixdof.space import Space
 from jaxhil.sixdof.watch import (
     Beginning,
     Watch,
@@ -128,10 +129,10 @@ def _tick(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> Episo
     runs = progress.active & (progress.lasted < last) & ~watch.beyond
     lasted = progress.lasted + runs.astype(jnp.int32)
     watched = watch_tick(rig, progress.beginning, watch, seen, after.states, lasted)
-    watched = choose(runs & ~watch.over, watched, watch)
+    watched = select_lanes(runs & ~watch.over, watched, watch)
     beyond = watch.beyond | (runs & ~rig.kinematics.reaches(after.hardware.commands[0]))
     return progress._replace(
-        run=after._replace(states=choose(runs, after.states, run.states)),
+        run=after._replace(states=select_lanes(runs, after.states, run.states)),
         watch=watched._replace(beyond=beyond),
         lasted=lasted,
     )
@@ -145,7 +146,7 @@ def _episode(
     lasted = (jnp.where(over, watch.end_tick, ticks) - beginning.tick).astype(period.dtype) * period
     return Episode(
         start=beginning.states,
-        end=choose(over, watch.end, states),
+        end=select_lanes(over, watch.end, states),
         lasted=lasted,
         meeting=beginning.reference.meeting,
         past=past_at(beginning.reference, lasted, over),
@@ -186,11 +187,11 @@ def _begin_next(rig: Rig, last: Array, progress: EpisodeProgress, begins: Array)
     def follow(beginning: Beginning) -> Beginning:
         reference = ideal_contact(rig, states, jnp.where(begins, last - age, 0))
         following = Beginning(states, age, relative_energy(rig, states), reference)
-        return choose(begins, following, beginning)
+        return select_lanes(begins, following, beginning)
 
     beginning = lax.cond(jnp.any(begins), follow, lambda beginning: beginning, progress.beginning)
     fresh = fresh_watch(rig, states, age)._replace(touching=watch.touching)
-    return progress._replace(beginning=beginning, watch=choose(begins, fresh, watch))
+    return progress._replace(beginning=beginning, watch=select_lanes(begins, fresh, watch))
 
 
 def _failure(rig: Rig, beginning: Beginning, watch: Watch, states: States) -> Array:

@@ -11,8 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxhil.lanes import safe_sqrt
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
-from jaxhil.sixdof.vectors import Vector, direction, dot, norm, root
+from jaxhil.sixdof.vectors import Vector, direction, dot, norm
 
 NEAR_AXIS = 1e-12  # m; distance from the axis below which the radial direction vanishes smoothly
 
@@ -132,7 +133,7 @@ class Rim(Shape):
     def surface(self, point):
         radius, outward = _radial(point)
         across, along = radius - self.ring_radius, point.z - self.height
-        apart = root(across**2 + along**2)
+        apart = safe_sqrt(across**2 + along**2)
         share = 1 / jnp.where(apart > 0, apart, 1)
         zero = jnp.zeros_like(along)
         normal = (share * across) * outward + Vector(zero, zero, share * along)

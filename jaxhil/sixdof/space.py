@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.contact.dormand_prince import take_looped_step
+from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
 from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_points, latch_wrench
@@ -158,7 +159,7 @@ def advance_flight(
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
     apart = lax.stop_gradient(_time_apart(space, now))
     moved = Flight(time, ahead, touching, memories, now.states, tries, apart)
-    after: Flight = choose(accepted, moved, flight._replace(length=ahead, tries=tries))
+    after: Flight = select_lanes(accepted, moved, flight._replace(length=ahead, tries=tries))
     # The integration stops after many steps with a mean below a thousandth of the longest step.
     endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
     time = jnp.where(endless, jnp.inf, after.time)
@@ -217,7 +218,7 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
     def body(flight):
         left = until - flight.time
         moved, _ = advance_flight(space, flight, left, longest, speed)
-        return choose(left > _nothing(until), moved, flight)
+        return select_lanes(left > _nothing(until), moved, flight)
 
     def ahead(flight):
         return jnp.any(until - flight.time > _nothing(until))
@@ -237,15 +238,6 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
     )
     apart = states.chaser.velocity - states.target.velocity
     return lax.stop_gradient(norm(apart) + norm(chaser - target) + 1e-9)
-
-
-def choose(condition: Array, first: Any, other: Any) -> Any:
-    """Select lane by lane; lanes are the last axes."""
-
-    def either(a: Array, b: Array) -> Array:
-        return lax.select(jnp.broadcast_to(condition, a.shape), a, b)
-
-    return jax.tree.map(either, first, other)
 
 
 def _nothing(until: Array) -> Array:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxhil.lanes import safe_sqrt
+
 
 class Vector(eqx.Module):
     """Three components, with sums, differences and `number * vector`."""
@@ -92,20 +94,13 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 def norm(a: Vector) -> Float[Array, "..."]:
     """Return the length; its derivative at 0 is 0."""
-    return root(dot(a, a))
+    return safe_sqrt(dot(a, a))
 
 
 def direction(a: Vector) -> Vector:
     """Return the unit vector along a; 0 if a is 0."""
     length = norm(a)
     return (1 / jnp.where(length > 0, length, 1)) * a
-
-
-def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root of a number >= 0; its derivative at 0 is 0."""
-    positive = square > 0
-    # The branch that is not selected must not be sqrt(0): its derivative would be 0 times infinity.
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
 
 
 @jax.jit

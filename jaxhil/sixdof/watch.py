@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import select_lanes
 from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.loop import Rig, Tick
@@ -18,7 +19,6 @@ from jaxhil.sixdof.peaks import Peak, higher, no_peak
 from jaxhil.sixdof.reference import Reference, is_quiet
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
-from jaxhil.sixdof.space import choose
 from jaxhil.sixdof.vectors import dot, norm
 
 QUIET = 0.06  # s; time without a touch, of rig and ideal contact, after which an episode is over
@@ -101,7 +101,7 @@ def watch_tick(
     ends = pauses & lax.cond(jnp.any(pauses), are_free, lambda: jnp.ones_like(pauses))
     return watch._replace(
         over=watch.over | ends,
-        end=choose(ends, after, watch.end),
+        end=select_lanes(ends, after, watch.end),
         end_tick=jnp.where(ends, ticks, watch.end_tick),
     )
 

@@ -1,12 +1,13 @@
 """Impulse ledger in JAX: the batched compensator of `rig.py` in this folder, which states the equations."""
 
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.contact.laws import deflection
+from jaxhil.lanes import safe_sqrt, select_lanes
 from jaxhil.laws.impulse_ledger import rig, specified
 from jaxhil.laws.impulse_ledger.alignment.simulation import Aligned, align
 from jaxhil.laws.impulse_ledger.contact_model import simulation as contact_model
@@ -25,7 +26,7 @@ from jaxhil.laws.shared.delay_line import (
     read_delayed,
     split_delay,
 )
-from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, rig_gain
+from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, clear_lanes, rig_gain
 
 USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter where the mechanism has less
 VELOCITY_GAIN = 105.0  # 1/s
@@ -153,7 +154,7 @@ class ImpulseLedger(Compensator):
         )
 
     def restart(self, gains, state, begins, fresh):
-        flight = jax.tree.map(lambda leaf: jnp.where(begins, 0, leaf), state.flight)
+        flight = clear_lanes(state.flight, begins)
         return state._replace(flight=flight, in_contact=state.in_contact & ~begins)
 
     def force_delay(self, gains, state):
@@ -181,7 +182,7 @@ class ImpulseLedger(Compensator):
         # Lanes of a tile touch at about the same time: most ticks of free flight need no contact.
         command, contact = jax.lax.cond(
             jnp.any(follows),
-            lambda old: _select(
+            lambda old: select_lanes(
                 follows,
                 self._follow(prepared, old, signals, position, velocity, flight, state.variance),
                 (jnp.zeros_like(position), old),
@@ -215,7 +216,7 @@ class ImpulseLedger(Compensator):
         side = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = side * signals.velocity_desired
         approaches = gains["equivalent_mass"] * speed > rig.LEAST_MOMENTUM
-        sigma = _sqrt(onset_detection.variance(flight, gains["force_noise"]))
+        sigma = safe_sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
         # The bias is known only after a reading of free flight, at an approach speed towards this side.
         settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
@@ -234,11 +235,11 @@ class ImpulseLedger(Compensator):
             side, speed, origin, lag, zeros, zeros + rig.LEAST_PEAK, zeros,
             contact_model.begin(*prior), reference, zeros, state.variance,
         )  # fmt: skip
-        contact = _select(free & approaches, fresh, contact)
+        contact = select_lanes(free & approaches, fresh, contact)
         contact = contact._replace(
             side=jnp.where(free, side, contact.side), speed=jnp.where(free & ~approaches, 0, contact.speed)
         )
-        return _select(free, onset_detection.learn(flight, signals.force_measured), flight), contact
+        return select_lanes(free, onset_detection.learn(flight, signals.force_measured), flight), contact
 
     def _follow(self, prepared, contact, signals, position, velocity, flight, delay_variance):
         """Return command [N] and contact after one reading."""
@@ -259,13 +260,13 @@ class ImpulseLedger(Compensator):
         estimate = contact_model.learn(estimate, phi, reading, variance, learns)
 
         onset = rig.ONSET_TICKS * period * contact_model.slope(estimate.mean, deepest)
-        onset = onset + gains["force_noise_floor"] + _sqrt(noise)
+        onset = onset + gains["force_noise_floor"] + safe_sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
         left = ~(depth > 0)
         delay = contact_model.estimate_delay(
             estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread
         )
-        mean, variance = _select(left, delay, (contact.delay, contact.variance))
+        mean, variance = select_lanes(left, delay, (contact.delay, contact.variance))
         ended = left & (rate < 0)
         theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, mean, 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
@@ -274,7 +275,7 @@ class ImpulseLedger(Compensator):
         push, ahead = reference_trajectory.bridge(reference, theta, contact.lag + 0.5 * period)
 
         secure = dot(phi[:HINGES], estimate.mean[:HINGES]) / jnp.maximum(depth, rig.SHALLOW)
-        predicted = _sqrt(secure - _sqrt(estimate.covariance[0, 0]))
+        predicted = safe_sqrt(secure - safe_sqrt(estimate.covariance[0, 0]))
         largest = jnp.maximum(contact.peak, reading)
         peak = jnp.maximum(largest, jnp.where(rate > rig.SLOWEST, predicted, 0))
         desired = side * signals.velocity_desired / speed
@@ -290,20 +291,6 @@ class ImpulseLedger(Compensator):
             delay=mean,
             variance=variance,
         )
-
-
-def _select(condition: Bool[Array, "*batch"], new: Any, old: Any) -> Any:
-    """Return the new leaves where the condition holds, else the old ones."""
-
-    def select(new: Array, old: Array) -> Array:
-        return jnp.where(jnp.expand_dims(condition, range(new.ndim - condition.ndim)), new, old)
-
-    return jax.tree.map(select, new, old)
-
-
-def _sqrt(value: Array) -> Array:
-    """Return the square root, with derivative 0 where the value is not positive."""
-    return jnp.where(value > 0, jnp.sqrt(jnp.where(value > 0, value, 1)), 0)
 
 
 COMPENSATOR = ImpulseLedger()

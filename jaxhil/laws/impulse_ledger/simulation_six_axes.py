@@ -10,10 +10,11 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
+from jaxhil.lanes import select_lanes
 from jaxhil.laws.impulse_ledger.six_axes.booking.simulation import follow, onset
 from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
 from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
-from jaxhil.laws.impulse_ledger.six_axes.simulation import select, wrench_at_target
+from jaxhil.laws.impulse_ledger.six_axes.simulation import wrench_at_target
 from jaxhil.laws.impulse_ledger.six_axes.state import FreeFlightState, LedgerState, Prepared, SixAxisContact
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import begin_estimate
 from jaxhil.laws.shared import nominal_values
@@ -73,7 +74,7 @@ class ImpulseLedger(SixAxisCompensator):
         state = record(prepared, state, signals, tick)
         reading, state = read(prepared, state, signals, tick)
         begins = reading.loud & ~state.in_contact
-        contact = select(begins, onset(prepared, state, reading, signals), state.contact)
+        contact = select_lanes(begins, onset(prepared, state, reading, signals), state.contact)
         in_contact = state.in_contact | reading.loud
         command, contact, estimate = follow(prepared, state, reading, (contact, state.estimate, begins), tick)
         quiet = jnp.where(reading.loud, 0, state.flight.quiet + 1)

@@ -3,9 +3,6 @@
 Vectors are (6, *batch), matrices (6, 6, *batch).
 """
 
-from typing import Any
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -16,20 +13,15 @@ def product(matrix: Array, vector: Array) -> Float[Array, "6 *batch"]:
     return jnp.sum(matrix * vector[None], axis=1)
 
 
-def dot(left: Array, other: Array) -> Float[Array, "*batch"]:
+def dot(a: Array, b: Array) -> Float[Array, "*batch"]:
     """Return the scalar product."""
-    return jnp.sum(left * other, axis=0)
+    return jnp.sum(a * b, axis=0)
 
 
-def cross(left: Array, other: Array) -> Float[Array, "3 *batch"]:
+def cross(left: Array, right: Array) -> Float[Array, "3 *batch"]:
     """Return the vector product."""
-    (a, b, c), (x, y, z) = left, other
+    (a, b, c), (x, y, z) = left, right
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x])
-
-
-def size(square: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the square root, with derivative 0 where the number is not positive."""
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def wrench_at_chaser(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
@@ -49,15 +41,6 @@ def look_back(
     whole = lax.stop_gradient(jnp.floor(ticks))
     newer, older = (_read(ring, tick - whole.astype(jnp.int32) - more) for more in (0, 1))
     return newer + (ticks - whole) * (older - newer)
-
-
-def select(condition: Bool[Array, "*batch"], new: Any, old: Any) -> Any:
-    """Return the new leaves where the condition holds, else the old ones; lanes are the last axes."""
-
-    def either(chosen: Array, other: Array) -> Array:
-        return lax.select(jnp.broadcast_to(condition, chosen.shape), chosen, other)
-
-    return jax.tree.map(either, new, old)
 
 
 def running_mean(mean: Array, value: Array, count: Array, used: Bool[Array, "*batch"]) -> Array:

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import safe_sqrt, select_lanes
 from jaxhil.laws.impulse_ledger.six_axes import constants as fixed
-from jaxhil.laws.impulse_ledger.six_axes.simulation import dot, look_back, product, select, size
+from jaxhil.laws.impulse_ledger.six_axes.simulation import dot, look_back, product
 from jaxhil.laws.impulse_ledger.six_axes.state import (
     DESIRED,
     IMPULSE,
@@ -38,9 +39,9 @@ def onset(
     twist = jnp.where(has_flown[None], flight.twist, signals.twist_desired)
     direction = reading.wrench / _size_of(prepared, reading.wrench)[None]
     closing, whole = -dot(direction, twist), dot(twist, product(mass, twist))
-    least = fixed.LEAST_SHARE * size(whole) + fixed.LEAST_TWIST
+    least = fixed.LEAST_SHARE * safe_sqrt(whole) + fixed.LEAST_TWIST
     is_closing = closing > least
-    slowest = fixed.LEAST_SPEED * size(whole) + fixed.LEAST_TWIST
+    slowest = fixed.LEAST_SPEED * safe_sqrt(whole) + fixed.LEAST_TWIST
     # Where the contact is across the motion, the delay is the mean over all directions.
     mean = dot(lag, product(mass, twist)) / (whole + fixed.LEAST_TWIST**2)
     delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
@@ -90,7 +91,7 @@ def follow(
     along = dot(old.modelled, product(inverse_mass, direction))
     turns = begins | (loud & (along < fixed.TURNED))
     modelled = jnp.where(turns[None], direction, old.modelled)
-    estimate = select(turns, prepared.prior, estimate)
+    estimate = select_lanes(turns, prepared.prior, estimate)
     path = jnp.where(turns, 0, old.path - dot(direction, reading.moved))
     force = dot(reading.wrench, product(inverse_mass, direction))
     estimate, tangent = _learned(prepared, old, reading, estimate, (direction, path, force))
@@ -137,14 +138,14 @@ def _correction(
     """Return the wrench that pays the unpaid impulse, with limited size."""
     wrench = -prepared.gains["velocity_gain"][None] * unpaid
     limit = prepared.gains["correction_limit"] * jnp.sqrt(stiffness) * speed
-    large = size(dot(wrench, product(prepared.constants.inverse_mass, wrench)))
+    large = safe_sqrt(dot(wrench, product(prepared.constants.inverse_mass, wrench)))
     return wrench * jnp.where(large > limit, limit / jnp.where(large > 0, large, 1), 1)[None]
 
 
 def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
     """Return the size of a wrench, never 0."""
     square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
-    return jnp.where(square > 0, size(square), 1)
+    return jnp.where(square > 0, safe_sqrt(square), 1)
 
 
 def _direction(
