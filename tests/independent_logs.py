@@ -35,9 +35,8 @@ class Kind:
     walk: float = 0.0  # N/sqrt(s), random walk of the force's bias
     lost: float = 0.0  # share of rows lost; stamps jitter, too
     force_clock: bool = False  # the force has stamps of its own and begins later
-    resampled: bool = (
-        False  # its readings are brought to these stamps by straight lines before they are logged
-    )
+    # its readings are brought to these stamps by straight lines before they are logged
+    resampled: bool = False
     late: int = 0  # rows by which the measured position begins later, with its stamps; logs in Parquet
 
 

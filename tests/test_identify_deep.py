@@ -11,7 +11,12 @@ from jaxhil.contact.laws import find_contact_law
 from tuning.identification.contact_fit import split_long_run
 from tuning.identification.contact_laws import kelvin_voigt
 from tuning.identification.contact_problem import ContactProblem
-from tuning.identification.deep_contact import COMPARED, deep_lanes, representative, summarized
+from tuning.identification.deep_contact import (
+    LANES_FOR_LAW_CHOICE,
+    find_deep_lanes,
+    select_representative_lanes,
+    summarise_deep_lanes,
+)
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 from tuning.identification.rational import STRUCTURES, MotionModel
@@ -44,7 +49,7 @@ def problem(law, time_constant=0.0, whitening=(1.0,), threshold=0.0, seconds=12.
 @pytest.mark.parametrize("threshold", [0.0, 0.5])
 def test_pseudo_rows_have_the_misfit_of_all_rows(law, lag, whitening, threshold):
     full = problem(law, lag, whitening, threshold)
-    few = summarized(full, (NEAR[0] - lag, 0.0))
+    few = summarise_deep_lanes(full, (NEAR[0] - lag, 0.0))
     assert few is not full
     for delay, plane in ((0.0037, 0.0), (0.0032, 3e-6), (0.0051, -2e-6)):
         exact, fit = full.at(delay - lag, plane), few.at(delay - lag, plane)
@@ -67,7 +72,7 @@ def test_pseudo_rows_have_the_misfit_of_all_rows(law, lag, whitening, threshold)
 )
 def test_all_rows_are_used_where_pseudo_rows_are_not_accurate(law, plane):
     full = problem(law)
-    few = summarized(full, NEAR)
+    few = summarise_deep_lanes(full, NEAR)
     exact, fit = full.at(0.0037, plane), few.at(0.0037, plane)
     np.testing.assert_array_equal(fit.coefficients, exact.coefficients)
     assert fit.misfit == exact.misfit
@@ -75,13 +80,13 @@ def test_all_rows_are_used_where_pseudo_rows_are_not_accurate(law, plane):
 
 def test_touches_are_never_summarized():
     full = problem(kelvin_voigt())
-    deep = deep_lanes(full.motion, 0.0)
+    deep = find_deep_lanes(full.motion, 0.0)
     assert deep.sum() >= 8 and not deep[-3:].any()
     short = problem(kelvin_voigt(), seconds=4.0)
-    assert summarized(short, NEAR) is short
+    assert summarise_deep_lanes(short, NEAR) is short
     long = problem(kelvin_voigt(), seconds=40.0)
-    lanes, total = representative(long), long.readings.force.shape[1]
-    assert len(lanes) < COMPARED + 8 < total and {total - 3, total - 2, total - 1} < {*lanes}
+    lanes, total = select_representative_lanes(long), long.readings.force.shape[1]
+    assert len(lanes) < LANES_FOR_LAW_CHOICE + 8 < total and {total - 3, total - 2, total - 1} < {*lanes}
 
 
 @pytest.mark.parametrize("whitening", [(1.0,), COLOURED])

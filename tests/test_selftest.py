@@ -129,7 +129,7 @@ def test_selftest_detects_damage_at_the_weak_points_of_its_guard(files, folder):
         ("\ncheck_this_file()\n", "\n"),
         ("good = not damaged", "good = True"),
         ("return good", "return True"),
-        ("!= own:", "== own:"),
+        ("!= digest:", "== digest:"),
         ('["selftest.py"]["sha256"]', '["selftest.pi"]["sha256"]'),
     ]:
         assert old in content, old

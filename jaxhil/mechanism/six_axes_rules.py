@@ -24,9 +24,8 @@ from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 __all__ = ["check_contact_names", "check_leg_values", "check_six_axes", "inertia_matrix"]
 
 MAX_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
-INERTIA_TOLERANCE = (
-    1e-9  # relative tolerance of the rule that no moment of inertia exceeds the sum of the others
-)
+# relative tolerance of the rule that no moment of inertia exceeds the sum of the others
+INERTIA_TOLERANCE = 1e-9
 MIN_INERTIA_RATIO = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia
 QUATERNION_TOLERANCE = 1e-6  # tolerance of a quaternion's norm, which is 1
 # Required and optional keys of each kind of axes of the motion simulator.

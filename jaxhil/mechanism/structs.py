@@ -46,10 +46,8 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-MAGNITUDE_LIMITS = (
-    1e-100,
-    1e100,
-)  # limits of nonzero numbers; a product of three neither overflows nor underflows
+# limits of nonzero numbers; a product of three neither overflows nor underflows
+MAGNITUDE_LIMITS = 1e-100, 1e100
 NO_METADATA: Mapping[str, Any] = {}  # metadata of a type without any
 
 # The type refers to the registry itself, because `jaxhil.register` adds laws later.

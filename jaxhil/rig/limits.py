@@ -23,10 +23,8 @@ from jaxhil.rig.bounds import (
 
 HELD_READINGS = 0.0, 1000.0  # ticks in a row
 TICK_COUNTS = 0.0, 1e6  # ticks; more than the longest gap that the clock counts
-RATIOS = (
-    0.0,
-    1e300,
-)  # of energies or restitutions; the upper bound is never reached, however slow the approach
+# of energies or restitutions; the upper bound is never reached, however slow the approach
+RATIOS = 0.0, 1e300
 FEATURES = -1e3, 1e3  # p, w and z of the expected restitution (`watchdog`)
 COEFFICIENTS = -1e9, 1e9  # of the polynomial in p, w and z
 

@@ -23,9 +23,8 @@ from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
 
-BOUND_TOLERANCE = (
-    1e-9  # [1]; relative tolerance, because bounds may be rounded differently on another machine
-)
+# [1]; relative tolerance, because bounds may be rounded differently on another machine
+BOUND_TOLERANCE = 1e-9
 
 
 class LoadedGains(NamedTuple):

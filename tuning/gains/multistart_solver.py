@@ -37,9 +37,8 @@ LANES_PER_TILE = 64  # lanes computed together on a device; more exceed the proc
 STEPS_BEFORE_SELECTION = 8  # steps of the first round
 MAX_CONTINUED_STARTS = 3  # starts of a task that continue after the first round
 MAX_STEPS_PER_CALL = 32  # largest number of steps of one call
-MIN_RELATIVE_IMPROVEMENT = (
-    0.005  # relative improvement in a round below which a start with probes counts as converged
-)
+# relative improvement in a round below which a start with probes counts as converged
+MIN_RELATIVE_IMPROVEMENT = 0.005
 STEP_LIMIT = SOLVER_STATUSES.index("step limit")
 GIVEN_UP = "given up"
 

@@ -38,12 +38,10 @@ from jaxhil.simulation.outcome import Outcome
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
 from tuning.transparency.probes import mask_probes
 
-RESIDUAL_SCALE = (
-    0.01  # error that makes a residual of 1; the solver's first damping is for residuals of order one
-)
-FAILED_CONTACT_ERROR = (
-    3.0  # error of a contact that does not end or is not reached, as of a strong divergence
-)
+# error that makes a residual of 1; the solver's first damping is for residuals of order one
+RESIDUAL_SCALE = 0.01
+# error of a contact that does not end or is not reached, as of a strong divergence
+FAILED_CONTACT_ERROR = 3.0
 PROBED_LANES_PER_TILE = 32  # lanes with probes that are computed together
 CVAR_TAIL_DIVISOR = 20  # cvar: the worst 1/TAIL of the contacts, at least one
 NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norms in the residuals
@@ -51,11 +49,8 @@ OBJECTIVE_NAMES = tuple(NORM_POWERS)
 WEIGHT_FIELDS = tuple(
     f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency")
 )
-LIMIT_SCALED_WEIGHTS = (
-    "command_weight",
-    "noise_weight",
-    "chatter_weight",
-)  # weights in multiples of the limit
+# weights in multiples of the limit
+LIMIT_SCALED_WEIGHTS = "command_weight", "noise_weight", "chatter_weight"
 # Factor on an error within the tolerance: of equally quiet gains the most accurate are wanted.
 TOLERATED_ERROR_FACTOR = 0.02
 

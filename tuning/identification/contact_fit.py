@@ -19,7 +19,7 @@ from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior, compute_posterior
-from tuning.identification.deep_contact import summarized
+from tuning.identification.deep_contact import summarise_deep_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse
@@ -286,7 +286,7 @@ def _fit_law(
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
     """Fit one law, with a sensor lag unless a dead zone hides the onset; return the log evidence last."""
-    problem = summarized(ContactProblem(motion, readings, law, plane), near)
+    problem = summarise_deep_lanes(ContactProblem(motion, readings, law, plane), near)
     posterior = compute_posterior(problem, seed, near)
     lag = None if noise_is_hidden else estimate_sensor_lag(problem, posterior, seed)
     return (
@@ -412,7 +412,7 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
     rest = ContactProblem(problem.motion, rest, fit.law, problem.plane, problem.time_constant)
     freedom = len(rest.kept) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
-    rest = summarized(rest, (delay, plane))
+    rest = summarise_deep_lanes(rest, (delay, plane))
     if rest.time_constant:
         best = search_coarsely(rest, (delay, plane, inner.misfit), 2)
         posterior = compute_posterior_at_lag(rest, best, fit.posterior, seed)

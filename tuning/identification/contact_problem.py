@@ -16,10 +16,18 @@ from scipy import special
 from scipy.signal import lfilter
 
 from tuning.identification.contact_laws import Law
-from tuning.identification.contact_regression import Inner, Pseudo, Solution, dot, force_of, solve, sums
+from tuning.identification.contact_regression import (
+    CoefficientFit,
+    LeastSquaresFit,
+    PseudoRows,
+    compute_force,
+    fit_coefficients,
+    sum_and_squares,
+    sum_products,
+)
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
-from tuning.identification.packed_rows import Packed, packed
+from tuning.identification.packed_rows import PackedRows, pack_rows
 from tuning.identification.sensor_filter import (
     compute_lag_weights,
     compute_onset_shares,
@@ -88,7 +96,7 @@ class ContactProblem:
         self.local = bool(readings.threshold)
         # Whitened and normalized reading out of contact for a bias of 1 N.
         self.bias_alone = 0.0 if self.local else float(np.sum(readings.whitening)) / readings.std
-        self.sums = sums(self.target)
+        self.sums = sum_and_squares(self.target)
         self.memory = len(readings.whitening) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
         )
@@ -113,7 +121,7 @@ class ContactProblem:
         """Return the same problem with another law and another lag of the sensor [s]."""
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
-    def at(self, delay: float, plane: float, pseudo: Pseudo | None = None) -> Inner:
+    def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at one delay [s] and plane [m], to the readings and to pseudo-rows.
 
         Rows in which the force of the law would be negative are treated as out of contact.
@@ -126,16 +134,18 @@ class ContactProblem:
         if pseudo is not None:
             by_plane = np.concatenate([by_plane, inner.coefficients @ pseudo.by_plane[0]])
         residual, design = fit.residual[0], fit.design[0]
-        along = dot(design, by_plane)
+        along = sum_products(design, by_plane)
         change = -inner.covariance @ along
-        slope, curvature = dot(residual, by_plane), dot(by_plane, by_plane) + along @ change
+        slope, curvature = sum_products(residual, by_plane), sum_products(by_plane, by_plane) + along @ change
         return replace(inner, slope=float(slope), curvature=float(curvature), plane=plane, by_plane=change)
 
-    def fit_surfaces(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None = None) -> list[Inner]:
+    def fit_surfaces(
+        self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
+    ) -> list[CoefficientFit]:
         """Fit the coefficients at several planes at once, without derivatives by the plane."""
         return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
-    def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: Pseudo | None):
+    def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None):
         """Fit at each plane, with the rows in contact updated until they agree with the fit.
 
         Returns:
@@ -155,14 +165,16 @@ class ContactProblem:
         self._guess = fit.coefficients[len(planes) // 2]
         return near, flags, fit
 
-    def _make_fits(self, fit: Solution) -> list[Inner]:
+    def _make_fits(self, fit: LeastSquaresFit) -> list[CoefficientFit]:
         """Return the fits of all planes as records, with the log posterior of each."""
         coefficients, covariance, misfit = fit.coefficients, fit.covariance, fit.misfit
         allowed = sum(
             special.log_ndtr(coefficients[:, i] / np.sqrt(covariance[:, i, i])) for i in self.damping_indices
         )
         evidence = -0.5 * misfit + 0.5 * np.linalg.slogdet(covariance)[1] + allowed
-        return [Inner(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)]
+        return [
+            CoefficientFit(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)
+        ]
 
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return position [m] and rate [m/s] in the rows `where`, for each time in `before`."""
@@ -204,7 +216,7 @@ class ContactProblem:
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
-        pushing = inside & (force_of(coefficients, near.columns) > 0.0)
+        pushing = inside & (compute_force(coefficients, near.columns) > 0.0)
         # With the wrong sign of the force the law pulls in most rows; keep them, so that the fit shows it.
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
@@ -225,11 +237,11 @@ class ContactProblem:
         rate = self.motion.period / self.time_constant
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
-    def _packed(self, near: list[_NearbyRows]) -> Packed:
+    def _packed(self, near: list[_NearbyRows]) -> PackedRows:
         """Return the rows at which the filters respond to the rows near contact."""
-        return packed([part.rows for part in near], self.readings.force.shape, self.memory)
+        return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
 
-    def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: Packed, whitening):
+    def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
         """Return columns as the sensor with its lag reads them, whitened, at packed rows.
 
         Args:
@@ -301,15 +313,17 @@ class ContactProblem:
             design[:, -1] = self.bias_alone
         return design, self.target[used[used >= 0]]
 
-    def _solve(self, near, flags, onsets, pseudo: Pseudo | None) -> Solution:
+    def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
         """Fit the coefficients at each plane to the rows in contact by `flags`, and to pseudo-rows."""
         design, target = self._design(near, flags, onsets)
         # The rows that depend on the bias alone.
-        count, total, square = (full - part for full, part in zip(self.sums, sums(target), strict=True))
+        count, total, square = (
+            full - part for full, part in zip(self.sums, sum_and_squares(target), strict=True)
+        )
         if pseudo is not None:
             design = np.concatenate([design, pseudo.design], axis=2)
             target = np.concatenate([target, pseudo.target])
-        return solve(design, target, (count, total, square), self.bias_alone, self.readings.bias)
+        return fit_coefficients(design, target, (count, total, square), self.bias_alone, self.readings.bias)
 
     def _by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
@@ -326,7 +340,7 @@ class ContactProblem:
         now = near[0]
         rows = self.where[now.rows]
         up, down = (
-            force_of(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
+            compute_force(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
             for d in (STEP, -STEP)
         )
         table = ((down - up) * flag / scale)[:, None]
@@ -346,11 +360,11 @@ class ContactProblem:
         force.ravel()[where.rows[real]] = values[real]
         return force if self.local else force + coefficients[-1]
 
-    def _predicted(self, near, flags, onsets, coefficients, where: Packed, whitening) -> np.ndarray:
+    def _predicted(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
         """Return the whitened readings at packed rows [N], without a bias of all rows, (planes, rows)."""
         offset, first = self.local * coefficients[-1], None
         tables = [
-            ((force_of(coefficients, part.columns) + offset) * flag)[:, None]
+            ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]
             for part, flag in zip(near, flags, strict=True)
         ]
         if onsets is not None:
@@ -381,7 +395,7 @@ class ContactProblem:
         onsets = self._onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
         return near, flags, onsets
 
-    def find_best_surface(self, delay: float, plane: float) -> tuple[float, Inner, float]:
+    def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
         """Return the plane of least misfit at a delay, a fit nearby, and the gain of log likelihood.
 
         Args:

@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from tuning.identification import press_bias
 from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
-from tuning.identification.contact_regression import Inner
+from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.normal_draws import factorise_covariance
 
 FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
@@ -45,7 +45,7 @@ class Posterior:
     draws: np.ndarray  # (draws, names)
     delays: np.ndarray  # s, the final grid
     log_posterior: np.ndarray  # of the delay at the final grid, minus its maximum
-    best: tuple[float, float, Inner]  # delay, plane and fit of greatest posterior density
+    best: tuple[float, float, CoefficientFit]  # delay, plane and fit of greatest posterior density
     evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
 
     @property
@@ -159,7 +159,7 @@ def _find_likely_delays(
 
 def _fit_grid(
     problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
-) -> tuple[np.ndarray, list[Inner]]:
+) -> tuple[np.ndarray, list[CoefficientFit]]:
     """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
 
     The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
@@ -208,7 +208,7 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
 
 
 def _marginalise_over_surface(
-    places: np.ndarray, cells: list[Inner], count: int
+    places: np.ndarray, cells: list[CoefficientFit], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return, for each delay, its marginal log posterior, and the surface's mean and standard deviation."""
     heights, planes = (
@@ -225,13 +225,13 @@ def _marginalise_over_surface(
     return total, mean, np.maximum(spread, width / 2.0)
 
 
-def _compute_cell_posteriors(places: np.ndarray, cells: list[Inner]) -> np.ndarray:
+def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) -> np.ndarray:
     """Return the log posterior of each cell of a grid."""
     return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
 
 
 def _draw_from_grid(
-    problem: ContactProblem, places: np.ndarray, cells: list[Inner], delays: np.ndarray, seed: int
+    problem: ContactProblem, places: np.ndarray, cells: list[CoefficientFit], delays: np.ndarray, seed: int
 ) -> Posterior:
     """Draw from the posterior: a cell by its probability, a point in the cell, and normal coefficients."""
     heights = _compute_cell_posteriors(places, cells)
@@ -269,7 +269,7 @@ def _draw_from_grid(
     )
 
 
-def _draw_coefficients(cell: Inner, positive: list[int], count: int, rng) -> np.ndarray:
+def _draw_coefficients(cell: CoefficientFit, positive: list[int], count: int, rng) -> np.ndarray:
     """Return normal draws of the coefficients; those with a negative damping are drawn again."""
     root = factorise_covariance(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T

@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Inner:
+class CoefficientFit:
     """Linear fit of the coefficients at one delay and surface."""
 
     coefficients: np.ndarray
@@ -22,7 +22,7 @@ class Inner:
     by_plane: np.ndarray | None = None  # derivative of the coefficients by the plane, if that is fitted
 
 
-class Pseudo(NamedTuple):
+class PseudoRows(NamedTuple):
     """Few rows that have the same sum of squares, for all coefficients, as many readings."""
 
     design: np.ndarray  # (planes, coefficients, rows), over the noise's standard deviation
@@ -30,7 +30,7 @@ class Pseudo(NamedTuple):
     by_plane: np.ndarray  # 1/m, derivative of `design` by the plane
 
 
-class Solution(NamedTuple):
+class LeastSquaresFit(NamedTuple):
     """Fit at each plane; design and residuals are divided by the noise's standard deviation."""
 
     coefficients: np.ndarray  # (planes, coefficients)
@@ -40,13 +40,13 @@ class Solution(NamedTuple):
     design: np.ndarray  # (planes, coefficients, rows)
 
 
-def solve(
+def fit_coefficients(
     design: np.ndarray,
     target: np.ndarray,
     rest: tuple[float, float, float],
     bias_alone: float,
     bias_prior: tuple[float, float] | None,
-) -> Solution:
+) -> LeastSquaresFit:
     """Return the least-squares fit at each plane.
 
     Args:
@@ -57,7 +57,7 @@ def solve(
         bias_prior: Bias [N] and its standard deviation from runs at rest, or None.
     """
     count, total, square = rest
-    normal, right = design @ design.swapaxes(1, 2), dot(design, target)
+    normal, right = design @ design.swapaxes(1, 2), sum_products(design, target)
     normal[:, -1, -1] += count * bias_alone**2
     right[:, -1] += total * bias_alone
     if bias_prior is not None:
@@ -75,15 +75,15 @@ def solve(
     if bias_prior is not None:
         mean, error = bias_prior
         misfit = misfit + ((coefficients[:, -1] - mean) / error) ** 2
-    return Solution(coefficients, covariance, misfit, residual, design)
+    return LeastSquaresFit(coefficients, covariance, misfit, residual, design)
 
 
-def force_of(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the force of the law without the bias, (planes, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 
-def dot(table: np.ndarray, values: np.ndarray) -> Any:
+def sum_products(table: np.ndarray, values: np.ndarray) -> Any:
     """Return the sums of products along the rows.
 
     BLAS would split the sum by its number of threads, which changes the last bits.
@@ -91,6 +91,6 @@ def dot(table: np.ndarray, values: np.ndarray) -> Any:
     return np.einsum("...m,m->...", table, values)
 
 
-def sums(values: np.ndarray) -> tuple[int, float, float]:
+def sum_and_squares(values: np.ndarray) -> tuple[int, float, float]:
     """Return the number of values, their sum and that of their squares."""
-    return len(values), float(values.sum()), float(dot(values, values))
+    return len(values), float(values.sum()), float(sum_products(values, values))

@@ -26,7 +26,7 @@ from jaxhil.contact.regression import RegressionFamily
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import estimate_surface_from_onset
-from tuning.identification.deep_contact import representative
+from tuning.identification.deep_contact import select_representative_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 
@@ -58,7 +58,7 @@ def choose_contact_law(
     The parts of a long press are alike, so exponents and depths are fitted to a few of them.
     """
     judged = []
-    lanes = representative(ContactProblem(motion, readings, kelvin_voigt(), plane))
+    lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))
     few, few_readings = motion.of(lanes), readings.select_lanes(lanes)
     is_same, fitted_families = len(lanes) == readings.force.shape[1], {}
     _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)

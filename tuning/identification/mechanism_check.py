@@ -16,7 +16,7 @@ from tuning.identification import contact_fit as contacts
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior
-from tuning.identification.contact_regression import Inner
+from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.edge_check import check_contact_edges
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
@@ -167,7 +167,7 @@ def _make_contact_fit(
         predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
         readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))
     problem = ContactProblem(motion, readings, law, plane, lag)
-    inner = Inner(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
+    inner = CoefficientFit(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _draw_delay_and_surface(mechanism)
     # The motion is computed only up to the longest delay of the search.
     delays = np.clip(delays, problem.min_delay, max(MAX_FORCE_DELAY, delay))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Packed(NamedTuple):
+class PackedRows(NamedTuple):
     """Sequence of rows of several lanes."""
 
     rows: np.ndarray  # row of the readings, counted along (rows, lanes); -1 behind the end of a lane
@@ -24,7 +24,7 @@ class Packed(NamedTuple):
         return self.starts[lane] + row
 
 
-def packed(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -> Packed:
+def pack_rows(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -> PackedRows:
     """Return the sequence that holds rows near contact.
 
     Args:
@@ -45,4 +45,4 @@ def packed(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -> P
     starts = begins - first
     lane = np.repeat(np.arange(lanes), counts)
     row = np.arange(len(lane)) - starts[lane]
-    return Packed(np.where(row < length, row * lanes + lane, -1), starts)
+    return PackedRows(np.where(row < length, row * lanes + lane, -1), starts)

@@ -13,17 +13,13 @@ from jaxtyping import Float
 from scipy.stats import qmc
 
 POLISH_CANDIDATES = 16  # candidates in a generation of `polish`
-CANDIDATES_PER_BASIN = (
-    32  # candidates in a generation of `search_globally`, for each basin of the first round
-)
+# candidates in a generation of `search_globally`, for each basin of the first round
+CANDIDATES_PER_BASIN = 32
 SIMULTANEOUS_BASINS = 8  # basins that `search_globally` searches simultaneously
 SCAN_BUDGET_DIVISOR = 8  # the scan of `search_globally` uses 1/SCAN of the budget
 MIN_START_DISTANCE = 0.1  # minimum distance of starts, relative to the box's diagonal
-INITIAL_STD_BY_ROUND = (
-    0.1,
-    0.2,
-    0.01,
-)  # `reach` of the first, the intermediate and the last round of `search_globally`
+# `reach` of the first, the intermediate and the last round of `search_globally`
+INITIAL_STD_BY_ROUND = 0.1, 0.2, 0.01
 # Loss of a failed evaluation, which is worse than all others but finite.
 FAILED_LOSS = np.finfo(float).max
 

@@ -32,9 +32,8 @@ SUBSET_SAMPLES, SUBSET_REPLICATES = (
     1000,
     10,
 )  # subset simulation: samples per level and replicate, number of replicates
-MAX_SPREAD_RATIO = (
-    2.0  # spread of replicates over the formula's, beyond which they found different failure regions
-)
+# spread of replicates over the formula's, beyond which they found different failure regions
+MAX_SPREAD_RATIO = 2.0
 
 
 class InputIndices(NamedTuple):

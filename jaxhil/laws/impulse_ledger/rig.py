@@ -52,6 +52,7 @@ MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from 
 ONSET_TICKS = 0.3  # periods; standard deviation of the onset, 1/sqrt(12)
 ONSET_MEAN = 0.25  # share of the force at which the onset is detected: mean force at the onset
 ONSET_SPREAD = 0.4  # share of the same force: its standard deviation at the onset
+# gains: the prior standard deviations of the contact model
 SPREADS = (
     "prior_stiffness_spread",
     "prior_slope_spread",
@@ -60,7 +61,7 @@ SPREADS = (
     "prior_unloading_spread",
     "prior_friction_spread",
     "prior_preload_spread",
-)  # gains: the prior standard deviations of the contact model
+)
 
 
 @register("impulse_ledger")
