@@ -1,4 +1,4 @@
-"""What the README promises of Python, line by line, with small numbers: run by `test_api_tuning`."""
+"""Python interface that the README promises, line by line, with small numbers: run by `test_api_tuning`."""
 
 import jax.numpy as jnp
 import jaxhil

@@ -59,8 +59,8 @@ def test_functions_bind_no_empty_names(package):
     assert not wrong, "\n".join(wrong)
 
 
-def concept(path: Path, name: str) -> str:
-    """Return the concept behind a class: sides of a compensator, and one axis and six, share theirs."""
+def concept(path: Path) -> str:
+    """Return what a file's classes belong to: versions of one class have the same name on purpose."""
     relative = path.relative_to(ROOT).as_posix()
     if relative.startswith("jaxhil/laws/") or relative in ("jaxhil/rig/filters.py", "jaxhil/rig/registry.py"):
         return "compensator"
@@ -75,7 +75,7 @@ def test_class_names_are_unique_except_within_a_concept():
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                    concepts.setdefault(node.name, set()).add(concept(path, node.name))
+                    concepts.setdefault(node.name, set()).add(concept(path))
     shared = {name: sorted(homes) for name, homes in concepts.items() if len(homes) > 1}
     assert not shared
 

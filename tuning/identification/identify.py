@@ -8,14 +8,10 @@ specify these values.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from jaxhil.errors import InputError
-from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import conditioning, free_motion, mechanism_models, parameters, validation
 from tuning.identification import contact_fit as contacts
@@ -25,22 +21,18 @@ from tuning.identification.contact_profile import POSTERIOR_DRAWS
 from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
-from tuning.identification.mechanism_check import check_against_mechanism as check_file
-from tuning.identification.mechanism_check import check_file_uncertainty
-from tuning.identification.mechanism_file import to_toml
 from tuning.identification.noise import NoiseEstimate, estimate_noise
 from tuning.identification.notes import collect_notes, note_absent_dead_zone
 from tuning.identification.options import KEYS_FIXED_BEFORE_FIT, IdentificationOptions, check_options
 from tuning.identification.parameters import SIMULATOR_PREFIX
 from tuning.identification.rational import MotionModel
-from tuning.identification.records import Campaign, LoggedRun
+from tuning.identification.records import CONTACT_KINDS, Campaign, LoggedRun
 from tuning.identification.result import Identification, find_confounded_pairs
+from tuning.identification.result_checks import check_result
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
-from tuning.identification.uncertainty_effect import compute_uncertainty_effect
 
 MIN_REST_ROWS = 200  # minimum number of rows at rest for an estimate of the noise
 ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
-CONTACT_KINDS = ("contact", "press", "tap")
 STAGE_COUNT = 3  # progress messages: free motion, contact, validation; a bootstrap adds one per chunk of fits
 ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
@@ -100,7 +92,7 @@ def identify(
         prior, model, used, clock_drift is not None and FORCE_DELAY_KEY not in fixed
     )
     mechanism = None if missing else make_mechanism(campaign, prior, model, used, numbers, draws, options)
-    mechanism, lines = _check_result(mechanism, campaign, motion, contact, model, touching, options)
+    mechanism, lines = check_result(mechanism, campaign, motion, contact, model, touching, frequency, options)
     table = np.array(list(draws.values())).T if draws else np.zeros((POSTERIOR_DRAWS, 0))
     return Identification(
         estimates=numbers,
@@ -274,91 +266,6 @@ def _fit_and_check_contact(
         return fit, []
     partial_fit = contacts.refit_without(fit, left_out, options.seed)
     return fit, validation.check_held_out_contacts(partial_fit, runs, campaign.equivalent_mass, left_out)
-
-
-def _check_result(
-    mechanism: dict[str, Any] | None,
-    campaign: Campaign,
-    motion: FreeMotion | None,
-    contact: ContactFit | None,
-    model: MotionModel | None,
-    touching: list[LoggedRun],
-    options: IdentificationOptions,
-) -> tuple[dict[str, Any] | None, list[validation.CheckResult]]:
-    """Check the mechanism file or, if none can be checked, the fits.
-
-    Returns:
-        The mechanism, or None if its file would be invalid; and the checks.
-    """
-    written, errors = _parse_written_mechanism(mechanism)
-    lines = _check_written_file(campaign, written, motion if options.order is None else None)
-    if lines is None:
-        lines = [*errors, *_check_fits(motion, contact, model, touching, campaign.equivalent_mass, written)]
-    return None if errors else mechanism, lines
-
-
-def _parse_written_mechanism(
-    mechanism: dict[str, Any] | None,
-) -> tuple[Mechanism | None, list[validation.CheckResult]]:
-    """Return the mechanism as read from its file, or a failed check if the file would be invalid."""
-    if mechanism is None:
-        return None, []
-    try:
-        return from_plain_data(tomllib.loads(to_toml(mechanism)), "identified mechanism"), []
-    except InputError as error:
-        return None, [validation.CheckResult("mechanism file", str(error), True, 1.0)]
-
-
-def _check_written_file(
-    campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
-) -> list[validation.CheckResult] | None:
-    """Compare the logs with the written mechanism, as `identify --check` does.
-
-    Args:
-        campaign: The logs.
-        written: The mechanism as read from its file, or None.
-        motion: Fit of the motion simulator without a specified order, or None.
-
-    Returns:
-        The checks, or None if there is no file or the logs cannot be compared with it.
-    """
-    if written is None or campaign.timing.two_clocks:
-        return None
-    if not any(run.kind in (*CONTACT_KINDS, "free") for run in campaign.runs):
-        return None
-    try:
-        return list(check_file(campaign, written, fitted=motion).lines)
-    except InputError:
-        return None
-
-
-def _check_fits(
-    motion: FreeMotion | None,
-    contact: ContactFit | None,
-    model: MotionModel | None,
-    touching: list[LoggedRun],
-    mass: float,
-    written: Mechanism | None,
-) -> list[validation.CheckResult]:
-    """Return the checks of the fits to free motion and contact."""
-    frequency, lines = _estimate_frequency(contact, mass), []
-    if motion is not None:
-        lines = [
-            *validation.check_motion_model(motion, frequency),
-            validation.check_delay_sign(motion, frequency),
-        ]
-    if contact is not None and model is not None:
-        lag = contacts.compute_force_lag(contact, model, frequency)
-        all_touches = np.ones(len(touching), bool)
-        lines += [
-            validation.check_stiffness_sign(contact),
-            *validation.check_contact_model(contact, touching, mass, frequency, lag, all_touches),
-        ]
-    if written is not None:
-        lines += check_file_uncertainty(
-            compute_uncertainty_effect(written), any(run.kind == "press" for run in touching)
-        )
-    return lines
 
 
 def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 RunKind = Literal["free", "press", "tap", "contact", "rest"]
+CONTACT_KINDS: tuple[RunKind, ...] = "contact", "press", "tap"
 CommandHold = Literal["zoh", "linear"]
 RowConvention = Literal["tick", "sent", "after"]
 DEFAULT_MECHANISM_NAME = "identified"  # name of an identified mechanism without a prior
