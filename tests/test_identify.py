@@ -156,6 +156,14 @@ def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
     assert str(dead.low) == "0.0"
 
 
+def test_surface_further_away_goes_with_a_smaller_dead_zone():
+    """The readings, stiffness (x - surface) - dead zone, determine only the sum of what both remove."""
+    campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
+    posterior = identify(campaign, options=IdentificationOptions(law="kelvin_voigt")).contact.posterior
+    surface, bias = (posterior.draws[:, posterior.names.index(name)] for name in ("plane", "bias"))
+    assert np.all(bias <= 1e-9) and np.corrcoef(surface, -bias)[0, 1] < -0.9
+
+
 @pytest.mark.slow
 def test_identify_uses_prior_for_missing_motion_or_contact():
     campaign = campaigns.campaign("clean", 2, speeds=FEW, seconds=0)

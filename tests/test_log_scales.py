@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from log_cases import MASS, PERIOD, mapping, read, touches, write_csv
 
@@ -153,6 +153,8 @@ def test_compensator_damping_and_dead_zone_are_not_taken_for_a_wrong_unit(tmp_pa
     assert "times the impulse" in refused(tmp_path, scaled(dead, F=1 / LBF), **NO_COMMAND)
 
 
+# Where rounding dominates differences over few rows, these alone favour the wrong row convention.
+@example(factor=1.0, quantum=1e-8, noise=0.0, lost=0.1, seed=1)
 @settings(deadline=None, max_examples=25)
 @given(
     factor=st.sampled_from([1.0, 1 / LBF, LBF, 2.54, 1 / 2.54, 1e3, 1.2]),
