@@ -1,7 +1,7 @@
 """Processor time of a second `jaxhil tune`: with the cached programs, and with JAX's persistent cache alone.
 
 Each run is a process of its own; the first one of either kind fills its cache and is not counted. Run with
-`pytest -m benchmark -s tests/benchmarks/test_cached_programs.py`.
+`pytest -m benchmark -s tests/benchmarks/test_second_tune.py`.
 """
 
 import os
