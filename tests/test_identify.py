@@ -264,6 +264,18 @@ def test_identify_copies_previous_list_entry_for_grazing_contact():
     assert "contact.stiffness.1: known to 30 % at best: taken as the entry before it" in result.notes[0]
 
 
+def test_identify_keeps_position_delay_if_force_delay_may_be_zero(monkeypatch):
+    """Both sensors lag alike, so the force delay is 0; its estimate is negative, but by less than its spread."""
+    rig = campaign_kinds.rig(force_sensor__delay=0.003, position_sensor__delay=0.003)
+    monkeypatch.setitem(campaigns.KINDS, "same", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
+    campaign = campaigns.campaign("same", 2, speeds=FEW, seconds=30.0)
+    result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt"))
+    delay = result["rig.force_sensor.delay"]
+    assert -2.0 * delay.std < delay.value < 0.0 and result.good
+    assert result["rig.simulator.delay"].value == pytest.approx(0.0073, abs=2e-5)
+    assert result.mechanism["rig"]["position_sensor"]["delay"] == 0.0
+
+
 @pytest.mark.slow
 def test_identify_splits_delay_if_position_sensor_lags_more(monkeypatch):
     rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)

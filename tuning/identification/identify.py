@@ -273,10 +273,9 @@ def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
     notes = []
     for key, draws in draws_by_key.items():
         if compute_bound_excess(key, draws) > 0.0:
-            estimate = f"the logs give {draws.mean():.4g} +- {draws.std():.2g}, {get_unit(key)}"
             notes.append(
-                f"{key}: {estimate}: the file has the smallest allowed value, 0, and an uncertainty that "
-                "includes the difference"
+                f"{key}: the logs give {draws.mean():.2g} {get_unit(key)}, standard deviation {draws.std():.2g}; "
+                "the file has 0, the lowest value allowed, with an uncertainty that includes the difference"
             )
     return notes
 
@@ -362,9 +361,9 @@ def _choose_position_delay(
     if motion is None or contact is None:
         return specified
     delay = contact.posterior.draws[:, 0]
-    return (
-        specified if delay.mean() + specified >= 0.0 else float(MIN_DELAY_SIGMAS * delay.std() - delay.mean())
-    )
+    # The mean of an uncertain delay may be negative by chance, hence the margin.
+    mean, margin = float(delay.mean()), MIN_DELAY_SIGMAS * float(delay.std())
+    return specified if mean + specified >= -margin else margin - mean
 
 
 def _note_shifted_delay(fixed: Mapping[str, float], options: IdentificationOptions) -> list[str]:
