@@ -46,7 +46,7 @@ def test_contact_law_requires_its_key_and_checks_its_range(contact):
     other = others[key == others[0]]
     assert f": {other}: found 2.0, expected nothing" in refusal(changed({**contact, other: 2.0}))
     low = {key: {"distribution": "uniform", "low": 0.0, "high": 2.0}}
-    assert f': uncertainty."{key}": found values as far as 0' in refusal(
+    assert f': uncertainty."{key}": found draws as far as 0' in refusal(
         changed({**contact, "uncertainty": low})
     )
 
@@ -174,7 +174,7 @@ def test_start_is_clear_of_the_contact_surface(side):
     assert from_plain_data(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
     message = refusal(changed(changes | {"rig.contact_plane": plane}))
     assert ": rig.contact_plane: found " in message
-    assert "expected a number > -0.0197427 and < 0.0197427, the clearance less" in message
+    assert "expected a number > -0.0197427 and < 0.0197427 m, the clearance less" in message
     assert from_plain_data(changed({"contact.clearance": math.inf, "rig.contact_plane": plane}), "f")
 
 

@@ -104,7 +104,7 @@ class _Unitless(msgspec.Struct):
 
 @pytest.mark.parametrize(
     ("kind", "reason"),
-    [(_Silent, "drag: its type does not say what it means"), (_Unitless, "drag: .* the number's unit")],
+    [(_Silent, "drag: found no description"), (_Unitless, "drag: found no unit")],
 )
 def test_key_without_meaning_or_unit_is_refused(kind, reason):
     with pytest.raises(ValueError, match=reason):

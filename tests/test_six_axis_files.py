@@ -63,21 +63,21 @@ def test_six_values_may_be_given_as_one_or_two():
     ("override", "reason"),
     [
         ("schema=jaxhil/mechanism/3", "schema: found 'jaxhil/mechanism/3', expected"),
-        ("schema=jaxhil/mechanism/1", "found 'jaxhil/mechanism/1' beside target and chaser, expected jaxhil"),
-        ("target.inertia=[0, 0, 0]", "nothing but zeros, in kg m^2, expected positive principal moments"),
-        ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, expected those of a body"),
+        ("schema=jaxhil/mechanism/1", "found 'jaxhil/mechanism/1' with the tables target and chaser"),
+        ("target.inertia=[0, 0, 0]", "only zeros, expected positive principal moments"),
+        ("target.inertia=[1, 1, 3]", "principal moments 1, 1 and 3 kg m^2, expected moments of a rigid body"),
         ("target.inertia=[1, 1, -1]", "principal moment of -1 kg m^2, expected positive"),
-        ("target.inertia=[1, 1, 1e-7]", "moments from 1e-07 to 1 kg m^2, expected those of a body: none "
-                                        "less"),
-        ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, 1 there transposed"),
+        ("target.inertia=[1, 1, 1e-7]", "moments from 1e-07 to 1 kg m^2, expected moments of at "
+                                        "least"),
+        ("target.inertia=[[1, 2, 0], [1, 2, 0], [0, 0, 2]]", "2 at row 1, column 2, and 1 at the"),
         ("target.inertia=[[1, 0, 0], 2, 3]", "three moments, or three rows"),
-        ("chaser.interface=[0, 0, 1.0]", "expected one beyond C, at positive z"),
+        ("chaser.interface=[0, 0, 1.0]", "expected a centre beyond C, at positive z"),
         ("target.interface_rotation=[3, 0, 0]", "target.interface: found a centre of mass at z = 1.18"),
         ("target.interface_rotation=[4, 0, 0]", "a rotation by 4 rad, expected a rotation vector shorter"),
         ("approach.attitude=[1, 1, 0]", "a rotation by 1.414 rad, expected a rotation vector of at most 1"),
         ("approach.velocity[2]=0.01", "approach.velocity[2]: found 0.01, expected a number < 0 m/s"),
         ("contact={}", "contact: found nothing, expected [contact.NAME]"),
-        ("contact={law='linear', stiffness=1}", "a table without a name: law, stiffness, expected [contact."),
+        ("contact={law='linear', stiffness=1}", "a table without a name: law, stiffness, expected tables ["),
         ("contact.tip.target.half_angle=45", "found 45, expected a number > 0 rad and < 1.5708 rad"),
         ("contact.tip.target={shape='plane', point=[0, 0, 0]}",
          "normal: found nothing, expected a list of 3 entries, each a finite number (plane needs it)"),
@@ -89,19 +89,19 @@ def test_six_values_may_be_given_as_one_or_two():
         ("contact.tip.law=hardening", "reference_depth: found nothing, expected a number > 0"),
         ("contact.tip.depths=[1]", "depths: found [1.0], expected nothing (only for law piecewise_linear)"),
         ("contact.tip.friction.law=bristle", "slip: found 0.0025, expected nothing (bristle"),
-        ("contact.tip.chaser.radius=0.05", "0.05, expected a number < 0.04 m, the radius that it is to fit"),
-        ("contact.tip.chaser.radius=0", "expected a number > 0 m: a drogue with a mouth is a thin shell"),
+        ("contact.tip.chaser.radius=0.05", "0.05, expected a number < 0.04 m, the radius of the shape"),
+        ("contact.tip.chaser.radius=0", "expected a number > 0 m, because a drogue with mouth_radius"),
         ("contact.tip.chaser.from=[0, 0, 0]", "expected nothing (sphere does not use it: unset it)"),
         ("contact.tip.chaser.shape=drogue", "centre: found [0.0, 0.0, 0.0], expected nothing (drogue"),
         ("contact.tip.target.mouth_radius=0.02", "expected a number > 0.0292"),
-        ("contact.tip.target_pattern.phase=1", "expected nothing, or pattern = { count = N } beside it"),
+        ("contact.tip.target_pattern.phase=1", "expected nothing, or pattern = { count = N } as well"),
         ("rig.simulator.delay=[1, 2]", "a list of 2 entries, expected a list of 6 entries"),
         ("rig.simulator.delay=2.0", "rig.simulator.delay[0]: found 2.0, expected a number from 0 to 1 s"),
         ("rig.simulator.model=ideal", "damping_ratio: found [0.8, 0.8,"),
         ("rig.force_sensor.side=fixed", "tool: found a table, expected nothing (a fixed sensor"),
         ("rig.force_sensor.tool.inertia=[1, 1, 3]", "tool.inertia: found principal moments 1, 1 and 3"),
         ("rig.force_sensor.crosstalk=[[0,1,0,0,0,0],[1,0,0,0,0,0],[0,0,0,0,0,0],[0,0,0,0,0,0],"
-         "[0,0,0,0,0,0],[0,0,0,0,0,0]]", "crosstalk: found channels that are nearly the same"),
+         "[0,0,0,0,0,0],[0,0,0,0,0,0]]", "crosstalk: found channels that are nearly identical"),
         ("rig.velocity_limit=1", "rig.velocity_limit: found an unknown key"),
         ('uncertainty."contact.tip.stifness"={distribution="normal",std=1}', "did you mean contact.tip"),
         ('uncertainty."target.inertia"={distribution="normal",std=1,independent=true}', "are not symmetric"),
@@ -124,23 +124,23 @@ LEGS = "hydraulic-hexapod"
         ("ring-capture", {"latch.hooks.depth": None}, "found nothing, expected a number >= 0 m, or latched"),
         ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false: an approach"),
         ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, expected six numbers"),
-        ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix beside it, expected"),
+        ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix as well, expected"),
         ("ring-capture",
          {"latch.hooks.stiffness": None, "latch.hooks.stiffness_matrix": NO_SPRING,
-          "uncertainty": {}}, "or has an eigenvalue below 0, expected that of a spring"),
+          "uncertainty": {}}, "or has an eigenvalue below 0, expected the matrix of a spring"),
         ("ring-capture", {"latch.hooks.angel": 0.1}, "an unknown key, expected one of chaser, pattern"),
         ("ring-capture", {"latch.hooks.pattern.count": 0}, "count: found 0, expected an integer from 1"),
         ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, 'latch."a b": found this name, expected'),
-        (LEGS, {"rig.simulator.height": None}, 'height: found nothing, expected what space = "stewart" '
+        (LEGS, {"rig.simulator.height": None}, 'height: found nothing, expected a value (space = "stewart" '
                                                'needs'),
         (LEGS, {"rig.simulator.base": [[0, 0, 0]]}, "base: found a list of 1 entry, expected a list of 6"),
         (LEGS, {"rig.simulator.base[2]": [0, 0]}, "base[2]: found a list of 2 entries, expected a list of 3"),
-        (LEGS, {"rig.simulator.stroke": [2, 1]}, "stroke: found [2.0, 1.0], expected a longest leg longer"),
-        (LEGS, {"rig.simulator.delay": {"translation": 1e-3, "rotation": 2e-3}}, "list of six, one each leg"),
+        (LEGS, {"rig.simulator.stroke": [2, 1]}, "stroke: found [2.0, 1.0], expected [shortest, "),
+        (LEGS, {"rig.simulator.delay": {"translation": 1e-3, "rotation": 2e-3}}, "list of six numbers"),
         (LEGS, {"rig.simulator.space": "task"}, '(space = "task" does not use it)'),
         (LEGS, {"rig.simulator.space": "two_robots", "rig.simulator.target_robot.share": 0.5},
          'base: found [[1.58, 0.255, 0.0]'),
-        ("claw-two-arms", {"rig.simulator.target_robot": None}, "target_robot: found nothing, expected what"),
+        ("claw-two-arms", {"rig.simulator.target_robot": None}, "target_robot: found nothing, expected"),
         ("claw-two-arms", {"rig.simulator.target_robot.share": 1.5}, "share[0]: found 1.5, expected a "
                                                                      "number"),
         ("claw-two-arms", {"rig.simulator.target_robot.time_constant": 0.1}, "(model second_order does not"),
@@ -158,7 +158,7 @@ def test_shapes_that_cannot_touch_are_refused():
     with pytest.raises(InputError, match="found drogue against the chaser's capsule, expected a sphere on"):
         any_from_plain_data(raw, "f")
     raw["contact"]["tip"]["target"] = {**capsule, "to": [0, 0, 0]}
-    with pytest.raises(InputError, match=r"contact\.tip\.target\.to: found the point that is from"):
+    with pytest.raises(InputError, match=r"contact\.tip\.target\.to: found the same point as from"):
         any_from_plain_data(raw, "f")
     raw["contact"]["tip"]["target"] = capsule
     assert any_from_plain_data(raw, "f")
@@ -166,7 +166,7 @@ def test_shapes_that_cannot_touch_are_refused():
 
 def test_start_replaces_the_approach():
     start = {"start.target": BODY, "start.chaser": {**BODY, "position": [0, 0, 3]}}
-    with pytest.raises(InputError, match=r"start: found \[approach\] beside it, expected one of the two"):
+    with pytest.raises(InputError, match=r"start: found \[approach\] as well, expected either \[start\] or"):
         load_any("probe-drogue", start)
     mechanism = load_any(
         "probe-drogue", {**start, "approach": None, "contact": {}, "uncertainty": {}}
@@ -174,7 +174,7 @@ def test_start_replaces_the_approach():
     assert mechanism.start.duration is None and PHASE_KEY not in draw(mechanism, 1, 0)
     assert "approach: found nothing, expected [approach], or [start]" in refusal(unset=["approach"])
     start["start.chaser"]["attitude"] = [1, 0.1, 0, 0]
-    with pytest.raises(InputError, match=r"attitude: found one of norm 1\.0049876, expected a quaternion"):
+    with pytest.raises(InputError, match=r"attitude: found a quaternion of norm 1\.0049876, expected"):
         load_any("probe-drogue", {**start, "approach": None})
 
 

@@ -1,1 +1,1 @@
-"""Contact laws, contact with one surface or two, and the ideal (undelayed) contact as the reference."""
+"""Contact laws, and the ideal contact (without any delay) with which contacts on the rig are compared."""

@@ -6,7 +6,7 @@ __all__ = ["jnp"]
 
 
 class _LazyNumpy:
-    """Stand-in for `jax.numpy` that imports it when an attribute is first used."""
+    """Proxy of `jax.numpy`: the first use of an attribute imports the module."""
 
     def __getattr__(self, name: str) -> Any:
         import jax.numpy

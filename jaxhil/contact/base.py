@@ -1,13 +1,13 @@
-"""Interface of the contact laws: contact force against penetration d > 0 [m] and its rate d' [m/s].
+"""Interface of the contact laws, which compute the contact force from the penetration and its rate.
 
-A law defines everything that depends on it: its keys in a mechanism file, its force in the simulation and in
-plain floats, its ideal contact, and the functions that tuning, benchmarks and identification call. A new law
-is one file with a class and one entry in `jaxhil.contact.laws`.
+A law defines its keys in a mechanism file, its force in the simulation and in Python floats, its ideal
+contact, and functions for tuning, benchmarks and identification. To add a law, write a module with a subclass
+of `ContactLaw` and add an entry to `jaxhil.contact.laws`.
 
-In the simulation a law is a pure function of the motion and of the law's state (`init`, `step`); a law
-without memory has an empty state. A force is zero for d <= 0 and, unless tension is allowed, never negative.
-Every argument broadcasts to the batch shape; slopes and depths of a segmented law have a leading axis of
-segments. Arrays are those of `jax.numpy` unless stated otherwise.
+In the simulation a law is a pure function of the penetration d [m], its rate d' [m/s] and the law's state
+(`init`, `step`); a law without memory has an empty state. The force is 0 for d <= 0 and, unless the law
+allows tension, never negative. All arguments broadcast to the batch shape; slopes and depths of a segmented
+law have a leading axis of segments. Arrays are `jax.numpy` arrays unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ __all__ = ["ContactLaw"]
 
 @dataclass_transform(frozen_default=True)
 class ContactLaw(abc.ABC):
-    """Interface of all contact laws.
+    """Base class of all contact laws.
 
-    A subclass becomes a frozen dataclass. It holds no arrays: all numbers come from the parameters
-    (`jaxhil.contact.laws.ContactParameters`) or from the file's table `[contact]`, here called `contact`.
+    Every subclass is a frozen dataclass without arrays. The methods take all numbers from `parameters`
+    (`jaxhil.contact.laws.ContactParameters`) or from `contact`, the table `[contact]` of a mechanism file.
     """
 
     name: ClassVar[str] = ""  # name in mechanism files
-    # Keys that only some laws have and that this law uses; None: unspecified, the law may use any of them.
+    # Keys of `[contact]` that this law uses beyond those of all laws; None: the law may use any key.
     keys: ClassVar[tuple[ContactKey, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
     damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
-    dissipates_by: ClassVar[str] = ""  # source of dissipation of a law that rejects the key `damping`
+    dissipates_by: ClassVar[str] = ""  # process that dissipates energy in a law that rejects `damping`
     segmented: ClassVar[bool] = False  # whether each entry of `stiffness` is a list of slopes
     is_linear: ClassVar[bool] = False  # whether the force in contact is k d + b d'
-    damped_as: ClassVar[str] = ""  # name of the law that adds damping to this one; empty: this law itself
+    damped_as: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the subclass a frozen dataclass: programs are compiled per law, which must be hashable."""
+        """Make the subclass a frozen dataclass: laws must be hashable, as keys of compiled programs."""
         super().__init_subclass__(**kwargs)
         dataclass(frozen=True)(cls)
 
@@ -61,64 +61,63 @@ class ContactLaw(abc.ABC):
     def remembers(self) -> bool:
         """Return whether the force depends on the deepest penetration so far.
 
-        The simulation then follows state and motion between samples too. Without penetration the state is
-        that before the first touch: a released surface is as new. The path between two penetrations counts
-        only by its deepest point.
+        If so, the simulation also updates the state of the law between samples. `step` must reset the
+        state at d <= 0; otherwise only the deepest point since the last call may change the state.
         """
         return False
 
     @property
     def jumps(self) -> bool:
-        """Return whether the force jumps at a turning point; its peak is then sought between samples too."""
+        """Return whether the force jumps when the motion reverses. Its peak may then lie between samples."""
         return False
 
     @property
     def arcs(self) -> bool:
-        """Return whether the force in a slow contact is nearly parabolic over a quarter of a control period.
+        """Return whether the force of a slow contact is nearly parabolic over a quarter of a control period.
 
-        It is not if its slope changes at a depth, if it jumps at a turning point, or if it ends as a power of
-        the depth.
+        This is false if the slope changes at a given depth, if the force jumps when the motion reverses, or
+        if the force approaches 0 like a power of the depth.
         """
         return False
 
     @property
     def closed_form(self) -> bool:
-        """Return whether the ideal contact has a closed form, computed in every run, or is integrated."""
+        """Return whether the ideal contact has a closed form; otherwise its motion is integrated."""
         return type(self).reference is not ContactLaw.reference
 
     @property
     def simulated(self) -> ContactLaw:
-        """Return the law that computes this force in the simulation, so that two laws can share a program."""
+        """Return the law that the simulation uses for this law; laws with equal forces share a program."""
         return self
 
     def specialised(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
-        """Return the law specialised to keys whose value all batch elements share.
+        """Return a faster law with the same force for a batch in which certain keys have only one value.
 
         Args:
             contact: the file's table `[contact]`.
-            drawn: function that returns whether the value of a key varies over the batch.
+            drawn: function that returns whether the value of a key differs between batch elements.
         """
         return self.simulated
 
     def init(self, penetration: Any) -> tuple[Any, ...]:
-        """Return the state before the first touch, in the batch shape of `penetration`."""
+        """Return the state of the law before the first touch, in the batch shape of `penetration`."""
         return ()
 
     @abc.abstractmethod
     def step(
         self, parameters: Any, state: tuple[Any, ...], penetration: Any, rate: Any
     ) -> tuple[Any, tuple[Any, ...]]:
-        """Return the force [N] at `penetration` [m] and `rate` [m/s], and the next state."""
+        """Return the force [N] at a `penetration` [m] and its `rate` [m/s], and the next state of the law."""
 
     @abc.abstractmethod
     def edge(self, parameters: Any, rate: Any) -> Any:
-        """Return the limit of the force [N] as d goes to 0 from above: the jump at a damped touch."""
+        """Return the force [N] just inside the surface: its limit as d goes to 0 from above."""
 
     @abc.abstractmethod
     def hold(self, parameters: Any, state: tuple[Any, ...], penetration: Any, rate: Any) -> Any:
-        """Return a smooth function that is positive until the penetrated surfaces separate, at its zero.
+        """Return a smooth value that is positive during the contact and crosses 0 at the separation.
 
-        It is the force before it is clamped, or a function of the same sign.
+        The value is the force before clamping at 0, or has the same sign as this force.
         """
 
     def corners(self, parameters: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -126,19 +125,19 @@ class ContactLaw(abc.ABC):
         return ()
 
     def reference(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
-        """Return the ideal contact of equivalent `mass` [kg] and approach `velocity` [m/s].
+        """Return the ideal contact for an equivalent `mass` [kg] and an approach `velocity` [m/s].
 
-        By default its motion is integrated (`jaxhil.contact.ideal_contact_motion`).
+        By default the motion is integrated (`jaxhil.contact.ideal_contact_motion`).
         """
         from jaxhil.contact.ideal_contact import IdealContact
         from jaxhil.contact.ideal_contact_motion import integrate_contact
 
         return IdealContact(*integrate_contact(self, parameters, mass, velocity)[:3])
 
-    # Scales of the contact, from the parameters of scenarios as NumPy arrays
+    # Magnitudes of the contact, from the parameters of scenarios as NumPy arrays
 
     def undamped_peak_force(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the peak force [N] of the undamped contacts, (slots, batch); integrated by default."""
+        """Return the peak force [N] of the ideal contacts without damping, (contacts, batch)."""
         import jax
         import jax.numpy as jnp
 
@@ -151,24 +150,27 @@ class ContactLaw(abc.ABC):
         return np.asarray(motion.peak_force)
 
     def tangent_stiffness(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the largest slope of the force against the depth [N/m], (slots, batch).
+        """Return the largest slope dF/dd [N/m] in the contact, (contacts, batch); by default the stiffness.
 
-        By default it is the stiffness. The parameters of a segmented law contain only its largest slope.
+        For a segmented law, `parameters` contain only the largest slope.
         """
         return parameters.stiffness
 
     def onset_damping(self, parameters: Any) -> np.ndarray:
-        """Return the slope of the force against the rate at the onset of contact [N s/m], (slots, batch)."""
+        """Return the damping constant dF/dd' [N s/m] at the onset of contact, (contacts, batch)."""
         return parameters.damping
 
-    # Scales of the contact, from a mechanism file
+    # Magnitudes of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Estimate the peak force [N] over the entries of `stiffness`; by default as a linear contact's."""
+        """Estimate the largest peak force [N] of successive contacts; by default for a linear law."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:
-        """Return the damping ratio [1] of a linear oscillator at `frequency` [rad/s] with equal loss."""
+        """Return the damping ratio [1] of the linear oscillator that loses as much energy as the contact.
+
+        `frequency` is the contact frequency [rad/s], and `damping` an entry of the key `damping`.
+        """
         return damping / (2 * mass * frequency)
 
     # Optional functions for other packages
@@ -176,33 +178,39 @@ class ContactLaw(abc.ABC):
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray
     ) -> tuple[str, np.ndarray]:
-        """Return a key and its values after adding the dissipation of an oscillator with this damping ratio.
+        """Add the dissipation of a linear oscillator with the damping ratio zeta to the contacts.
 
         Args:
-            drawn: function that returns the draws of a key, (draws, ...); those of `stiffness` and `damping`
-                are (draws, entries), for a segmented law with its first slope.
-            ratio: damping ratio [1], (draws, 1).
+            drawn: function that returns the random draws of a key, (draws, ...). For `stiffness` and
+                `damping` the shape is (draws, entries); for a segmented law, `stiffness` is the first slope.
+            ratio: damping ratio zeta [1], (draws, 1).
             mass: equivalent mass [kg], (draws, 1).
             velocity: approach speed [m/s], (draws, 1).
 
+        Returns:
+            The key of `[contact]` that sets the dissipation, and its increased values.
+
         Raises:
-            InputError: if the law does not define this function.
+            InputError: if the law does not define this method.
         """
-        raise self._unstated("whose damping can be perturbed", "perturb_damping")
+        raise self._missing_method_error("perturb_damping")
 
     def in_floats(self, contact: Any, stiffness: Any, damping: float) -> FloatLaw:
-        """Return the law in plain floats, with one entry each of the lists `stiffness` and `damping`.
+        """Return the law as functions of Python floats, for one entry of `stiffness` and of `damping`.
 
-        Raise `InputError` if the law does not define this function.
+        Raise `InputError` if the law does not define this method.
         """
-        raise self._unstated("in plain floats", "in_floats")
+        raise self._missing_method_error("in_floats")
 
     def regression(self, contact: Any) -> Regression:
-        """Return the law as a sum of known functions. Raise `InputError` if the law does not define this."""
-        raise self._unstated("that is fitted to logs", "regression")
+        """Return the law as a linear combination of known functions, for fits to logs.
+
+        Raise `InputError` if the law does not define this method.
+        """
+        raise self._missing_method_error("regression")
 
     def families(self, deepest: float, entries: int) -> list[RegressionFamily]:
-        """Return the regression families that identification tries; none by default.
+        """Return the families of regressions that identification tries for this law; none by default.
 
         Args:
             deepest: largest penetration in the logs [m].
@@ -211,14 +219,13 @@ class ContactLaw(abc.ABC):
         return []
 
     def coefficients(self, contact: Any, stiffness: Any, damping: float) -> list[float]:
-        """Return the coefficients of `regression`: those of one entry, then the shared ones."""
+        """Return the coefficients of `regression` for one contact, in the order of `Regression.names`."""
         return [stiffness, damping]
 
     def file_values(self, fitted: Mapping[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
-        """Return values by dotted key of the mechanism file from the `fitted` coefficients of an entry."""
+        """Convert the `fitted` coefficients of a list entry to values of a mechanism file, by dotted key."""
         return {f"contact.stiffness.{entry}": fitted["stiffness"]}
 
-    def _unstated(self, which: str, method: str) -> InputError:
-        """Return the error for a law that lacks an optional `method`."""
-        expected = f"a law {which} (ContactLaw.{method})"
+    def _missing_method_error(self, method: str) -> InputError:
+        expected = f"a law that defines ContactLaw.{method}"
         return InputError(f"contact.law: found {format_value(self.name)}, expected {expected}")

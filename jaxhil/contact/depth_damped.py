@@ -10,18 +10,18 @@ from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
 from jaxhil.contact.regression import Regression, RegressionFamily
 
-DEFAULT_REFERENCE_DEPTH = 1e-3  # m, reference depth that identification writes into a file
+DEFAULT_REFERENCE_DEPTH = 1e-3  # m, d_0 for which identification fits b
 
 
 class DepthDamped(PowerLaw):
     """Contact law F = max(0, k d^n + b d' d/d_0), with damping proportional to depth.
 
     k is `stiffness` [N/m^n], n is `exponent` (1.5 for Hertz), b is `damping` [N s/m] at the depth d_0,
-    `reference_depth` [m]. The force does not jump at the onset. On the way out the surfaces separate at a
-    depth d > 0, where k d^(n-1) = b |d'|/d_0.
+    `reference_depth` [m]. The force does not jump at the onset. During the outward motion the surfaces
+    separate at a depth d > 0, where k d^(n-1) = b |d'|/d_0.
 
-    The ideal contact is integrated. Without damping it equals that of Hunt and Crossley's law; with n = 1 the
-    law is theirs with chi = 2 b/(3 k d_0), whose ideal contact has a closed form.
+    The ideal contact is integrated. Without damping it equals that of Hunt and Crossley's law. With n = 1 the
+    force equals that of Hunt and Crossley's law with chi = 2 b/(3 k d_0).
     """
 
     name: ClassVar[str] = "depth_damped"
@@ -39,14 +39,17 @@ class DepthDamped(PowerLaw):
         return jnp.zeros_like(rate)
 
     def hold(self, parameters, state, penetration, rate):
-        """Return F/d; for d <= 0 only its damping term, plus k for a linear spring."""
+        """Return the unclamped F/d for d > 0, and its limit at d = 0 for d <= 0."""
         touching = penetration > 0
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
         power = jnp.where(touching | (parameters.exponent == 1), power, 0)
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the damping b that dissipates as much at the deepest point."""
+        """Add the b whose damping force at the deepest point equals that of `HuntCrossley`, chi = pi zeta/v.
+
+        zeta is the damping ratio `ratio`, and v the approach speed.
+        """
         stiffness, order = drawn("stiffness"), drawn("exponent")[:, None] + 1
         depth = (order * mass * velocity**2 / (2 * stiffness)) ** (1 / order)
         reference_depth = drawn("reference_depth")[:, None]
@@ -57,7 +60,6 @@ class DepthDamped(PowerLaw):
         exponent, reference_depth = contact.exponent, contact.reference_depth
 
         def hold(depth: float, rate: float) -> float:
-            """Return F/d; for d <= 0 only its damping term, plus k for a linear spring."""
             return stiffness * max(depth, 0.0) ** (exponent - 1.0) + damping * rate / reference_depth
 
         def force(depth: float, rate: float) -> float:
@@ -78,7 +80,7 @@ class DepthDamped(PowerLaw):
 
 
 def _regression(exponent: float, reference_depth: float) -> Regression:
-    """Return F = k d^n + b d' d/d_0 with the coefficients k and b."""
+    """Return the regression F = k d^n + b d' d/d_0 with the unknown coefficients k and b."""
     return Regression(
         "depth_damped",
         lambda d, v: [d**exponent],

@@ -1,4 +1,4 @@
-"""Runge-Kutta step of order 5(4) for y' = f(t, y) (Dormand and Prince 1980), and the motion within a step."""
+"""Runge-Kutta step of order 5(4) for y' = f(t, y) (Dormand and Prince 1980), and interpolation in a step."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,22 +24,22 @@ _STAGE_COEFFICIENTS = (
 )
 _ERROR_COEFFICIENTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
-# Function of the time since the step's start [s] and of y, a tree of arrays. It returns y' and any other
-# result that is needed at the step's end.
+# Function of the time since the start of the step [s] and of y, a tree of arrays. It returns y' and further
+# results, which `StepResult.extra` contains for the end of the step.
 SlopeFunction = Callable[[Array, Any], tuple[Any, Any]]
 
 
 class StepResult(NamedTuple):
-    """Result of a step."""
+    """Result of a Runge-Kutta step."""
 
-    end: Any  # y at the step's end
-    slopes: Any  # y' at each stage; the first is at the step's start, the last at its end
-    found: Any  # second result of the slope function at the step's end
-    error: Any  # error estimate of y
+    end: Any  # y at the end of the step
+    slopes: Any  # y' at each stage, from the start of the step (first) to its end (last)
+    extra: Any  # second result of the slope function at the end of the step
+    error: Any  # estimated error of `end`
 
 
 def take_step(slope: SlopeFunction, start: Any, length: Array) -> StepResult:
-    """Take a step of `length` [s] from y = `start`."""
+    """Take one Runge-Kutta step of `length` [s] from the initial value y = `start`."""
 
     def increment(row, slopes):
         terms = [(a, stage) for a, stage in zip(row, slopes, strict=True) if a]
@@ -58,7 +58,7 @@ def take_step(slope: SlopeFunction, start: Any, length: Array) -> StepResult:
 
 
 def take_looped_step(slope: SlopeFunction, start: Any, length: Float[Array, "*batch"]) -> StepResult:
-    """Take the same step with a loop over its stages, which compiles in a fraction of the time."""
+    """Take the step of `take_step` by a compiled loop through the stages, which compiles much faster."""
     stages, batch_axes = len(_NODES), [1] * length.ndim
 
     def increment(row: Array, slopes: Any) -> Any:
@@ -84,20 +84,23 @@ def take_looped_step(slope: SlopeFunction, start: Any, length: Float[Array, "*ba
 
 
 class StepEnd(NamedTuple):
-    """Motion of one coordinate in a step: position and velocity at its end, acceleration at both ends."""
+    """Position and velocity at the end of a step, and the acceleration at its start and end."""
 
     depth: Array  # penetration [m]
-    velocity: Array  # its rate [m/s]
-    first: Array  # acceleration at the step's start [m/s^2]
-    last: Array  # acceleration at its end [m/s^2]
+    velocity: Array  # rate of the penetration [m/s]
+    first: Array  # acceleration at the start of the step [m/s^2]
+    last: Array  # acceleration at the end of the step [m/s^2]
 
 
 def interpolate_step(
     s: Array | float, length: Array, depth: Array, velocity: Array, end: StepEnd
 ) -> tuple[Array, Array]:
-    """Return position [m] and velocity [m/s] at the fraction s of a step (quintic Hermite polynomial)."""
+    """Interpolate position [m] and velocity [m/s] at the fraction s of a step (quintic Hermite polynomial).
+
+    `depth` and `velocity` are the values at the start of the step.
+    """
     linear, square = velocity * length, end.first * length**2 / 2
-    # Remainders at the step's end of position, velocity and acceleration, per step length.
+    # Differences from uniform acceleration at the end of the step, multiplied by powers of the step length.
     position_rest = end.depth - depth - linear - square
     velocity_rest = end.velocity * length - linear - 2 * square
     acceleration_rest = end.last * length**2 - 2 * square

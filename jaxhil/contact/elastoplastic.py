@@ -1,4 +1,4 @@
-"""Elastoplastic contact: loading along one slope, unloading from the deepest point along a steeper one."""
+"""Elastoplastic contact law: the force decreases along a steeper slope than it increased."""
 
 from typing import ClassVar
 
@@ -13,13 +13,13 @@ from jaxhil.contact.keys import ContactKey
 class Elastoplastic(ContactLaw):
     """Contact law F = max(0, k d_max - k_u (d_max - d)), k_u = r k, of a mechanism that yields.
 
-    k is `stiffness` [N/m], r is `unloading_ratio` >= 1. The state is the deepest penetration d_max [m]. At
-    d = d_max the force is k d. It falls along the slope k_u to 0 at d = d_max (1 - 1/r), rises along the same
-    line up to d_max and continues along k from there. The loss is the triangle between the two lines: the
-    energy M v^2/2 = k d_max^2/2 goes in, 1/r of it comes back, so that e = 1/sqrt(r). The law has no damping.
+    k is `stiffness` [N/m], r is `unloading_ratio` >= 1, and the state d_max [m] is the deepest penetration so
+    far. Loading beyond d_max follows F = k d. Unloading and reloading below d_max follow the slope k_u; the
+    force is 0 for d <= d_max (1 - 1/r). The mechanism stores k d_max^2/2 = M v^2/2 and returns the fraction
+    1/r, so that e = 1/sqrt(r). The law has no damping.
 
-    The dent is lost when the mechanism leaves the surface (d <= 0): every new contact begins undeformed, and
-    each of two surfaces has its own dent. Only a touch within the dent (0 < d < d_max) still sees it.
+    d_max is reset when the mechanism leaves the surface (d <= 0), so that every contact starts undeformed. It
+    is not reset while F = 0 at d > 0.
     """
 
     name: ClassVar[str] = "elastoplastic"
@@ -66,7 +66,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
     def reference(self, parameters, mass, velocity):
-        """Return a quarter period of the frequency sqrt(k/M) inward and of sqrt(k_u/M) outward."""
+        """Return the ideal contact: a quarter period of sqrt(k/M) inward, then one of sqrt(k_u/M) outward."""
         from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
@@ -84,7 +84,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * parameters.unloading_ratio
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Multiply the unloading ratio r by exp(2 pi zeta), since e* = 1/sqrt(r)."""
+        """Multiply r by exp(2 pi zeta), where zeta is the damping ratio `ratio`, since e* = 1/sqrt(r)."""
         return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
 
     def in_floats(self, contact, stiffness, damping):
@@ -92,7 +92,7 @@ class Elastoplastic(ContactLaw):
 
 
 def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
-    """Return the law after a penetration d_max: F = k d_max - k_u (d_max - d) >= 0, k d beyond d_max."""
+    """Return the law after a `deepest` penetration [m] so far."""
 
     def spring(depth: float, rate: float) -> float:
         if depth >= deepest:

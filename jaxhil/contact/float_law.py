@@ -1,4 +1,4 @@
-"""Contact laws in plain floats, for loops that run tick by tick in real time."""
+"""Contact laws in Python floats, for loops that run tick by tick in real time."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,17 +9,17 @@ ForceFunction = Callable[[float, float], float]
 
 
 class FloatLaw(NamedTuple):
-    """Contact law of one contact: functions of penetration d [m] and rate d' [m/s]."""
+    """Contact law of one contact, as functions of the penetration d [m] and its rate d' [m/s]."""
 
     force: ForceFunction  # force [N] at d > 0; 0 where the surfaces separate
-    hold: ForceFunction  # [N or 1]; positive until penetrated surfaces separate (`ContactLaw.hold`)
+    hold: ForceFunction  # positive until the surfaces separate (`ContactLaw.hold`)
     edge: Callable[[float], float]  # limit of the force [N] as d goes to 0 from above, a function of d' only
-    # for a law with memory: returns the law after a deepest penetration [m]; 0 gives the undeformed law
+    # only for a law with memory: returns the law after a deepest penetration [m]; 0: undeformed
     loaded: "Callable[[float], FloatLaw] | None" = None
 
 
 def clamp_force(spring: ForceFunction, edge: Callable[[float], float]) -> FloatLaw:
-    """Return the law whose force is `spring` clamped at 0; `edge` is the unclamped limit at d = 0."""
+    """Return the law with the force max(0, `spring`); `edge` is the limit of `spring` at d = 0."""
 
     def force(depth: float, rate: float) -> float:
         value = spring(depth, rate)

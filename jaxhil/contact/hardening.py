@@ -42,7 +42,7 @@ class Hardening(ContactLaw):
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return the force at the depth d where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2)."""
+        """Return the force [N] at the deepest point d, where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2)."""
         energy, unit = mass * velocity**2 / 2, parameters.reference_depth
         square = np.sqrt(1 + 4 * energy / (parameters.stiffness * unit**2)) - 1
         return parameters.stiffness * unit * np.sqrt(square) * (1 + square)
@@ -58,7 +58,7 @@ class Hardening(ContactLaw):
         return contact.reference_depth * max(forces)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to the damping."""
+        """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -70,7 +70,7 @@ class Hardening(ContactLaw):
         return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
-        """Return F = k d + k d^3/d_0^2 + b d' with the coefficients k, k/d_0^2 and b."""
+        """Return the regression F = k d + k d^3/d_0^2 + b d' with the unknown k, k/d_0^2 and b."""
         names = ("stiffness", "cubic", "damping")
         return Regression("hardening", lambda d, v: [d, d**3], names, lambda d, v: [v])
 

@@ -11,11 +11,14 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class HuntCrossley(PowerLaw):
-    """Contact law F = k d^n (1 + (3/2) chi d'), n = 1.5 for Hertz (Hunt and Crossley 1975)."""
+    """Contact law F = max(0, k d^n (1 + (3/2) chi d')), n = 1.5 for Hertz (Hunt and Crossley 1975).
+
+    k is `stiffness` [N/m^n], n is `exponent`, and chi is `damping` [s/m].
+    """
 
     name: ClassVar[str] = "hunt_crossley"
     damping_unit: ClassVar[str] = "s/m"
-    QUICK: ClassVar = (1.0, 1.5)  # exponents n that need no general power, which is not vectorised
+    QUICK: ClassVar = (1.0, 1.5)  # exponents n that need no general power function, which is slow
 
     # n, if it is in `QUICK` and equal for all batch elements; else None
     exponent: float | None = None
@@ -50,11 +53,11 @@ class HuntCrossley(PowerLaw):
         )
 
     def damping_ratio(self, damping, mass, velocity, frequency):
-        """Return chi v/pi, which follows from e = 1 - chi v."""
+        """Return zeta = chi v/pi, because e is about 1 - chi v, and exp(-pi zeta) for a linear oscillator."""
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add pi zeta/v to the damping chi, since e* is about 1 - chi v."""
+        """Add pi zeta/v to chi, where zeta is the damping ratio `ratio`, since e* is about 1 - chi v."""
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 
     def in_floats(self, contact, stiffness, damping):
@@ -89,7 +92,7 @@ class HuntCrossley(PowerLaw):
 
 
 def _regression(exponent: float) -> Regression:
-    """Return F = k d^n (1 + 1.5 chi d') with the coefficients k and k chi."""
+    """Return the regression F = k d^n (1 + 1.5 chi d') with the unknown coefficients k and k chi."""
     return Regression(
         "hunt_crossley",
         lambda d, v: [d**exponent, 1.5 * v * d**exponent],

@@ -1,12 +1,12 @@
-"""Ideal contact: the same contact of two free bodies, in continuous time and without any delay.
+"""Ideal contact of two free bodies, in continuous time and without any delay, in closed form.
 
-It is the reference of every result of the rig: the motion M d'' = -F(d, d'), d(0) = 0, d'(0) = v > 0, of two
-free bodies of equivalent mass M until they separate. No time stepping is needed: each contact law here has a
-closed form, or a first integral that leaves one well-conditioned scalar equation.
+All results of the rig are compared with the ideal contact: the motion M d'' = -F(d, d'), d(0) = 0,
+d'(0) = v > 0, of two free bodies with the equivalent mass M until they separate. Each contact law in this
+module has a closed form, or a first integral that leaves one well-conditioned scalar equation.
 
-All parameters are floating-point arrays of one batch shape and one dtype, `damping` not negative and all
-others positive (not checked here). All functions can be jitted, vmapped and differentiated once: equations
-are solved without differentiation, and their roots then get the exact first derivative.
+All parameters are floating-point arrays of one batch shape and one dtype. `damping` must not be negative, and
+all others must be positive; this is not checked here. All functions can be jitted, vmapped and differentiated
+once: scalar equations are solved without differentiation, then their roots get the exact first derivative.
 """
 
 import math
@@ -22,9 +22,9 @@ from jaxhil.contact.ideal_contact_segments import arccosine_over_sine, solve_cha
 
 
 class IdealContact(NamedTuple):
-    """Result of the ideal contact: arrays of the batch shape."""
+    """Restitution, peak force and duration of ideal contacts."""
 
-    restitution: Float[Array, "*batch"]  # rebound speed over approach speed [1]
+    restitution: Float[Array, "*batch"]  # rebound speed divided by approach speed [1]
     peak_force: Float[Array, "*batch"]  # largest contact force [N]
     # time from first touch to separation [s]; infinite if the bodies never separate
     duration: Float[Array, "*batch"]
@@ -39,10 +39,10 @@ def ideal_kelvin_voigt(
 ) -> IdealContact:
     """Return the ideal contact with F = k d + b d', at any damping ratio xi = b / (2 sqrt(k M)).
 
-    Without `tension`, F = max(0, k d + b d') and the bodies separate at F = 0, after 2 g(xi) / omega,
-    with e = exp(-2 xi g(xi)), g(xi) = acos(xi) / sqrt(1 - xi^2) continued analytically through xi = 1.
-    With `tension` they separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick (e = 0,
-    infinite duration) if xi >= 1. F is largest within the contact for xi < 1/2, else b v at the onset.
+    Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after 2 g(xi) / omega, with
+    e = exp(-2 xi g(xi)) and g(xi) = acos(xi) / sqrt(1 - xi^2), continued analytically through xi = 1.
+    With `tension`, they separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)). For xi >= 1 they stick
+    together (e = 0, infinite duration). For xi >= 1/2 the peak force is b v, at the onset of contact.
     Source: impulse response of the damped oscillator.
 
     Args:
@@ -91,17 +91,18 @@ def ideal_hunt_crossley(
 ) -> IdealContact:
     """Return the ideal contact with F = k d^n (1 + a d'), a = 3 chi / 2.
 
-    With y = a d', q = a v the first integral is k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),
-    G(y) = y - log(1 + y). The two rates at one depth, y and -p with G(y) = G(-p), have the common
-    parameter s = (y + p) / 2: y = s + L, p = s - L, L(s) = s coth(s) - 1, and there
+    With y = a d' and q = a v, the first integral is k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),
+    G(y) = y - log(1 + y). At each depth the inward rate y and the outward rate -p satisfy G(y) = G(-p). With
+    the parameter s = (y + p) / 2 they are y = s + L and p = s - L, L(s) = s coth(s) - 1, and
     G = L(s) + log(sinh(s) / s). Hence, with the root S of S + L(S) = q,
 
         e = (S - L(S)) / (S + L(S)),
         duration = 2 M / (a k) int_0^S d(s)^-n ds,
 
-    and F is largest where G(q) - G(y) = n y / (n + 1). All three are evaluated in forms that are regular at
-    chi = 0. The integral uses the double-exponential rule after a substitution that removes its singularity
-    at s = S. Source of the law: Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445; of the solution: here.
+    and F is largest where G(q) - G(y) = n y / (n + 1). All three results are computed in forms that are
+    regular at chi = 0. The integral uses the double-exponential rule after a substitution that removes the
+    singularity at s = S. The law is that of Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445; the solution
+    is derived here.
 
     Args:
         mass: equivalent mass M [kg].
@@ -128,8 +129,8 @@ def ideal_piecewise_linear(
 ) -> IdealContact:
     """Return the ideal contact with F = max(0, f(d) + b d'), f(0) = 0, f' = k_i between d_(i-1) and d_i.
 
-    The closed form of the damped oscillator is chained from one depth to the next, inward and outward. The
-    last slope continues beyond the last depth. One segment gives `ideal_kelvin_voigt` without tension.
+    The closed form of the damped oscillator is applied segment by segment, inward and outward. The last slope
+    continues beyond the last depth. With one segment the result equals `ideal_kelvin_voigt` without tension.
 
     Args:
         mass: equivalent mass M [kg].
@@ -141,7 +142,7 @@ def ideal_piecewise_linear(
     return IdealContact(*solve_chained_oscillators(mass, slopes, depths, damping, velocity))
 
 
-# s coth(s) - 1 = sum_k COTANGENT[k-1] s^(2k), radius of convergence pi.
+# s coth(s) - 1 = sum_k _COTH_SERIES[k-1] s^(2k), radius of convergence pi.
 _SERIES_ORDERS = np.arange(1, 9)
 _MAX_SERIES_ARGUMENT = 0.3
 # Riemann's zeta(2), zeta(4), ... are listed because SciPy, which has them, takes long to import.
@@ -163,7 +164,7 @@ _POTENTIAL_SERIES = _COTH_SERIES * (1 + 1 / (2 * _SERIES_ORDERS))
 
 
 def _langevin(s):
-    """Return 1 - L(s) / s, with Langevin's function L(s) / s = coth(s) - 1 / s, and L'(s), for s >= 0."""
+    """Return 1 - L(s) / s and L'(s) for s >= 0, where L(s) / s = coth(s) - 1 / s is Langevin's function."""
     small = s < _MAX_SERIES_ARGUMENT
     square = jnp.where(small, s, 0.0) ** 2
     value, slope = jnp.zeros_like(s), jnp.zeros_like(s)
@@ -182,7 +183,7 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Return restitution, peak force and duration in units of M, v and D, D^(n+1) = (n + 1) M v^2 / k."""
+    """Return e, and peak force and duration in the units M v^2/D and D/v, D^(n+1) = (n + 1) M v^2 / k."""
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
 
@@ -207,7 +208,7 @@ def _hunt_crossley_shape_jvp(primals, tangents):
 
 
 def _shape_at_roots(half_span, at_peak, onset, exponent):
-    """Return restitution, scaled peak force and scaled duration at the roots of their equations."""
+    """Return the results of `_hunt_crossley_shape` from the roots S = `half_span` and u = `at_peak`."""
     symmetry, _ = _langevin(half_span)
     share = exponent / (exponent + 1)
     # The force is stationary in y / q^2 = `at_peak`, which needs no derivative.
@@ -295,7 +296,7 @@ def _duration_integral(half_span, exponent):
 
 
 def _gap_by_series(span, fraction):
-    """Return R = (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)), r = s / S."""
+    """Return R of `_duration_integral`: (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)), r = s / S."""
 
     def term(k, carry):
         total, power, partial_sum = carry
@@ -309,10 +310,10 @@ def _gap_by_series(span, fraction):
 
 
 def _gap_in_closed_form(span, fraction, below_end):
-    """Return R from differences of coth and log sinh, written without cancellation at s = S."""
+    """Return R of `_duration_integral` in closed form, without cancellation near s = S."""
     s, distance = span * fraction, span * below_end
     loss = -jnp.expm1(-2 * span)
-    # The surplus is defined by sinh(S) = exp(S - s) sinh(s) (1 + surplus)
+    # The surplus is defined by sinh(S) = exp(S - s) sinh(s) (1 + surplus).
     surplus = jnp.exp(-2 * s) * jnp.expm1(-2 * distance) / jnp.expm1(-2 * s)
     at_end = below_end < 0.5
     log_fraction = jnp.where(

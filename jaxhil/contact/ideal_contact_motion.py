@@ -2,14 +2,14 @@
 
     M d'' = -F(d, d') - p(t),   d(0) = 0,   d'(0) = v > 0
 
-F is the law's force while the bodies touch. p(t) >= 0 is a further force that pushes the bodies apart, for
-example of a spring-loaded pusher; it acts whether they touch or not. This integration is the reference for
-laws without a closed form (`jaxhil.contact.ideal_contact`) and with a push; it checks the closed forms.
+F is the law's force while the bodies touch. The push p(t) >= 0 is a further force that drives the bodies
+apart, for example from a spring-loaded pusher; it also acts when the bodies do not touch. This integration
+computes the ideal contact for laws without a closed form (`jaxhil.contact.ideal_contact`) and with a push.
 
-The method is Dormand and Prince's pair of order 5(4) with one step size per batch element. Steps end at the
-turning point and at the separation, so that each step lies within one smooth branch of the motion; at the
-kinks of a law the error control shortens the steps. The law's state (`ContactLaw.init`, `step`) is updated
-after each step.
+The method is Dormand and Prince's pair of order 5(4) with one step size for each batch element. Steps end at
+the turning point and at the separation, so that the motion is smooth within each step. Where the slope of the
+force changes, the error control shortens the steps. The state of the law (`ContactLaw.init`, `step`) is
+updated after each step.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ INWARD, OUTWARD, FREE, ENDED = range(4)  # phases of the motion; FREE occurs onl
 
 @runtime_checkable
 class ForceLaw(Protocol):
-    """Part of the interface `jaxhil.contact.base.ContactLaw` that the integration calls."""
+    """Methods of `jaxhil.contact.base.ContactLaw` that the integration calls."""
 
     def init(self, penetration: Any) -> tuple[Any, ...]: ...
 
@@ -46,7 +46,7 @@ class ForceLaw(Protocol):
 
 
 class IdealContactMotion(NamedTuple):
-    """Result of the integrated ideal contact, and its motion at the requested times."""
+    """Result of an integrated ideal contact, and its motion at the requested times."""
 
     restitution: Float[Array, "*batch"]  # speed |d'| after contact and push, divided by v [1]
     peak_force: Float[Array, "*batch"]  # largest contact force, without the push [N]
@@ -69,9 +69,9 @@ def integrate_contact(
 ) -> IdealContactMotion:
     """Integrate the motion of one ideal contact.
 
-    The contact ends by separation: on the way out the penetration, or `ContactLaw.hold`, goes through 0.
-    Since p >= 0 pushes the bodies apart, they never touch again. If the push lasts longer than the contact,
-    the restitution is computed from the speed at the end of the push and may exceed 1.
+    The bodies separate when the penetration, or `ContactLaw.hold`, crosses 0 during the outward motion. Since
+    p >= 0 drives the bodies apart, they never touch again. If the push lasts longer than the contact, the
+    restitution is computed from the speed at the end of the push and may exceed 1.
 
     The function can be jitted, vmapped and differentiated in forward mode, also with respect to `times` and
     to the variables that `push` encloses. Shapes are as for the closed forms: one batch shape and one dtype,
@@ -122,13 +122,13 @@ class _Problem(NamedTuple):
 
 
 class _IntegrationState(NamedTuple):
-    """State of the motion."""
+    """State of the integrated motion."""
 
     time: Array  # time since the first touch [s]
     depth: Array  # penetration [m]
-    velocity: Array  # its rate [m/s]
+    velocity: Array  # rate of the penetration [m/s]
     memory: Any  # state of the contact law
-    phase: Array  # INWARD, OUTWARD, FREE or OVER
+    phase: Array  # INWARD, OUTWARD, FREE or ENDED
     deepest: Array  # largest |penetration| so far [m]
     peak: Array  # largest contact force so far [N]
     hold_scale: Array  # `ContactLaw.hold` at the turning point
@@ -148,22 +148,22 @@ class _Search(NamedTuple):
 
 
 class _Nodes(NamedTuple):
-    """Start of each step, (nodes, *batch)."""
+    """Motion at the start of each step, (steps, *batch)."""
 
     time: Array  # time since the first touch [s]
     depth: Array  # penetration [m]
-    velocity: Array  # its rate [m/s]
-    first: Array  # acceleration at the step's start [m/s^2]
-    last: Array  # acceleration at its end [m/s^2]
+    velocity: Array  # rate of the penetration [m/s]
+    first: Array  # acceleration at the start of the step [m/s^2]
+    last: Array  # acceleration at the end of the step [m/s^2]
 
 
-def _build_event_function(problem, state, time, depth, rate):
-    """Return a function that is 0 at the end of the phase: turning point, separation, or end of the push.
+def _event_value(problem, state, time, depth, rate):
+    """Return a value that is positive during a phase of the motion and 0 at its end.
 
-    It is positive before.
+    A phase ends at the turning point, at the separation, or at the end of the push.
     """
     hold = problem.law.hold(problem.parameters, state.memory, depth, rate)
-    # Both are scaled to order 1; otherwise the root of their minimum would be hard to find.
+    # Force and depth are scaled to order 1; otherwise the root of their minimum would be hard to find.
     hold = hold / jnp.where(state.hold_scale > 0, state.hold_scale, 1)
     share = depth / jnp.where(state.deepest > 0, state.deepest, 1)
     separation = jnp.where(hold < share, hold, share)
@@ -172,14 +172,14 @@ def _build_event_function(problem, state, time, depth, rate):
 
 
 def _contact_force(problem, state, depth, rate):
-    """Return the contact force [N]; for d <= 0, where a step may overshoot, its limit from inside."""
+    """Return the contact force [N]; at d <= 0, which a step may reach, its limit for d -> 0 from above."""
     force, _ = problem.law.step(problem.parameters, state.memory, depth, rate)
     force = jnp.where(depth > 0, force, problem.law.edge(problem.parameters, rate))
     return jnp.where(state.phase < FREE, force, 0)
 
 
 def _try_step(problem, state, length):
-    """Return the motion after a step of `length` [s], and the errors of penetration [m] and rate [m/s]."""
+    """Return the motion after a step of `length` [s], and the errors of its depth [m] and rate [m/s]."""
     pushes = state.time < problem.push_end
 
     def slope(offset, motion):
@@ -209,7 +209,7 @@ def _initial_state(problem):
 
 
 def _integrate_phases(problem, records):
-    """Integrate to the end of every contact, at most to `MAX_CONTACT_DURATION`; return end and nodes."""
+    """Integrate all contacts; return the final state and, if `records`, the nodes (else None)."""
     like = problem.approach
     dtype, zeros = like.dtype, jnp.zeros_like(like)
     rounding = float(np.finfo(dtype).eps)
@@ -237,7 +237,7 @@ def _integrate_phases(problem, records):
         is_accurate = (ratio <= 1) | (step <= 8 * rounding * state.time)
 
         def event(time, depth, rate):
-            return _build_event_function(problem, state, time, depth, rate)
+            return _event_value(problem, state, time, depth, rate)
 
         time = state.time + step
         value, slope = jax.jvp(
@@ -246,14 +246,14 @@ def _integrate_phases(problem, records):
         crosses = ~searching & is_accurate & (value <= 0)
         is_located = searching & ((search.tries >= MAX_EVENT_ITERATIONS) | (value == 0))
         is_accepted = active & (is_located | (~searching & is_accurate & ~crosses))
-        # A last step of Newton's method gives the event's time its derivative.
+        # A final Newton step gives the time of the event its derivative.
         slope = lax.stop_gradient(slope)
-        rest = jnp.where(is_located & (slope < 0), -value / jnp.where(slope < 0, slope, -1), 0)
-        after = _update_state(problem, state, step, trial, rest, is_located)
+        correction = jnp.where(is_located & (slope < 0), -value / jnp.where(slope < 0, slope, -1), 0)
+        after = _update_state(problem, state, step, trial, correction, is_located)
         growth = jnp.clip(0.9 * jnp.maximum(ratio, 1e-6) ** -0.2, 0.2, 5)
         at_start = event(state.time, state.depth, state.velocity)
         search = _update_search(search, step, step * growth, value, at_start, crosses, is_located)
-        # A batch element that is not finite ends here.
+        # The motion of a batch element with values that are not finite ends here.
         after = after._replace(phase=jnp.where(jnp.isfinite(ratio), after.phase, ENDED))
         return select_lanes(is_accepted | ~jnp.isfinite(ratio), after, state), search, count + 1, nodes
 
@@ -266,10 +266,10 @@ def _integrate_phases(problem, records):
 
 
 def _propose_step(problem, state, search):
-    """Return the step to try [s]: a false position for a bracketed event, else that of the error control."""
+    """Return the next step to try [s]: by false position if an event is bracketed, else by error control."""
     rise = search.at_high - search.at_low
     middle = search.high - search.at_high * (search.high - search.low) / jnp.where(rise < 0, rise, -1)
-    # A step neither crosses the end of the push nor more than 1/50 of its duration.
+    # A step does not cross the end of the push, and is at most 1/50 of the duration of the push.
     push_left = problem.push_end - state.time
     bounded = jnp.minimum(jnp.minimum(search.step, problem.push_end / 50), push_left)
     step = jnp.where(search.tries > 0, middle, jnp.where(push_left > 0, bounded, search.step))
@@ -277,7 +277,7 @@ def _propose_step(problem, state, search):
 
 
 def _fill_nodes(nodes, end, count):
-    """Return the nodes with all entries from index `count` on set to the end of the motion."""
+    """Set all nodes from index `count` on to the end of the motion."""
     zeros = jnp.zeros_like(end.time)
     is_unused = jnp.arange(MAX_STEPS, dtype=count.dtype).reshape(-1, *[1] * zeros.ndim) >= count
     filling = end.time, end.depth, end.velocity, zeros, zeros
@@ -286,7 +286,7 @@ def _fill_nodes(nodes, end, count):
 
 
 def _update_search(search, step, proposed, value, at_start, crosses, is_located):
-    """Return the search after a step: started, narrowed, or finished."""
+    """Return the search for the event after one more step: started, narrowed, or finished."""
     searching = search.tries > 0
     before = value > 0
     # The Illinois rule halves the value at a bound that does not move for a second time.
@@ -307,8 +307,8 @@ def _update_search(search, step, proposed, value, at_start, crosses, is_located)
     return lax.stop_gradient(select_lanes(crosses, started, narrowed))
 
 
-def _update_state(problem, state, step, trial, rest, is_located):
-    """Return the state after a `step` and a `rest` [s], in the next phase if an event `is_located`."""
+def _update_state(problem, state, step, trial, correction, is_located):
+    """Return the state after a `step` and its `correction` [s]; a located event starts the next phase."""
 
     def force_at(s):
         depth, rate = interpolate_step(s, step, state.depth, state.velocity, trial)
@@ -323,9 +323,9 @@ def _update_state(problem, state, step, trial, rest, is_located):
     peak = state.peak
     for force in (first, last, top):
         peak = jnp.where(force > peak, force, peak)
-    time = state.time + step + rest
-    depth = trial.depth + rest * trial.velocity
-    velocity = trial.velocity + rest * trial.last
+    time = state.time + step + correction
+    depth = trial.depth + correction * trial.velocity
+    velocity = trial.velocity + correction * trial.last
     _, memory = problem.law.step(problem.parameters, state.memory, depth, velocity)
     magnitude, hold = jnp.abs(depth), problem.law.hold(problem.parameters, memory, depth, velocity)
     phase = state.phase + is_located.astype(state.phase.dtype)

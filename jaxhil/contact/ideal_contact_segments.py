@@ -1,11 +1,10 @@
-"""Ideal contact of the piecewise-linear law: a chain of damped oscillators in closed form.
+"""Ideal contact of the piecewise-linear law: one damped oscillator for each segment, in closed form.
 
-Between two depths the bodies obey M d'' = -(f + k (d - d_0) + b d'), a damped oscillator about the depth at
-which the segment's line would reach zero force. The motion through a segment ends at the next depth, or
-where a homogeneous solution of the same oscillator has its first zero: d' (turning point) inward,
-F = -M d'' (separation) outward. These zeros have closed forms at every damping ratio. Only the time at which
-a depth is crossed needs iterations, by Newton's method, which converges monotonically because d is concave
-in time throughout a contact.
+In a segment that starts at the depth d_0 with the spring force f, M d'' = -(f + k (d - d_0) + b d'). The
+motion leaves the segment at the next depth, or ends at d' = 0 (inward: turning point) or at F = -M d'' = 0
+(outward: separation). d' and d'' are homogeneous solutions of the oscillator, and their first zeros have
+closed forms at every damping ratio. Only the time at which the motion crosses a depth needs iterations:
+Newton's method converges monotonically, because d is concave in time throughout a contact.
 """
 
 import math
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_NEWTON_STEPS = 80  # enough even at a grazed depth, where each step only halves the distance
+_NEWTON_STEPS = 80  # enough even for a turning point at a depth, where a step only halves the distance
 
 
 def solve_chained_oscillators(
@@ -80,40 +79,40 @@ def arccosine_over_sine(cosine):
 
 
 class _Segment(NamedTuple):
-    """Segment of the law, per unit mass."""
+    """Segment of the piecewise-linear force, divided by the mass."""
 
     number: Int[Array, ""]  # index, from 0
     stiffness: Float[Array, "*batch"]  # slope [1/s^2]
-    acceleration: Float[Array, "*batch"]  # spring force over mass at the lower depth [m/s^2]
+    acceleration: Float[Array, "*batch"]  # spring force / mass at the lower depth [m/s^2]
     thickness: Float[Array, "*batch"]  # distance from the lower to the upper depth [m]; infinite for the last
 
 
 class _State(NamedTuple):
-    """State of the motion between two segments."""
+    """State of the motion at the boundary between two segments."""
 
-    depth: Float[Array, "*batch"]  # turning point above the lower depth of its segment [m]
+    depth: Float[Array, "*batch"]  # distance from the lower depth of its segment to the turning point [m]
     velocity: Float[Array, "*batch"]  # [m/s]
     time: Float[Array, "*batch"]  # time since the first touch [s]
-    peak: Float[Array, "*batch"]  # largest force so far over mass [m/s^2]
+    peak: Float[Array, "*batch"]  # largest force so far divided by mass [m/s^2]
     segment: Int[Array, "*batch"]  # index of the deepest segment reached
     # inward: whether the turning point is reached; outward: whether the bodies have separated
     ended: Bool[Array, "*batch"]
 
 
 class _SegmentPassage(NamedTuple):
-    """Motion through one segment, from its start to its end."""
+    """Motion through one segment."""
 
-    spring: Array  # spring force over mass at the start [m/s^2]
+    spring: Array  # spring force divided by mass at the start [m/s^2]
     velocity: Array  # velocity at the start [m/s]
-    crosses: Array  # whether it ends at the segment's far depth, not at a turning point or a separation
+    crosses: Array  # whether the motion crosses the far depth of the segment, instead of ending within it
     target: Array  # distance to the far depth [m]; 0 if it is not reached
     time: Array  # duration, without derivative [s]
-    grows: Array  # whether it is inward and the force grows at first
+    grows: Array  # whether the motion is inward and the force increases at the start
     culmination: Array  # time until the force is largest [s]
 
 
 def _traverse(decay, layer: _Segment, inward, state: _State) -> _State:
-    """Move through one segment, inward or outward, to its far depth, the turning point or separation."""
+    """Advance the state through one segment: to the far depth, the turning point or the separation."""
     active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= layer.number))
     passage = _compute_passage(decay, layer, inward, state, active)
     stiffness = layer.stiffness
@@ -158,7 +157,7 @@ def _traverse(decay, layer: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, layer: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Return the motion through a segment for `active` batch elements; times have no derivative."""
+    """Compute the motion through a segment for the `active` batch elements, with times without derivative."""
     stiffness, turns_here = layer.stiffness, state.segment == layer.number
     # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, layer.thickness))
@@ -167,8 +166,8 @@ def _compute_passage(decay, layer: _Segment, inward, state: _State, active) -> _
     spring = layer.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
-    # Unless a depth is crossed, the motion ends at d' = 0 or at F = 0. Inward, F is largest at the start or
-    # the end or, if it grows at first, where F' = 0.
+    # Unless the motion crosses a depth, it ends at d' = 0 or at F = 0. Inward, F is largest at the start or
+    # at the end or, if F increases at the start, where F' = 0.
     fixed = lax.stop_gradient((decay, stiffness, spring, velocity))
     growth = stiffness * velocity - 2 * decay * force
     grows = inward & (growth > 0)
@@ -194,8 +193,8 @@ def _compute_passage(decay, layer: _Segment, inward, state: _State, active) -> _
 def _crossing_time(decay, stiffness, spring, velocity, target, start):
     """Return the time [s], without derivative, to travel the distance `target`; 0 if `target` is 0.
 
-    Since d is concave in time, Newton's method moves from `start` (0 inward, the separation outward) towards
-    the crossing without overshooting it. A batch element is done when rounding stops its progress.
+    `start` is 0 for the inward motion, and the time of separation for the outward motion. Since d is concave
+    in time, Newton's method approaches the crossing from there without overshooting, until rounding stops it.
     """
 
     def advance(carry):
@@ -220,7 +219,7 @@ def _first_zero(decay, stiffness, value, slope_share):
 
     The arguments are a, k, y(0) and c >= 0. With w^2 = k - a^2 the solution is
     e^(-a t) (y(0) cos(w t) - (a y(0) + c) sin(w t) / w). Its zero is artanh(h y(0) / (a y(0) + c)) / h,
-    h^2 = -w^2, for either sign of w^2. For k > a^2 it lies in the first quarter period.
+    h^2 = -w^2, for either sign of w^2. For k > a^2 the zero lies in the first quarter period.
     """
     over, rate = _characteristic_root(decay, stiffness)
     circular = jnp.arctan2(rate * value, decay * value + slope_share) / rate
@@ -232,9 +231,10 @@ def _first_zero(decay, stiffness, value, slope_share):
 
 
 def _free_motion(decay, stiffness, spring, velocity, time):
-    """Return distance [m] and velocity [m/s] after `time`; `spring` is the initial spring force over mass.
+    """Return distance [m] and velocity [m/s] after `time` [s].
 
-    With the impulse response S they are v S - f int S and v S' - f S.
+    With the impulse response S and the initial spring force per mass, f = `spring`, the distance is
+    v S - f int S, and the velocity is v S' - f S.
     """
     impulse, slope, integral = _impulse_response(decay, stiffness, time)
     return velocity * impulse - spring * integral, velocity * slope - spring * impulse
@@ -242,7 +242,7 @@ def _free_motion(decay, stiffness, spring, velocity, time):
 
 @jax.custom_jvp
 def _impulse_response(decay, stiffness, time):
-    """Return S = e^(-a t) sin(w t) / w, S' and int S, at any damping ratio; w^2 = k - a^2."""
+    """Return the impulse response S = e^(-a t) sin(w t) / w, w^2 = k - a^2, with S' and int S."""
     over, rate = _characteristic_root(decay, stiffness)
     half = jnp.where(over, 0.0, rate * time) / 2
     sine = jnp.sin(half)

@@ -1,4 +1,4 @@
-"""Linear contact laws: spring with damper (Kelvin-Voigt), and spring alone."""
+"""Linear contact laws: a spring with a damper (Kelvin-Voigt), and a spring without a damper."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class KelvinVoigt(ContactLaw):
-    """Contact law F = k d + b d', clamped at 0 unless tension is allowed."""
+    """Contact law F = k d + b d', clamped at 0 unless the key `tension` is true."""
 
     name: ClassVar[str] = "kelvin_voigt"
     keys: ClassVar = (ContactKey("tension", "whether {laws} may pull", default=False),)
@@ -46,7 +46,7 @@ class KelvinVoigt(ContactLaw):
         return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to the damping."""
+        """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -65,7 +65,7 @@ class KelvinVoigt(ContactLaw):
 
 
 class Linear(KelvinVoigt):
-    """Contact law F = k d."""
+    """Contact law F = k d, without damping."""
 
     name: ClassVar[str] = "linear"
     keys: ClassVar = ()
@@ -90,7 +90,7 @@ class Linear(KelvinVoigt):
 
 
 def _kelvin_voigt(pulls: bool) -> Regression:
-    """Return F = k d + b d' with the coefficients k and b; the force may be negative if it `pulls`."""
+    """Return the regression F = k d + b d' with the unknown k and b; `pulls`: whether F may be negative."""
     return Regression(
         "kelvin_voigt",
         lambda d, v: [d],

@@ -1,4 +1,4 @@
-"""Keys of a mechanism file's `[contact]` that only some contact laws have: meaning, unit, range, default."""
+"""Keys of the table `[contact]` that only some contact laws have: description, unit, range and default."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
@@ -7,16 +7,16 @@ from msgspec import Meta, field
 
 __all__ = ["DEPTHS", "EXPONENT", "REFERENCE_DEPTH", "ContactKey", "key_metadata"]
 
-MAX_DEPTHS = 20  # depths at which a piecewise-linear law changes its slope
+MAX_DEPTHS = 20  # limit on the number of entries of the key `depths`
 
 
 def key_metadata(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
-    """Return the metadata of a key's type.
+    """Return the msgspec metadata of a key: its description, unit and allowed values.
 
     Args:
         meaning: description of the key, one line.
         unit: unit of a number ("1" if dimensionless); None for other types.
-        limits: allowed values, by msgspec's names; `infinite`: whether an infinite number is allowed.
+        limits: allowed values, by msgspec's names (`ge`, `lt`, ...); `infinite`: whether to allow infinity.
     """
     unit_entry = {} if unit is None else {"unit": unit}
     extra = {"infinite": limits.pop("infinite", False), **unit_entry}
@@ -24,25 +24,28 @@ def key_metadata(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
 
 
 class ContactKey(NamedTuple):
-    """Key of a contact law: a flag if the default is a bool, a list if it is a list, else a number."""
+    """Key of `[contact]` that only some contact laws have.
+
+    The key is a flag if `default` is a bool, a list if `default` is a list, and a number otherwise.
+    """
 
     name: str
     meaning: str  # description; "{laws}" stands for the names of the laws that have the key
     unit: str | None = None  # unit of the number or of the list's entries; None for a flag
-    limits: Mapping[str, float] = {}  # limits of the number or of the list's entries, by msgspec's names
+    limits: Mapping[str, float] = {}  # allowed values of the number or list entries, by msgspec's names
     default: Any = None  # None: the key is required for the laws that have it
     neutral: float = 0.0  # value in `ContactParameters` if the file has no value
     name_in_six_axes: str = ""  # name in six-axis files, if it differs
     meaning_in_six_axes: str = ""  # description in six-axis files, if the name differs
 
     def in_six_axes(self) -> "ContactKey":
-        """Return the key as it is in six-axis files."""
+        """Return the key with its name and description in six-axis files."""
         if not self.name_in_six_axes:
             return self
         return self._replace(name=self.name_in_six_axes, meaning=self.meaning_in_six_axes)
 
     def struct_field(self, laws: str) -> tuple[str, Any, Any]:
-        """Return name, type and default for `msgspec.defstruct`; `laws` names the laws that have the key."""
+        """Return name, type and default for `msgspec.defstruct`; `laws` names the laws that use the key."""
         meaning = self.meaning.format(laws=laws)
         if isinstance(self.default, bool):
             return self.name, Annotated[bool, key_metadata(meaning)], self.default

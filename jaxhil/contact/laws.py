@@ -1,7 +1,7 @@
-"""Registry of the contact laws, their parameters, and the contact at one surface or two.
+"""Registry of the contact laws, their parameters, and the contact force at one or two surfaces.
 
-A law is one file of `jaxhil.contact` and an entry here; `jaxhil.contact.base` defines its interface.
-`jaxhil.register` adds laws of other packages.
+Each law is a module of `jaxhil.contact` and an entry of `CONTACT_LAWS`; `jaxhil.contact.base` defines the
+interface. `jaxhil.register` adds laws of other packages.
 """
 
 from collections import namedtuple
@@ -53,7 +53,7 @@ CONTACT_KEYS: dict[str, ContactKey] = {
 
 
 def find_contact_law(name: str) -> ContactLaw:
-    """Return the contact law of this name. Raise `InputError` if there is none."""
+    """Return the contact law with this name. Raise `InputError` for an unknown name."""
     if name not in CONTACT_LAWS:
         raise InputError(
             f"contact.law: found {format_value(name)}, expected one of {', '.join(CONTACT_LAWS)}"
@@ -62,7 +62,7 @@ def find_contact_law(name: str) -> ContactLaw:
 
 
 def laws_with_key(key: ContactKey) -> tuple[str, ...]:
-    """Return the names of the laws that have the key, given in its one-axis or its six-axis form."""
+    """Return the names of the contact laws that use a key; the key may have its one-axis or six-axis name."""
     return tuple(
         law.name
         for law in CONTACT_LAWS.values()
@@ -73,15 +73,15 @@ def laws_with_key(key: ContactKey) -> tuple[str, ...]:
 if TYPE_CHECKING:
 
     class ContactParameters(NamedTuple):
-        """Parameters of one contact, or of several along a leading axis.
+        """Parameters of one contact, or of several contacts along a leading axis.
 
-        There is a further field for each of `CONTACT_KEYS`, (...); without a value in the file it has the
-        key's neutral value.
+        Each key in `CONTACT_KEYS` is a further field. If the file has no value for a key, the field has the
+        key's `neutral` value.
         """
 
         stiffness: Any  # [N/m], or [N/m^n] for a law with an exponent n; (segments, ...) if segmented
         damping: Any  # [N s/m], or chi [s/m] for Hunt-Crossley
-        kind: Any = None  # index of the law in `jaxhil.contact.mixture.AnyOf.laws`; None without a mixture
+        kind: Any = None  # index into `jaxhil.contact.mixture.LawMixture.laws`; None for a single law
 
         def __getattr__(self, key: str) -> Any: ...
 
@@ -94,7 +94,7 @@ else:
 def deflection(position: Any, clearance: Any | None) -> Any:
     """Return the signed deflection [m] of the mechanism: x for x > 0, x + c for x < -c, else 0.
 
-    The clearance c [m] may be infinite; None means that there is one surface only.
+    The clearance c [m] may be infinite; None means that there is only one surface.
     """
     if clearance is None:
         return jnp.where(position > 0, position, 0)
@@ -103,10 +103,10 @@ def deflection(position: Any, clearance: Any | None) -> Any:
 
 
 def compute_two_sided_force(law, parameters, state, position, velocity, clearance):
-    """Return the signed contact force [N] and the next state of the law, for one surface or two.
+    """Return the signed contact force [N] at one or two surfaces, and the next state of the law.
 
-    The force is law(d, d') with d = x at the first surface, and -law(d, d') with d = -c - x at the second,
-    which exists only if the `clearance` c [m] is not None.
+    At the first surface the force is law(d, d') with d = x. A `clearance` c [m] other than None adds a second
+    surface, where the force is -law(d, d') with d = -c - x.
     """
     signed = deflection(position, clearance)
     if clearance is None:

@@ -1,7 +1,7 @@
 """Contact law selected per batch element: one compiled program for mechanisms with different laws.
 
-Every law is evaluated for every batch element, which then takes the result of its law. This costs a few
-operations per tick, but saves compiling one program per law.
+Every law is evaluated for every batch element; then the result of the element's own law is selected. This
+costs a few operations per tick, but avoids the compilation of one program for each law.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,13 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters
 
 
 class LawMixture(ContactLaw):
-    """Contact law that applies the law number `parameters.kind` of `laws` to each batch element.
+    """Contact law that applies the law `laws[parameters.kind]` to each batch element.
 
-    Stiffness and depths have a leading axis of segments, as for the piecewise-linear law; the other laws take
-    the first segment. A batch element's parameters keep their meaning for its law; the other laws get them
-    without damping.
+    Stiffness and depths have a leading axis of segments; laws without segments use the first segment. A batch
+    element has the parameters of its own law; the other laws are evaluated with damping 0.
 
-    If `beforehand` is true, ideal contacts without a closed form come with the scenarios
-    (`Scenario.reference`), and `reference` returns NaN for them.
+    If `beforehand` is true, the scenarios contain the ideal contacts of laws without a closed form
+    (`Scenario.reference`), and the method `reference` returns NaN for these laws.
     """
 
     laws: tuple[ContactLaw, ...]
@@ -73,7 +72,7 @@ class LawMixture(ContactLaw):
         return IdealContact(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
 
     def _per_law(self, parameters: ContactParameters) -> list[ContactParameters]:
-        """Return the parameters as each law takes them."""
+        """Return the parameters for each law, with damping 0 for the batch elements of other laws."""
         per_law = []
         for kind, law in enumerate(self.laws):
             damping = jnp.where(parameters.kind == kind, parameters.damping, 0)
@@ -82,7 +81,7 @@ class LawMixture(ContactLaw):
         return per_law
 
     def _choose(self, parameters: ContactParameters, values: Sequence[Array]) -> Array:
-        """Return for each batch element the value of its law."""
+        """Select each batch element's value among the `values` of all laws."""
         chosen = jnp.asarray(values[0])
         for kind, value in enumerate(values[1:], start=1):
             chosen = jnp.where(parameters.kind == kind, value, chosen)

@@ -1,4 +1,4 @@
-"""Piecewise-linear contact law: a stiffness that changes with depth, as of buffers and hard stops."""
+"""Piecewise-linear contact law: the stiffness changes at given depths, as in buffers and hard stops."""
 
 from itertools import pairwise
 from typing import ClassVar
@@ -13,9 +13,10 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class PiecewiseLinear(ContactLaw):
-    """Contact law F = max(0, sum_i k_i overlap_i(d) + b d') with slopes k_i between depths d_1 < d_2 < ...
+    """Contact law F = max(0, sum_i k_i s_i(d) + b d'), where s_i(d) is the part of d within segment i.
 
-    Segment i spans d_{i-1} to d_i (d_0 = 0); the last segment is unbounded.
+    Segment i extends from the depth d_{i-1} to d_i (d_0 = 0), the last segment to infinity. The depths are
+    `depths` [m]; `stiffness` contains the slopes k_i [N/m]; b is `damping` [N s/m].
     """
 
     name: ClassVar[str] = "piecewise_linear"
@@ -53,7 +54,7 @@ class PiecewiseLinear(ContactLaw):
         )
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Add up segments: a force F at a segment's start grows to sqrt(F^2 + 2 k E) over an energy E."""
+        """Return the peak force [N]: in each segment the stored energy E raises F to sqrt(F^2 + 2 k E)."""
         stiffness, depths = parameters.stiffness, parameters.depths
         slots, segments = stiffness.shape[:2]
         energy = np.broadcast_to(mass * velocity**2 / 2, (slots, stiffness.shape[-1]))
@@ -68,7 +69,7 @@ class PiecewiseLinear(ContactLaw):
         return force
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to the damping, with the first slope k."""
+        """Add 2 zeta sqrt(k M) to `damping`: zeta is the damping ratio `ratio`, and k the first slope."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -100,11 +101,11 @@ class PiecewiseLinear(ContactLaw):
 
 
 def _regression(depths: tuple[float, ...]) -> Regression:
-    """Return F = sum_i k_i overlap_i(d) + b d' with the coefficients k_1, k_2, ... and b."""
-    edges = np.array([0.0, *depths, np.inf])
+    """Return the regression F = sum_i k_i s_i(d) + b d' with the unknown coefficients k_1, k_2, ... and b."""
+    bounds = np.array([0.0, *depths, np.inf])
 
     def overlaps(d, v):
-        return [np.clip(d - low, 0.0, high - low) for low, high in pairwise(edges)]
+        return [np.clip(d - low, 0.0, high - low) for low, high in pairwise(bounds)]
 
     slopes = tuple(f"slope{i + 1}" for i in range(len(depths) + 1))
     names, shape = (*slopes, "damping"), {"depths": list(depths)}

@@ -1,21 +1,21 @@
-"""Base class of the contact laws with a power of the depth, F = k d^n without damping."""
+"""Base class of the contact laws with the elastic force F = k d^n."""
 
 from typing import ClassVar
 
 from jaxhil.contact.base import ContactLaw
 from jaxhil.contact.keys import EXPONENT, ContactKey
 
-COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)
+COMMON_EXPONENTS = (1.0, 1.5, 2.0, 3.0)  # exponents that identification prefers
 
 
 class PowerLaw(ContactLaw):
-    """Base class of laws with F = k d^n without damping; k is `stiffness` [N/m^n], n is `exponent`."""
+    """Base class of the laws with the elastic force k d^n; k is `stiffness` [N/m^n], n is `exponent`."""
 
     keys: ClassVar[tuple[ContactKey, ...] | None] = (EXPONENT,)
     stiffness_unit: ClassVar[str] = "N/m^n"
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return k d^n at the depth d where k d^(n + 1)/(n + 1) = M v^2/2."""
+        """Return k d^n at the deepest point d, where k d^(n + 1)/(n + 1) = M v^2/2."""
         exponent, energy = parameters.exponent, mass * velocity**2 / 2
         depth = ((exponent + 1) * energy / parameters.stiffness) ** (1 / (exponent + 1))
         return parameters.stiffness * depth**exponent

@@ -13,13 +13,13 @@ from jaxhil.contact.keys import ContactKey
 class Preloaded(ContactLaw):
     """Contact law F = max(0, F_0 + k d + F_r sign(d')) of a preloaded spring with dry friction.
 
-    F_0 is `preload` [N], k is `stiffness` [N/m], F_r is `friction` [N], which acts against the motion
-    (Coulomb). The force jumps at the onset and at the turning point. The law has no damping.
+    F_0 is `preload` [N], k is `stiffness` [N/m], and F_r is `friction` [N], Coulomb friction against the
+    motion. The force jumps at the onset and when the motion reverses. The law has no damping.
 
-    The motion in each direction is an oscillation about a centre at d = -s, s = (F_0 + F_r)/k, inward and at
-    d = -r, r = (F_0 - F_r)/k, outward. The deepest point d satisfies (d + s)^2 = s^2 + (v/omega)^2. At
-    separation, where d or F goes through 0, e v/omega = sqrt((d + r)^2 - max(r, 0)^2). If friction holds the
-    mechanism at its deepest point, F_0 + k d <= F_r, it stays there.
+    The ideal contact oscillates about d = -s inward, s = (F_0 + F_r)/k, and about d = -r outward,
+    r = (F_0 - F_r)/k. The deepest point d_m satisfies (d_m + s)^2 = s^2 + (v/omega)^2. At the separation,
+    where d or F crosses 0, e v/omega = sqrt((d_m + r)^2 - max(r, 0)^2). If F_0 + k d_m <= F_r, friction holds
+    the mechanism at d_m, and e = 0.
     """
 
     name: ClassVar[str] = "preloaded"
@@ -61,7 +61,7 @@ class Preloaded(ContactLaw):
         outward = (parameters.preload - parameters.friction) / parameters.stiffness
         swing = velocity / frequency
         turning = jnp.sqrt(inward**2 + swing**2)
-        # This is (d + s) - s + r, without the cancellation of a strong preload.
+        # This is d_m + r; the difference (d_m + s) - s would lose digits at a strong preload.
         amplitude = swing**2 / (turning + inward) + outward
         sticks = amplitude <= 0
         amplitude = jnp.where(sticks, 1, amplitude)
@@ -75,9 +75,9 @@ class Preloaded(ContactLaw):
         )
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add friction that dissipates 1 - e*^2 of the energy on the way to the deepest point and back.
+        """Add friction that dissipates the fraction 1 - exp(-2 pi zeta) of the kinetic energy.
 
-        The deepest point is taken without friction.
+        zeta is the damping ratio `ratio`. The path is twice the deepest penetration without friction.
         """
         preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]
         energy = (mass * velocity**2)[:, 0] / 2
@@ -95,5 +95,5 @@ class Preloaded(ContactLaw):
         return clamp_force(spring, constant)
 
     def _constant(self, parameters, rate):
-        """Return the part of the force that does not depend on depth [N]."""
+        """Return the part of the force [N] that does not depend on the depth, F_0 + F_r sign(d')."""
         return parameters.preload + parameters.friction * jnp.sign(rate)

@@ -1,4 +1,4 @@
-"""Contact laws as sums of known functions of depth and rate, so that fits to logs are linear regressions."""
+"""Contact laws as linear combinations of known functions, for fits to logs by linear regression."""
 
 from __future__ import annotations
 
@@ -19,29 +19,33 @@ def _no_functions(depth: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class Regression:
-    """Contact law F = sum_i c_i phi_i(d, d') with a fixed shape (an exponent, depths)."""
+    """Contact law F = sum_i c_i phi_i(d, d') with unknown coefficients c_i and known functions phi_i.
+
+    An exponent or depths, on which the functions depend nonlinearly, have fixed values (`shape`).
+    """
 
     name: str  # name of the law in mechanism files
-    entry_functions: BasisFunctions = field(
-        repr=False
-    )  # phi(d [m], d' [m/s]) whose coefficients differ between entries
-    names: tuple[str, ...]  # names of the coefficients of `own`, then of `shared`
-    shared: BasisFunctions = field(
-        repr=False, default=_no_functions
-    )  # phi with coefficients common to all entries
+    # functions phi(d [m], d' [m/s]) whose coefficients differ between the entries of `stiffness`
+    entry_functions: BasisFunctions = field(repr=False)
+    names: tuple[str, ...]  # names of the coefficients of `entry_functions`, then of `shared`
+    # functions phi(d [m], d' [m/s]) whose coefficients are common to all entries
+    shared: BasisFunctions = field(repr=False, default=_no_functions)
     pulls: bool = False  # whether the force may be negative
-    shape: dict[str, Any] = field(default_factory=dict)  # keys of the mechanism file that fix the shape
+    shape: dict[str, Any] = field(default_factory=dict)  # fixed values by key, for example {"exponent": 1.5}
 
     @property
     def complexity(self) -> int:
-        """Return the number of unknowns for one list entry: coefficients, depths and exponent."""
+        """Return the number of unknowns of one contact: coefficients, depths and exponent."""
         return len(self.names) + len(self.shape.get("depths", ())) + ("exponent" in self.shape)
 
 
 class RegressionFamily(NamedTuple):
-    """Regressions of one contact law that differ in one number, the shape, which a fit chooses."""
+    """Regressions of one contact law that differ in one nonlinear parameter, such as an exponent.
 
-    make: Callable[[float], Regression]  # returns the regression of a shape
-    low: float = 0.0  # smallest shape that the fit tries
-    high: float = 0.0  # largest shape that the fit tries; equal to `low` if the shape is fixed
-    preferred: tuple[float, ...] = ()  # shapes that are preferred if they fit equally well
+    Identification searches the value of the parameter between `low` and `high`.
+    """
+
+    make: Callable[[float], Regression]  # returns the regression for a value of the parameter
+    low: float = 0.0  # smallest value
+    high: float = 0.0  # largest value; equal to `low` if there is no such parameter
+    preferred: tuple[float, ...] = ()  # values that are preferred if they fit equally well

@@ -1,1 +1,1 @@
-"""Mechanism files: their structs, reading and validation, and random draws of the uncertain numbers."""
+"""Mechanism files: their content as structs, reading, validation, and random draws of uncertain numbers."""

@@ -1,7 +1,7 @@
 """Conversion of a raw table into a `Mechanism`, key by key.
 
-The table is compared with the struct types of `jaxhil.mechanism.structs`, so that a wrong key is reported
-with its path, the value found and the allowed values. Rules for several keys together are in
+The table is compared with the struct types of `jaxhil.mechanism.structs`. A message about an invalid key
+states the key's path, the value found and the allowed values. Rules that involve several keys are in
 `jaxhil.mechanism.rules`.
 """
 
@@ -44,7 +44,7 @@ __all__ = [
 
 AnyStruct = TypeVar("AnyStruct", bound=msgspec.Struct)
 KeyPath = tuple[str | int, ...]
-TypeMetadata = Mapping[str, Any]  # metadata that `jaxhil.mechanism.structs.says` adds to a type
+TypeMetadata = Mapping[str, Any]  # `extra` of the metadata from `jaxhil.contact.keys.key_metadata`
 
 # Lists for which a bare number stands for a list of one entry.
 SCALAR_LIST_KEYS = ("contact", "stiffness"), ("contact", "damping")
@@ -56,21 +56,21 @@ _type_info = functools.cache(inspect.type_info)
 
 
 class KeyProblem(Exception):
-    """Error for a key with an unusable value: its path, the value found and the allowed values, in words."""
+    """Error for an invalid key: its path, the value found, and the expected (allowed) values in words."""
 
-    def __init__(self, path: KeyPath, found: str, allowed: str):
-        super().__init__(path, found, allowed)
+    def __init__(self, path: KeyPath, found: str, expected: str):
+        super().__init__(path, found, expected)
         self.path = path
         self.found = found
-        self.allowed = allowed
+        self.expected = expected
 
     def __str__(self) -> str:
         where = f"{format_key_path(self.path)}: " if self.path else ""
-        return f"{where}found {self.found}, expected {self.allowed}"
+        return f"{where}found {self.found}, expected {self.expected}"
 
 
 def format_key_path(path: KeyPath) -> str:
-    """Return a path as printable TOML text: ``uncertainty."contact.stiffness".factor[0]``."""
+    """Format a key's path as TOML text, such as ``uncertainty."contact.stiffness".factor[0]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -83,37 +83,37 @@ def format_key_path(path: KeyPath) -> str:
 
 
 def suggest_names(word: str, names: Iterable[str]) -> str:
-    """Return ` (did you mean X?)` with the known words closest to `word`, or an empty text."""
+    """Return ` (did you mean X?)` with the `names` most similar to `word`, or an empty text."""
     matches = difflib.get_close_matches(word[:200], list(names), n=3, cutoff=0.6)
     return f" (did you mean {' or '.join(matches)}?)" if matches else ""
 
 
 def format_entry_count(entries: Sequence[object]) -> str:
-    """Return the text `a list of N entries`."""
+    """Return the text "a list of N entries" with the number of `entries`."""
     return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
 
 
 def add_magnitude_limits(allowed: object) -> str:
-    """Return the text `allowed`, extended by the range of magnitudes that computations support."""
+    """Add the range of magnitudes that computations support to the text `allowed`."""
     return f"{allowed}, of a magnitude from {MAGNITUDE_LIMITS[0]:g} to {MAGNITUDE_LIMITS[1]:g}"
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
-    """Convert a raw table to a `Mechanism`. Raise `KeyProblem` for the first unknown or unusable key.
+    """Convert a raw table to a `Mechanism`. Raise `KeyProblem` for the first unknown or invalid key.
 
-    Integers are accepted as numbers, and a single number for the lists `contact.stiffness` and
-    `contact.damping`; leading zeros of a transfer function's polynomials are dropped.
+    Integers are accepted as numbers. `contact.stiffness` and `contact.damping` may be a single number instead
+    of a list. Leading zeros of a transfer function's polynomials are dropped.
     """
     return msgspec.convert(_convert(mechanism_type(), raw, (), NO_METADATA), Mechanism)
 
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
-    """Convert a raw table to a struct of a type with metadata like `Mechanism`'s. Raise `KeyProblem`."""
+    """Convert a raw table to a struct of type `kind`. Raise `KeyProblem` for an unknown or invalid key."""
     return msgspec.convert(_convert(_type_info(kind), raw, (), NO_METADATA), kind)
 
 
 def find_member_type(kind: inspect.Type, part: str | int, path: KeyPath) -> inspect.Type:
-    """Return the type of the key or list entry `part` in a value of type `kind`. Raise `KeyProblem`."""
+    """Return the type of the key or list index `part` within the type `kind`. Raise `KeyProblem`."""
     match kind:
         case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
             return find_member_type(inner, 0, path)
@@ -141,7 +141,7 @@ def find_member_type(kind: inspect.Type, part: str | int, path: KeyPath) -> insp
 
 
 def describe_allowed(kind: inspect.Type, extra: TypeMetadata = NO_METADATA) -> str:
-    """Return the allowed values of a type, in words."""
+    """Describe the allowed values of a msgspec type in words."""
     match kind:
         case inspect.Metadata(extra={"one_of": names}):
             return f"one of {', '.join(names)}"
@@ -176,7 +176,7 @@ def describe_allowed(kind: inspect.Type, extra: TypeMetadata = NO_METADATA) -> s
 
 
 def describe_allowed_at(kind: type[msgspec.Struct], key: str) -> str:
-    """Return the allowed values of a struct's key, in words."""
+    """Describe the allowed values of one key of a struct type in words."""
     info = _type_info(kind)
     assert isinstance(info, inspect.StructType)
     [key_type] = (entry.type for entry in info.fields if entry.encode_name == key)
@@ -184,18 +184,17 @@ def describe_allowed_at(kind: type[msgspec.Struct], key: str) -> str:
 
 
 def _strip_metadata(kind: inspect.Type) -> inspect.Type:
-    """Return a type without its metadata."""
     return _strip_metadata(kind.type) if isinstance(kind, inspect.Metadata) else kind
 
 
 def _unknown_key(kind: inspect.StructType, key: str, path: KeyPath) -> KeyProblem:
     names = [entry.encode_name for entry in kind.fields]
-    allowed = f"one of {', '.join(names)}{suggest_names(key, names)}"
-    return KeyProblem((*path, key), "an unknown key", allowed)
+    expected = f"one of {', '.join(names)}{suggest_names(key, names)}"
+    return KeyProblem((*path, key), "an unknown key", expected)
 
 
 def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata) -> Any:
-    """Return `value` as plain data of type `kind`, with numbers as floats. Raise `KeyProblem`."""
+    """Convert `value` to plain data of type `kind`, with numbers as floats. Raise `KeyProblem`."""
     if path in SCALAR_LIST_KEYS and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
@@ -221,10 +220,10 @@ def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata)
             shortest, longest = kind.min_length or 0, kind.max_length
             if len(value) < shortest or (longest is not None and len(value) > longest):
                 raise KeyProblem(path, format_entry_count(value), describe_allowed(kind, NO_METADATA))
-            cleaned = [_convert(item, entry, (*path, i), NO_METADATA) for i, entry in enumerate(value)]
-            while path in _POLYNOMIALS and len(cleaned) > 1 and cleaned[0] == 0.0:
-                del cleaned[0]
-            return cleaned
+            converted = [_convert(item, entry, (*path, i), NO_METADATA) for i, entry in enumerate(value)]
+            while path in _POLYNOMIALS and len(converted) > 1 and converted[0] == 0.0:
+                del converted[0]
+            return converted
         case inspect.FloatType() if isinstance(value, (int, float)) and not isinstance(value, bool):
             try:
                 number = float(value)
@@ -251,26 +250,26 @@ def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata)
 
 
 def _convert_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: KeyPath) -> dict[str, Any]:
-    """Return a table as plain data of the struct type `kind`. Raise `KeyProblem`."""
+    """Convert a table to plain data of the struct type `kind`. Raise `KeyProblem`."""
     names = {entry.encode_name for entry in kind.fields}
     for key in value:
         # Unknown keys are reported first, because a misspelt key also looks like a missing one.
         if key not in names:
             raise _unknown_key(kind, str(key), path)
-    cleaned = {}
+    converted = {}
     for entry in kind.fields:
         name = entry.encode_name
         if name in value:
-            cleaned[name] = _convert(entry.type, value[name], (*path, name), NO_METADATA)
+            converted[name] = _convert(entry.type, value[name], (*path, name), NO_METADATA)
         elif entry.required:
             raise KeyProblem((*path, name), "nothing", describe_allowed(entry.type, NO_METADATA))
-    return cleaned
+    return converted
 
 
 def _expand_six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any, path: KeyPath) -> Any:
-    """Return the six entries that one number, or a table of two numbers with the keys `names`, stands for.
+    """Expand one number, or a table of two numbers with the keys `names`, to a list of six numbers.
 
-    A list is returned unchanged. Raise `KeyProblem` for any other value.
+    Return a list unchanged. Raise `KeyProblem` for any other value.
     """
     if isinstance(value, (list, tuple)):
         return value
@@ -282,7 +281,7 @@ def _expand_six_entries(kind: inspect.Metadata, names: Sequence[str], value: Any
 
 
 def _choose_member(members: Iterable[inspect.Type], value: Any) -> inspect.Type:
-    """Return the member of a union type that fits the form of a value: None, a list, or a scalar."""
+    """Return the member of a union type that suits a value: None, a list, or a scalar."""
     kinds = list(members)
     none = [kind for kind in kinds if isinstance(kind, inspect.NoneType)]
     if value is None and none:

@@ -1,16 +1,16 @@
 """Correlation of uncertain numbers: the ``[correlation]`` table of a mechanism file.
 
-Each key keeps its distribution; the table correlates the standard normal numbers behind the keys, a Gaussian
-copula (Nelsen, "An Introduction to Copulas", 2006, 2.3.6). The uniform number u_i of a key becomes
+Each key keeps its distribution; a Gaussian copula correlates the keys (Nelsen, "An Introduction to Copulas",
+2006, 2.3.6). The uniform number u_i of a key becomes
 
     u'_i = Phi( sum_j L_ij Phi^-1(u_j) ),    L L^T = matrix,
 
-over the named keys in their order. It is uniform as well, and goes through the key's quantile function. The
-numbers of a key that has no correlation with an earlier one do not change by any bit.
+where i and j number the keys of the table. u'_i is uniform as well; the quantile function of the key converts
+u'_i to a value. If a key has no correlation with an earlier key, its numbers do not change by any bit.
 
-Keys with separate draws for each entry of a list (``independent = true``) come last in that order. The matrix
-holds for each entry: entry i is correlated with entry i of another such list (the last entry repeats) and
-with all keys that have a single draw. Conditional on the single draws, entries are independent.
+Lists with a separate draw for each entry (``independent = true``) come last in the order of the keys. Entry i
+of such a list is correlated with entry i of every other such list (the last entry repeats), and with all keys
+that have a single draw. For given single draws, different entries are independent.
 """
 
 from __future__ import annotations
@@ -28,20 +28,18 @@ from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
 
-MIN_EIGENVALUE = 1e-10  # a matrix with a smaller eigenvalue does not count as positive definite
+MIN_EIGENVALUE = 1e-10  # 1; below this, rounding may make the Cholesky factor undefined
 
-_MIN_UNIFORM, _MAX_UNIFORM = (
-    2.0**-54,
-    1.0 - 2.0**-53,
-)  # bounds of uniform numbers, so that normal numbers are finite
+# Bounds of uniform numbers, so that normal numbers are finite.
+_MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53
 
 
 def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the uniform numbers (draws, columns) of every key after applying the mechanism's correlation."""
+    """Apply the mechanism's correlation to the uniform numbers (draws, columns) of every key."""
     table = mechanism.correlation
     if table is None:
         return dict(uniform)
-    from scipy import special  # takes long to import, and reading a file needs none
+    from scipy import special  # takes long to import, and reading a file does not need SciPy
 
     order = sorted(range(len(table.keys)), key=lambda i: uniform[table.keys[i]].shape[1] > 1)
     keys = [table.keys[i] for i in order]
@@ -60,7 +58,7 @@ def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dic
 
 
 def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
-    """Return the keys of ``[correlation]`` in mutually independent groups, in the order of the table."""
+    """Return groups of the keys of ``[correlation]`` such that different groups are independent."""
     table = mechanism.correlation
     if table is None:
         return []
@@ -72,22 +70,22 @@ def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
 
 
 def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
-    """Return the mechanism with these keys fixed at their nominal values; the others vary as before."""
+    """Return the mechanism with the given keys fixed at their nominal values; other keys stay uncertain."""
     uncertainty = {key: entry for key, entry in mechanism.uncertainty.items() if key not in keys}
     table = mechanism.correlation
-    rest = table and remove_keys(table.keys, table.matrix, keys)
+    reduced = table and remove_keys(table.keys, table.matrix, keys)
     return msgspec.structs.replace(
         mechanism,
         uncertainty=uncertainty,
-        correlation=Correlation(keys=rest[0], matrix=rest[1]) if rest else None,
+        correlation=Correlation(keys=reduced[0], matrix=reduced[1]) if reduced else None,
     )
 
 
 def remove_keys(
-    keys: Sequence[str], matrix: Sequence[Sequence[Any]], gone: Collection[str]
+    keys: Sequence[str], matrix: Sequence[Sequence[Any]], removed: Collection[str]
 ) -> tuple[list[str], list[list[Any]]] | None:
-    """Return keys and lower triangle of the matrix without the keys `gone`, or None if no key remains."""
-    rest = [i for i, key in enumerate(keys) if key not in gone]
+    """Return keys and lower triangle of the matrix without the `removed` keys, or None if no key remains."""
+    rest = [i for i, key in enumerate(keys) if key not in removed]
     triangle = [[matrix[row][column] for column in rest if column <= row] for row in rest]
     return ([keys[i] for i in rest], triangle) if rest else None
 
@@ -95,7 +93,7 @@ def remove_keys(
 def check_correlation(mechanism: AnyMechanism) -> None:
     """Check the table ``[correlation]``.
 
-    Raise `KeyProblem` unless it names uncertain keys, each once, and its matrix is a correlation matrix.
+    Raise `KeyProblem` unless all keys are uncertain and different, and the matrix is a correlation matrix.
     """
     table = mechanism.correlation
     if table is None:
@@ -104,30 +102,30 @@ def check_correlation(mechanism: AnyMechanism) -> None:
     for index, key in enumerate(table.keys):
         where = ("correlation", "keys", index)
         if key not in uncertain:
-            allowed = f"a key of [uncertainty]{suggest_names(key, uncertain)}, or no correlation"
-            raise KeyProblem(where, format_value(key), allowed)
+            expected = f"a key of [uncertainty]{suggest_names(key, uncertain)}, or no correlation"
+            raise KeyProblem(where, format_value(key), expected)
         if key in table.keys[:index]:
-            raise KeyProblem(where, f"{format_value(key)} once more", "each key once")
+            raise KeyProblem(where, f"{format_value(key)} twice", "each key once")
     if len(table.matrix) != len(table.keys):
         raise KeyProblem(
-            ("correlation", "matrix"), f"{len(table.matrix)} rows", f"{len(table.keys)}, one a key"
+            ("correlation", "matrix"), f"{len(table.matrix)} rows", f"{len(table.keys)}, one for each key"
         )
     for index, row in enumerate(table.matrix):
         path = ("correlation", "matrix", index)
         if len(row) != index + 1:
-            allowed = f"{index + 1}: the matrix up to its diagonal"
-            raise KeyProblem(path, f"{len(row)} entries", allowed)
+            expected = f"{index + 1}: the row up to the diagonal"
+            raise KeyProblem(path, f"{len(row)} entries", expected)
         if row[-1] != 1.0:
             raise KeyProblem((*path, index), format_value(row[-1]), "1 on the diagonal")
-    least = float(np.linalg.eigvalsh(_full_matrix(table))[0])
-    if not least > MIN_EIGENVALUE:
-        found = f"a least eigenvalue of {least:.3g}"
-        allowed = f"a positive definite matrix, with one > {MIN_EIGENVALUE:g}"
-        raise KeyProblem(("correlation", "matrix"), found, allowed)
+    smallest = float(np.linalg.eigvalsh(_full_matrix(table))[0])
+    if not smallest > MIN_EIGENVALUE:
+        found = f"a smallest eigenvalue of {smallest:.3g}"
+        expected = f"a positive definite matrix, with eigenvalues > {MIN_EIGENVALUE:g}"
+        raise KeyProblem(("correlation", "matrix"), found, expected)
 
 
 def _full_matrix(table: Correlation) -> np.ndarray:
-    """Return the full symmetric matrix (keys, keys)."""
+    """Return the full symmetric correlation matrix, (keys, keys)."""
     matrix = np.zeros((len(table.keys), len(table.keys)))
     for index, row in enumerate(table.matrix):
         matrix[index, : index + 1] = matrix[: index + 1, index] = row
@@ -135,7 +133,7 @@ def _full_matrix(table: Correlation) -> np.ndarray:
 
 
 def _cholesky_factor(matrix: np.ndarray) -> np.ndarray:
-    """Return the Cholesky factor L; it uses the same operations on every machine, so that draws repeat."""
+    """Return the Cholesky factor L by the same operations on every machine, so that draws are repeatable."""
     factor = np.zeros_like(matrix)
     for row in range(len(matrix)):
         for column in range(row + 1):

@@ -2,7 +2,7 @@
 
 `load` makes a validated `Mechanism` from a file (or from the name of a built-in mechanism or suite), the
 ``PATH=VALUE`` overrides of ``--set`` and the keys that ``--unset`` removes; `load_any` also reads six-axis
-files. Any error in them raises `InputError` with a message of one line.
+files. Every error raises `InputError` with a one-line message.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MechanismType = TypeVar("MechanismType", Mechanism, AnyMechanism)
 
 SUITE_PREFIX = "suite-"  # prefix of the names of the standard suites
 
-_SIX_INFINITIES = [math.inf] * 6  # default of keys with six limits
+_SIX_INFINITIES = [math.inf] * 6  # default of limits for six axes
 _file_hashes: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
 
 _BUILTIN_FOLDER = Path(__file__).parent / "builtin"
@@ -58,7 +58,7 @@ _SIX_AXIS_FOLDER = _BUILTIN_FOLDER / "six_axes"
 
 
 class LoadedMechanism(NamedTuple):
-    """Validated mechanism with the identity of its file."""
+    """Validated one-axis mechanism, with hash and name of its file."""
 
     mechanism: Mechanism
     sha256: str  # SHA-256 of the file's bytes, in hexadecimal digits
@@ -66,7 +66,7 @@ class LoadedMechanism(NamedTuple):
 
 
 class LoadedAnyMechanism(NamedTuple):
-    """Validated mechanism with one axis or with six; fields as in `LoadedMechanism`."""
+    """Validated one-axis or six-axis mechanism; the fields are those of `LoadedMechanism`."""
 
     mechanism: AnyMechanism
     sha256: str
@@ -76,7 +76,7 @@ class LoadedAnyMechanism(NamedTuple):
 def load(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedMechanism:
-    """Load the one-axis mechanism of a TOML file, or a built-in one.
+    """Load and validate a one-axis mechanism from a TOML file, or a built-in mechanism by its name.
 
     Args:
         path_or_name: path of a file, name of a built-in mechanism, or None for the default one.
@@ -98,7 +98,7 @@ def load(
 def load_any(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedAnyMechanism:
-    """Load a mechanism with one axis or with six, as `load` does."""
+    """Load and validate a one-axis or six-axis mechanism; the arguments are those of `load`."""
     raw, sha256, label = _read_table(path_or_name)
     return LoadedAnyMechanism(
         _store_file_hash(any_from_plain_data(raw, label, overrides, unset), sha256), sha256, label
@@ -106,7 +106,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 (hex) of the file from which an equal mechanism was read, else of its content."""
+    """Return the SHA-256 (hex) of the file with this mechanism, or of the content if no file was read."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 
@@ -114,15 +114,15 @@ def source_sha256(mechanism: AnyMechanism) -> str:
 def from_plain_data(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> Mechanism:
-    """Return the validated one-axis mechanism of plain data, such as a parsed TOML or JSON table.
+    """Convert plain data, such as a parsed TOML or JSON table, to a validated one-axis mechanism.
 
-    `label` names the source in messages; `overrides` and `unset` are as for `load`. Raise `InputError`, also
-    for a six-axis mechanism.
+    `label` names the source in messages; `overrides` and `unset` are those of `load`. Raise `InputError` if
+    the data are invalid or describe a six-axis mechanism.
     """
     if is_six_axes(raw):
-        allowed = f"{SCHEMA}: six axes are known to init, mechanisms, simulate, tune, sweep and report"
+        expected = f"{SCHEMA}: only init, mechanisms, simulate, tune, sweep and report support six axes"
         raise InputError(
-            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA}, six axes, expected {allowed}"
+            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA}, six axes, expected {expected}"
         )
     mechanism = any_from_plain_data(raw, label, overrides, unset)
     assert isinstance(mechanism, Mechanism)
@@ -132,7 +132,7 @@ def from_plain_data(
 def any_from_plain_data(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> AnyMechanism:
-    """Return the validated mechanism of plain data with one axis or with six, as `from_plain_data` does."""
+    """Convert plain data to a validated one-axis or six-axis mechanism, as `from_plain_data` does."""
     changed, label = raw, to_one_line(label)
     all_changes = _requested_changes(overrides, unset)
     for option, changes in all_changes.items():
@@ -149,9 +149,9 @@ def any_from_plain_data(
 
 
 def to_plain_data(mechanism: AnyMechanism) -> dict[str, Any]:
-    """Return the mechanism as plain data for JSON, from which `from_plain_data` makes an equal mechanism.
+    """Convert a mechanism to plain data for JSON; `from_plain_data` converts the data back.
 
-    Keys without a value and infinite numbers, both defaults of their keys, are omitted.
+    The data omit keys without a value and infinite numbers, because these are the defaults of their keys.
     """
     return _drop_empty(msgspec.to_builtins(mechanism))
 
@@ -164,7 +164,7 @@ def builtin_names() -> list[str]:
 def suite_names() -> list[str]:
     """Return the names of the standard suites.
 
-    They are built-in mechanism files of one rig, each with one difficulty, for comparing compensators.
+    The suites are built-in mechanism files for comparing compensators: one rig, each with one difficulty.
     """
     return [name for name in _builtin_paths() if name.startswith(SUITE_PREFIX)]
 
@@ -180,13 +180,13 @@ def builtin_path(name: str) -> Path:
     if name not in names:
         raise InputError(
             f"{to_one_line(name)}: found no built-in mechanism of this name, "
-            f"expected {', '.join(names)}{suggest_names(name, names)}"
+            f"expected one of {', '.join(names)}{suggest_names(name, names)}"
         )
     return (_SIX_AXIS_FOLDER if name in six_axis_names() else _BUILTIN_FOLDER) / f"{name}.toml"
 
 
 def _read_table(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
-    """Return the table of a file, the SHA-256 of its bytes, and its printable name."""
+    """Return the raw table of a mechanism file, the SHA-256 of its bytes, and its printable name."""
     name = DEFAULT_MECHANISM if path_or_name is None else path_or_name
     if isinstance(name, str) and name in (*builtin_names(), *suite_names(), *six_axis_names()):
         path, label = builtin_path(name), name
@@ -200,7 +200,7 @@ def _read_table(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, 
 
 
 def _store_file_hash(mechanism: MechanismType, sha256: str) -> MechanismType:
-    """Store the SHA-256 of the mechanism's file for `source_sha256`, and return the mechanism."""
+    """Store the SHA-256 of the mechanism's file for `source_sha256`; return the mechanism unchanged."""
     _file_hashes[_content_sha256(mechanism)] = sha256
     return mechanism
 
@@ -215,14 +215,13 @@ def _builtin_paths() -> list[str]:
 
 
 def _make_missing_error(label: str) -> InputError:
-    """Return the error for a file that does not exist."""
     names = [*builtin_names(), *six_axis_names()]
     hint = suggest_names(label, [*names, *suite_names()]) or f" (built-in: {', '.join(names)})"
     return InputError(f"{label}: found no such file, expected a mechanism file{hint}")
 
 
 def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
-    """Return the validated mechanism of a raw table. Raise `KeyProblem`."""
+    """Convert a raw table to a mechanism and check all rules. Raise `KeyProblem` for an invalid key."""
     if is_six_axes(raw):
         check_contact_names(raw)
         six_axis_mechanism = to_struct(SixAxisMechanism, raw)
@@ -231,18 +230,19 @@ def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
         return six_axis_mechanism
     if isinstance(raw, Mapping) and raw.get("schema", SCHEMA) != SCHEMA:
         raise KeyProblem(
-            ("schema",), format_value(raw["schema"]), f"{SCHEMA}, or {SIX_AXIS_SCHEMA} of six axes"
+            ("schema",), format_value(raw["schema"]), f"{SCHEMA}, or {SIX_AXIS_SCHEMA} for six axes"
         )
     if isinstance(raw, Mapping) and {"target", "chaser"} <= set(raw):
-        found = f"{format_value(raw['schema'])} beside" if "schema" in raw else "nothing beside"
-        raise KeyProblem(("schema",), f"{found} target and chaser", f"{SIX_AXIS_SCHEMA}, of six axes")
+        found = format_value(raw["schema"]) if "schema" in raw else "no schema"
+        expected = f"{SIX_AXIS_SCHEMA}, because target and chaser are six-axis keys"
+        raise KeyProblem(("schema",), f"{found} with the tables target and chaser", expected)
     mechanism = to_mechanism(raw)
     mechanism_rules.check_mechanism_rules(mechanism)
     return mechanism
 
 
 def _find_problem(raw: Mapping[str, Any]) -> str:
-    """Return the message about a raw table's first problem, or an empty text."""
+    """Return the message about the first invalid key of a raw table, or an empty text."""
     try:
         _validate(raw)
     except KeyProblem as problem:
@@ -251,7 +251,7 @@ def _find_problem(raw: Mapping[str, Any]) -> str:
 
 
 def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the requested changes by the name of the command's option or of the function's argument."""
+    """Return the requested changes, by the option or the argument that requests them (for messages)."""
     is_mapping = isinstance(overrides, Mapping)
     return {
         "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),
@@ -260,7 +260,7 @@ def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, 
 
 
 def _format_changes(all_changes: Mapping[str, Sequence[Any]]) -> str:
-    """Return the first three changes of each option as a text for a message."""
+    """Format the first three changes of each option for a message."""
     options = [
         " ".join([option, *map(_format_change, changes[:3]), *["..."][: len(changes) > 3]])
         for option, changes in all_changes.items()
@@ -270,13 +270,13 @@ def _format_changes(all_changes: Mapping[str, Sequence[Any]]) -> str:
 
 
 def _format_change(change: object) -> str:
-    """Return a change's text, or its key if it is a pair of key and value."""
+    """Format a change for a message: its text, or the key of a (key, value) pair."""
     text = change[0] if isinstance(change, tuple) else change
     return to_one_line(text, 60) if isinstance(text, str) else format_value(text)
 
 
 def _drop_empty(value: Any) -> Any:
-    """Return plain data without keys that have no value or infinite numbers."""
+    """Return plain data without the keys whose value is None or infinite."""
     if isinstance(value, dict):
         entries = {key: _drop_empty(entry) for key, entry in value.items()}
         return {

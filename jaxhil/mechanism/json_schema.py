@@ -1,6 +1,7 @@
 """JSON Schema of mechanism files, with which editors complete keys, show descriptions and mark errors.
 
-It contains the allowed values of each key; rules for several keys together are checked when a file is read.
+The schema contains the allowed values of each key. Rules that involve several keys are checked when a file is
+read.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ SIX_AXIS_PREFIX = "SixAxes."  # prefix of the names of six-axis tables
 
 
 def build_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) as plain data, with the registered contact laws.
+    """Return the JSON Schema (draft 2020-12) as plain data, with all registered contact laws.
 
-    A file's key `schema` selects the one-axis or the six-axis tables.
+    The key `schema` of a file selects the one-axis or the six-axis tables.
     """
     has_six_axes = {"properties": {"schema": {"const": SIX_AXIS_SCHEMA}}, "required": ["schema"]}
     kinds = {
@@ -36,7 +37,7 @@ def build_json_schema() -> dict[str, Any]:
 
 
 def _one_axis() -> dict[str, Any]:
-    """Return the one-axis tables; some lists may also be a single number."""
+    """Return the schemas of the one-axis tables; keys in `SCALAR_LIST_KEYS` may also be one number."""
     tables = _tables(Mechanism)
     for table, name in SCALAR_LIST_KEYS:
         properties = tables[table.capitalize()]["properties"]
@@ -49,21 +50,21 @@ def _one_axis() -> dict[str, Any]:
 
 
 def _six_axes() -> dict[str, Any]:
-    """Return the six-axis tables, with a prefix because one-axis tables have the same names."""
+    """Return the schemas of the six-axis tables; a prefix makes their names differ from one-axis names."""
     return {
         f"{SIX_AXIS_PREFIX}{name}": _add_prefix(table) for name, table in _tables(SixAxisMechanism).items()
     }
 
 
 def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the schema of each table of a struct type, by name."""
+    """Return the schemas of the tables of a struct type, by name."""
     tables = {name: _clean_schema(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
     tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
     return tables
 
 
 def _add_prefix(node: Any) -> Any:
-    """Return a schema whose references to tables have the six-axis prefix."""
+    """Add the six-axis prefix to the references to tables in a schema."""
     if isinstance(node, list):
         return [_add_prefix(entry) for entry in node]
     if not isinstance(node, dict):
@@ -78,7 +79,7 @@ def _add_prefix(node: Any) -> Any:
 
 
 def _clean_schema(node: Any) -> Any:
-    """Return a schema with units in the descriptions, without null values and infinite defaults.
+    """Add units to the descriptions in a schema, and remove null values and infinite defaults.
 
     TOML has no null, and JSON has no infinite numbers.
     """
@@ -88,21 +89,21 @@ def _clean_schema(node: Any) -> Any:
         return node
     if "six" in node or "square" in node:
         return _add_short_forms(node)
-    tidied = {key: _clean_schema(value) for key, value in node.items() if key not in ("unit", "default")}
+    cleaned = {key: _clean_schema(value) for key, value in node.items() if key not in ("unit", "default")}
     if (unit := node.get("unit")) not in (None, "", "1"):
-        tidied["description"] += f" [{unit}]"
+        cleaned["description"] += f" [{unit}]"
     default = node.get("default")
     if default is not None and "$ref" not in node and default != math.inf:
-        tidied["default"] = default
-    members = [entry for entry in tidied.get("anyOf", ()) if entry.get("type") != "null"]
+        cleaned["default"] = default
+    members = [entry for entry in cleaned.get("anyOf", ()) if entry.get("type") != "null"]
     if len(members) == 1:
         [member] = members
-        return {key: value for key, value in tidied.items() if key != "anyOf"} | member
-    return tidied
+        return {key: value for key, value in cleaned.items() if key != "anyOf"} | member
+    return cleaned
 
 
 def _add_short_forms(node: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of six numbers or of a matrix, extended by the forms with one or two numbers."""
+    """Extend the schema of six numbers or of a matrix by the short forms with one or two numbers."""
     full = _clean_schema(
         {key: value for key, value in node.items() if key not in ("six", "square", "description")}
     )

@@ -1,7 +1,7 @@
 """Descriptions of all keys of a mechanism file, for the reference pages and the comments in a new file.
 
-They come from the types of the keys. A key without a description, or a number without a unit, raises
-ValueError.
+The descriptions come from the types of the keys. A key without a description, or a number without a unit,
+raises ValueError.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["KeyDescription", "TableDescription", "describe_tables"]
 
 
 class KeyDescription(NamedTuple):
-    """Key of a table."""
+    """Description of one key in a table of a mechanism file."""
 
     name: str
     meaning: str  # description
@@ -33,7 +33,7 @@ class KeyDescription(NamedTuple):
 
 
 class TableDescription(NamedTuple):
-    """Table of a mechanism file."""
+    """Description of one table of a mechanism file, with its keys."""
 
     path: str  # dotted path; '' for the head of the file
     meaning: str  # description
@@ -41,15 +41,16 @@ class TableDescription(NamedTuple):
 
 
 def describe_tables(kind: type[msgspec.Struct] = Mechanism) -> tuple[TableDescription, ...]:
-    """Return the tables of a struct, each before its subtables; `"KEY"` stands for any key of a dictionary.
+    """Describe the tables of a struct type, each table before its subtables.
 
-    Raise ValueError for a key without a description, or a number without a unit.
+    In paths, `"KEY"` stands for any key of a dictionary. Raise ValueError for a key without a description, or
+    a number without a unit.
     """
     return tuple(_describe_tables(inspect.type_info(kind), ""))
 
 
 def _describe_tables(kind: inspect.Type, path: str) -> Iterator[TableDescription]:
-    """Yield the table of a struct type at a path, then its subtables."""
+    """Yield the description of a struct type at a path, then the descriptions of its subtables."""
     assert isinstance(kind, inspect.StructType)
     keys, subtables = [], []
     for field in kind.fields:
@@ -67,12 +68,12 @@ def _describe_tables(kind: inspect.Type, path: str) -> Iterator[TableDescription
 
 
 def _first_paragraph(kind: inspect.StructType) -> str:
-    """Return the first paragraph of a struct's docstring, on one line."""
+    """Return the first paragraph of a struct type's docstring, on one line."""
     return " ".join((kind.cls.__doc__ or "").split("\n\n")[0].split())
 
 
 def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | None:
-    """Return the table type of a key, without metadata and None, or None if the key is not a table."""
+    """Return the struct or dictionary type of a key that is a table, else None."""
     match kind:
         case inspect.Metadata(type=inner):
             return _table_of(inner)
@@ -85,10 +86,10 @@ def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | Non
 
 
 def _describe_key(field: inspect.Field, path: str) -> KeyDescription:
-    """Return the description of the key at a path. Raise ValueError if it is incomplete."""
+    """Describe the key at a path. Raise ValueError if its type has no description or no unit."""
     meaning = next(_find_descriptions(field.type), "")
     if not meaning:
-        raise ValueError(f"{path}: its type does not say what it means")
+        raise ValueError(f"{path}: found no description in the type of the key, expected one")
     default = None if field.default is NODEFAULT else field.default
     if field.default_factory is not NODEFAULT:
         default = field.default_factory()
@@ -104,7 +105,7 @@ def _describe_key(field: inspect.Field, path: str) -> KeyDescription:
 
 
 def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
-    """Yield the descriptions of a type, the outermost first."""
+    """Yield the descriptions of a type and of the types within it, the outermost first."""
     match kind:
         case inspect.Metadata(type=inner, extra_json_schema=schema):
             if schema and schema.get("description"):
@@ -118,7 +119,7 @@ def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
 
 
 def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None) -> str | None:
-    """Return the unit of a number or of a list's entries, or None for other types."""
+    """Return the unit of a number or of a list's entries, or None for other types. Raise ValueError."""
     match kind:
         case inspect.Metadata(type=inner, extra=metadata):
             return _unit(inner, path, metadata)
@@ -128,14 +129,14 @@ def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None)
             return _unit(item, path)
         case inspect.FloatType() | inspect.IntType():
             if not extra or extra.get("unit") is None:
-                raise ValueError(f"{path}: its type does not say the number's unit")
+                raise ValueError(f"{path}: found no unit in the type of the number, expected one")
             return extra["unit"]
         case _:
             return None
 
 
 def _find_users(path: str) -> tuple[str, ...]:
-    """Return the contact laws or motion simulator models that use the key at a path; () for all."""
+    """Return the contact laws or the simulator models that use the key at a path, or () if all use it."""
     table, _, name = path.rpartition(".")
     if table == "contact":
         if name == "damping":

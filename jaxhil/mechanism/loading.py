@@ -1,4 +1,4 @@
-"""Loading of a mechanism from a built-in name, a file's path, or a `Mechanism` object."""
+"""Loading of a mechanism from a built-in name, the path of a file, or a `Mechanism` object."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["as_any_mechanism", "as_mechanism", "load"]
 def load(
     name_or_path: str | os.PathLike[str] = file.DEFAULT_MECHANISM, overrides: Mapping[str, Any] | None = None
 ) -> Any:
-    """Load a mechanism from a TOML file, or a built-in one.
+    """Load and validate a mechanism from a TOML file, or a built-in mechanism by its name.
 
     Args:
         name_or_path: name of a built-in mechanism, or path of a file.
-        overrides: values in SI units that replace those of the file, by key. A key is a dotted path such as
+        overrides: new values in SI units for keys of the file. A key is a dotted path such as
             ``rig.force_sensor.delay``, possibly with an index (``contact.stiffness[1]``). The value None
-            removes the key, as ``--unset`` does, and its entry of ``[uncertainty]``.
+            removes the key and its entry in ``[uncertainty]``, as ``--unset`` does.
 
     Returns:
         A `Mechanism`, or a `SixAxisMechanism` if the file's schema has six axes.
 
     Raises:
-        InputError: if the file, a key or a value is wrong. The message is one line.
+        InputError: if the file, a key or a value is invalid. The message is one line.
 
     Example:
         >>> import jaxhil
@@ -44,7 +44,7 @@ def load(
 
 
 def as_mechanism(argument: object) -> Mechanism:
-    """Validate a one-axis mechanism, or load that of a name or path. Raise `InputError`."""
+    """Return a one-axis mechanism, loaded by name or path, or validated if it is an object."""
     if not isinstance(argument, (Mechanism, SixAxisMechanism)):
         return file.load(_source(argument)).mechanism
     # Structs do not validate their fields: a mechanism that was not read from a file is unchecked.
@@ -52,15 +52,15 @@ def as_mechanism(argument: object) -> Mechanism:
 
 
 def as_any_mechanism(argument: object) -> file.AnyMechanism:
-    """Validate a mechanism with one axis or with six, or load that of a name or path. Raise `InputError`."""
+    """Return a one-axis or six-axis mechanism, loaded by name or path, or validated if it is an object."""
     if not isinstance(argument, (Mechanism, SixAxisMechanism)):
         return file.load_any(_source(argument)).mechanism
     return file.any_from_plain_data(file.to_plain_data(argument), f"mechanism {format_value(argument.name)}")
 
 
 def _source(argument: object) -> str | os.PathLike[str]:
-    """Return a name or path. Raise `InputError` for any other argument."""
+    """Return the argument if it is a name or a path. Raise `InputError` otherwise."""
     if isinstance(argument, (str, os.PathLike)) and isinstance(os.fspath(argument), str):
         return argument
-    allowed = "a Mechanism, the name of a built-in one or a path"
-    raise InputError(f"mechanism: found {format_value(argument)}, expected {allowed}")
+    expected = "a Mechanism, the name of a built-in mechanism, or a path"
+    raise InputError(f"mechanism: found {format_value(argument)}, expected {expected}")

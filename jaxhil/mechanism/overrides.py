@@ -1,8 +1,7 @@
 """Overrides of a mechanism file: ``PATH=VALUE`` of the option ``--set``, and ``PATH`` of ``--unset``.
 
 PATH is a dotted TOML key, possibly with indices into lists. VALUE is a TOML value; a bare word is a string,
-so that ``contact.law=linear`` needs no quotes within a shell's quotes. The value None, which TOML does not
-have, removes a key.
+so that ``contact.law=linear`` needs no quotes in a shell. In Python, the value None removes a key.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _MAX_OVERRIDE_LENGTH = 100_000
 
 
 def parse_override(override: str | tuple[object, Any]) -> tuple[KeyPath, Any]:
-    """Return path and value of a ``PATH=VALUE`` text, or of a pair (PATH, value). Raise `KeyProblem`."""
+    """Parse a ``PATH=VALUE`` text, or a pair (PATH, value), into path and value. Raise `KeyProblem`."""
     if not isinstance(override, str):
         key, value = override
         return parse_key(key), _to_python(value)
@@ -44,7 +43,7 @@ def parse_override(override: str | tuple[object, Any]) -> tuple[KeyPath, Any]:
 
 
 def parse_key(key: object) -> KeyPath:
-    """Return the path that a dotted key names. Raise `KeyProblem`."""
+    """Parse a dotted key, such as ``contact.stiffness[1]``, into its path. Raise `KeyProblem`."""
     if isinstance(key, str):
         path, end = _parse_path(f"{key}=", key)
         if end == len(key) + 1:
@@ -53,10 +52,10 @@ def parse_key(key: object) -> KeyPath:
 
 
 def _to_python(value: Any) -> Any:
-    """Return a value with the numbers and arrays of NumPy and JAX converted to those of Python."""
+    """Convert the NumPy and JAX numbers and arrays in a value to Python numbers and lists."""
     if isinstance(value, (list, tuple)):
         if len(value) > MAX_CONTACTS:
-            return value  # validation rejects it for its length, so that its entries do not matter
+            return value  # validation rejects the length before it reads the entries
         return [_to_python(entry) for entry in value]
     if isinstance(value, Mapping):
         return {key: _to_python(entry) for key, entry in value.items()}
@@ -64,7 +63,7 @@ def _to_python(value: Any) -> Any:
 
 
 def _parse_text(text: str) -> tuple[KeyPath, Any]:
-    """Return path and value of a ``PATH=VALUE`` text. Raise `KeyProblem`."""
+    """Parse a ``PATH=VALUE`` text into path and value. Raise `KeyProblem`."""
     path, position = _parse_path(text)
     written = text[position:].strip()
     if len(written) > _MAX_OVERRIDE_LENGTH:
@@ -86,10 +85,10 @@ def _parse_text(text: str) -> tuple[KeyPath, Any]:
 
 
 def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[str, Any]:
-    """Return a copy of a raw table with a new value at `path`; missing tables on the path are created.
+    """Return a copy of a raw table with a new value at `path`; create the missing tables on the path.
 
-    The value None removes the key, and the entries of ``[uncertainty]`` and ``[correlation]`` for it and for
-    the keys below it. Raise `KeyProblem` if the schema has no such path, a list has no such entry, or the key
+    The value None removes the key with all keys below it, and their entries in ``[uncertainty]`` and
+    ``[correlation]``. Raise `KeyProblem` if the schema has no such path, a list has no such entry, or the key
     to remove does not exist.
     """
     has_six_axes = is_six_axes(raw)
@@ -101,20 +100,20 @@ def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[st
             hint = suggest_names(
                 format_key_path(path), _numeric_keys(raw) if has_six_axes else numeric_keys()
             )
-            if hint and "did you mean" not in problem.allowed:
-                problem = KeyProblem(problem.path, problem.found, problem.allowed + hint)
+            if hint and "did you mean" not in problem.expected:
+                problem = KeyProblem(problem.path, problem.found, problem.expected + hint)
             raise problem from None
     return _remove_key(raw, path) if value is None else _replace_value(raw, path, 0, value)
 
 
 def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
-    """Return the numeric keys of a raw six-axis table, with their ranges."""
+    """Return the numeric keys that a raw six-axis table may have, with their allowed ranges."""
     tables = (raw.get(key) for key in ("contact", "latch"))
     return numeric_keys_with(*(tuple(map(str, t)) if isinstance(t, Mapping) else () for t in tables))
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
-    """Return the path before ``=`` and the position after it; messages show `key` if it is not None."""
+    """Return the path before ``=`` and the position after ``=``; messages show `key` if it is not None."""
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
@@ -139,7 +138,7 @@ def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
 
 
 def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
-    """Return a copy of a node at `path[:depth]` with a new value at `path`. Raise `KeyProblem`."""
+    """Return a copy of `node`, at `path[:depth]`, with a new value at `path`. Raise `KeyProblem`."""
     if depth == len(path):
         return value
     part = path[depth]
@@ -147,7 +146,7 @@ def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
         # A bare number stands for a list of one entry.
         entries = list(node) if isinstance(node, (list, tuple)) else [node]
         if node is None or part >= len(entries):
-            found = "no list to change" if node is None else format_entry_count(entries)
+            found = "no list" if node is None else format_entry_count(entries)
             raise KeyProblem(path[: depth + 1], found, "an index into the list, or a whole list")
         entries[part] = _replace_value(entries[part], path, depth + 1, value)
         return entries
@@ -158,7 +157,7 @@ def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
 
 
 def _remove_key(raw: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
-    """Return a raw table without the key at `path` and its uncertainty and correlation."""
+    """Return a raw table without the key at `path`, its uncertainty and its correlation."""
     changed, key = _remove_from_table(raw, path, 0), format_key_path(path)
     if isinstance(table := changed.get("uncertainty"), Mapping):
         entries = {name: entry for name, entry in table.items() if not f"{name}.".startswith(f"{key}.")}
@@ -170,7 +169,7 @@ def _remove_key(raw: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
 
 
 def _remove_correlations(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
-    """Return a raw table without the correlations of the keys that are now `certain`."""
+    """Return a raw table without the correlations of `certain` keys, whose uncertainty is removed."""
     table = raw.get("correlation")
     if not certain or table is None:
         return raw
@@ -185,12 +184,12 @@ def _remove_correlations(raw: dict[str, Any], certain: list[str]) -> dict[str, A
 
 
 def _remove_from_table(node: Any, path: KeyPath, depth: int) -> dict[str, Any]:
-    """Return a copy of a table at `path[:depth]` without the key at `path`. Raise `KeyProblem`."""
+    """Return a copy of the table `node`, at `path[:depth]`, without the key at `path`. Raise `KeyProblem`."""
     part = path[depth]
     if isinstance(path[-1], int):
-        raise KeyProblem(path, "an entry of a list", "a key: a list is replaced as a whole")
+        raise KeyProblem(path, "an entry of a list", "a key: set the whole list instead")
     if not isinstance(node, Mapping) or part not in node:
-        raise KeyProblem(path, "no such key there", "a key that is there")
+        raise KeyProblem(path, "no such key", "a key that the mechanism has")
     others = {name: value for name, value in node.items() if name != part}
     return others | (
         {str(part): _remove_from_table(node[part], path, depth + 1)} if depth + 1 < len(path) else {}

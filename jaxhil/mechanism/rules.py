@@ -1,8 +1,8 @@
-"""Validation rules for several keys of a mechanism file together.
+"""Validation rules that involve several keys of a mechanism file.
 
-Each rule raises a `KeyProblem` that names the key to change. Types and single ranges are checked before, in
-`jaxhil.mechanism.conversion`. A key that the chosen law or model does not use is rejected if it has a value,
-because its author expects an effect. A user-registered law that does not state its keys may use any of them.
+Each rule raises a `KeyProblem` that names the key to change. `jaxhil.mechanism.conversion` has checked the
+types and ranges of single keys before. A key with a value is rejected if the chosen law or model does not use
+the key, because the value would have no effect. A user-registered law without a list of its keys may use any.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
     "is_hurwitz",
 ]
 
-# Keys that each model of the motion simulator uses and needs.
+# Keys that each model of the motion simulator requires.
 KEYS_OF_MODELS = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -52,7 +52,7 @@ _ALL_MODEL_KEYS = sorted({key for keys in KEYS_OF_MODELS.values() for key in key
 
 
 def check_mechanism_rules(mechanism: Mechanism) -> None:
-    """Check every rule. Raise `KeyProblem` for the first violation."""
+    """Check all rules for a one-axis mechanism. Raise `KeyProblem` for the first violation."""
     check_texts(mechanism)
     _check_bodies(mechanism)
     check_contact_law(("contact",), mechanism.contact, mechanism.uncertainty, CONTACT_KEYS.values())
@@ -84,7 +84,7 @@ def is_hurwitz(polynomial: Sequence[float]) -> bool:
 
 
 def check_texts(mechanism: Any) -> None:
-    """Check that name and source are printable. Raise `KeyProblem`."""
+    """Check that the keys `name` and `source` are printable texts. Raise `KeyProblem`."""
     if not mechanism.name.isprintable():
         raise KeyProblem(("name",), format_value(mechanism.name), "printable characters")
     if not mechanism.source.replace("\n", "").replace("\t", "").isprintable():
@@ -98,26 +98,26 @@ def _check_bodies(mechanism: Mechanism) -> None:
     has_both = bodies.chaser_mass is not None and bodies.target_mass is not None
     has_any = bodies.chaser_mass is not None or bodies.target_mass is not None
     if bodies.equivalent_mass is not None and has_any:
-        raise KeyProblem(("bodies", "equivalent_mass"), "a body's mass beside it", either)
+        raise KeyProblem(("bodies", "equivalent_mass"), "a body's mass as well", either)
     if bodies.equivalent_mass is None and not has_both:
         missing = "target_mass" if bodies.chaser_mass is not None else "chaser_mass"
         key = missing if has_any else "equivalent_mass"
         raise KeyProblem(("bodies", key), "nothing", either)
     if not 0.0 < bodies.mass < math.inf:
-        allowed = "masses whose equivalent mass is a finite number > 0"
-        raise KeyProblem(("bodies",), format_value(bodies.mass), allowed)
+        expected = "masses whose equivalent mass is a finite number > 0"
+        raise KeyProblem(("bodies",), format_value(bodies.mass), expected)
 
 
 def check_contact_law(
     path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[ContactKey]
 ) -> None:
-    """Check that a contact has the keys of its contact law. Raise `KeyProblem`.
+    """Check that a contact has the keys that its contact law requires. Raise `KeyProblem`.
 
     Args:
         path: path of the contact's table.
         contact: the contact's struct.
         uncertainties: the file's table `[uncertainty]`.
-        keys: keys that only some laws have, by their names in this schema.
+        keys: keys that only some laws have, with their names in the file's schema.
     """
     law = find_contact_law(contact.law)
     _check_depths(path, law, contact.depths)
@@ -125,8 +125,8 @@ def check_contact_law(
     for i, entry in enumerate(contact.stiffness if is_list else [contact.stiffness]):
         where = (*path, "stiffness", *[i] * is_list)
         if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
-            allowed = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
-            raise KeyProblem(where, format_value(entry), allowed)
+            expected = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
+            raise KeyProblem(where, format_value(entry), expected)
         if isinstance(entry, list) and not law.segmented:
             raise KeyProblem(where, format_value(entry), f"a number > 0 N/m (law {law.name})")
     _check_keys(path, law, contact, uncertainties, keys)
@@ -138,60 +138,60 @@ def check_contact_law(
 def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> None:
     """Check that a segmented law has depths, and that they increase. Raise `KeyProblem`."""
     if law.segmented and not depths:
-        allowed = f"a list of at least one depth (law {law.name} needs it)"
-        raise KeyProblem((*path, "depths"), "no entries", allowed)
+        expected = f"a list of at least one depth (law {law.name} needs it)"
+        raise KeyProblem((*path, "depths"), "no entries", expected)
     for i, (depth, deeper) in enumerate(pairwise(depths)):
         if deeper <= depth:
             raise KeyProblem(
-                (*path, "depths", i + 1), format_value(deeper), f"a depth > the one before, {depth:g} m"
+                (*path, "depths", i + 1), format_value(deeper), f"a depth > the depth before, {depth:g} m"
             )
 
 
 def _check_keys(
     path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[ContactKey]
 ) -> None:
-    """Check that, among the `keys` that only some laws have, the contact has those of its law."""
+    """Check that, of the `keys` that only some laws have, the contact has exactly those of its law."""
     for key in keys:
         value = getattr(contact, key.name)
         laws = laws_with_key(key)
         if law.name in laws and value is None:
-            allowed = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
-            raise KeyProblem((*path, key.name), "nothing", allowed)
+            expected = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
+            raise KeyProblem((*path, key.name), "nothing", expected)
         if law.keys is not None and law.name not in laws:
             only = f"only for law {' or '.join(laws)}"
             if value != key.default:
                 raise KeyProblem((*path, key.name), format_value(value), f"nothing ({only})")
-            where = ".".join((*map(str, path), key.name))
-            if where in uncertain and value not in (None, []):
-                raise KeyProblem(("uncertainty", where), f"a key {only}", "keys that the law uses")
+            dotted = ".".join((*map(str, path), key.name))
+            if dotted in uncertain and value not in (None, []):
+                raise KeyProblem(("uncertainty", dotted), f"a key {only}", "keys that the law uses")
 
 
 def is_damped(
     path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
 ) -> bool:
-    """Return whether the key `by` of the contact is nonzero, or may be so in a random draw."""
+    """Return whether the contact's key `by` is nonzero, or can be nonzero in a random draw."""
     uncertain = uncertainties.get(".".join((*map(str, path), by)))
     return bool(np.any(getattr(contact, by))) or (uncertain is not None and uncertain.factor is None)
 
 
 def check_simulator_model(simulator: Any) -> None:
-    """Check that the motion simulator has the keys of its model and is stable. Raise `KeyProblem`."""
+    """Check that the motion simulator has the keys of its model, and is stable. Raise `KeyProblem`."""
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
-            allowed = f"{describe_allowed_at(type(simulator), key)} ({simulator.model} needs it)"
-            raise KeyProblem((*path, key), "nothing", allowed)
+            expected = f"{describe_allowed_at(type(simulator), key)} ({simulator.model} needs it)"
+            raise KeyProblem((*path, key), "nothing", expected)
     for key in _ALL_MODEL_KEYS:
         value = getattr(simulator, key)
         if value is not None and key not in KEYS_OF_MODELS[simulator.model]:
-            allowed = f"nothing ({simulator.model} does not use it: unset it)"
-            raise KeyProblem((*path, key), format_value(value), allowed)
+            expected = f"nothing ({simulator.model} does not use it: unset it)"
+            raise KeyProblem((*path, key), format_value(value), expected)
     if simulator.model == "first_order" and not np.all(simulator.time_constant):
         raise KeyProblem((*path, "time_constant"), "0.0", "a number > 0 (first_order), or ideal")
     if simulator.model == "third_order" and simulator.coefficients is not None:
         if not is_hurwitz([*reversed(simulator.coefficients), 1.0]):
-            allowed = "a stable motion simulator: a1 a2 > a3"
-            raise KeyProblem((*path, "coefficients"), format_value(simulator.coefficients), allowed)
+            expected = "a stable motion simulator: a1 a2 > a3"
+            raise KeyProblem((*path, "coefficients"), format_value(simulator.coefficients), expected)
     if simulator.model == "transfer_function":
         _check_transfer_function(simulator.numerator or [], simulator.denominator or [])
 
@@ -201,33 +201,33 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
     path = ("rig", "simulator")
     if len(numerator) >= len(denominator):
         found = f"degree {len(numerator) - 1} over degree {len(denominator) - 1}"
-        allowed = "a strictly proper transfer function: a degree below the denominator's"
-        raise KeyProblem((*path, "numerator"), found, allowed)
+        expected = "a strictly proper transfer function, with a degree below that of the denominator"
+        raise KeyProblem((*path, "numerator"), found, expected)
     if not is_hurwitz(denominator):
-        allowed = "a stable motion simulator: every pole in the open left half plane"
-        raise KeyProblem((*path, "denominator"), format_value(denominator), allowed)
+        expected = "a stable motion simulator: every pole in the open left half plane"
+        raise KeyProblem((*path, "denominator"), format_value(denominator), expected)
     if not abs(Fraction(numerator[-1]) - Fraction(denominator[-1])) <= (
         Fraction(1, 10**9) * abs(Fraction(denominator[-1]))
     ):
         found = f"last coefficients {numerator[-1]:g} and {denominator[-1]:g}"
-        raise KeyProblem((*path, "numerator"), found, "equal ones, so that G(0) = 1")
+        raise KeyProblem((*path, "numerator"), found, "equal last coefficients, so that G(0) = 1")
 
 
 def _check_hold(mechanism: Mechanism) -> None:
-    """Check that a damped contact has a velocity to act on. Raise `KeyProblem`."""
-    # An ideal simulator with zero-order hold jumps at the ticks and has no velocity between them.
+    """Check that a damped contact has no ideal simulator with zero-order hold. Raise `KeyProblem`."""
+    # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
     dissipates = (law.damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
-        allowed = '"linear" for an ideal simulator with contact damping (or another model)'
-        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), allowed)
+        expected = '"linear" for an ideal simulator with contact damping (or another model)'
+        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 
 def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
-    """Return a function of a path and of 0 or 1 that gives the least or the greatest value at the path.
+    """Return a function `extreme(path, end)` of a key's smallest (`end` 0) or largest (1) value in all draws.
 
-    A normal distribution has no useful bounds; the function gives the nominal value instead.
+    For a normal distribution, whose bounds are not useful, the function returns the nominal value.
     """
 
     def extreme(path: str, end: int) -> Any:
@@ -239,7 +239,7 @@ def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> 
 
 
 def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Check that the drives can follow the approach. Raise `KeyProblem`."""
+    """Check that the velocity limit of the drives is at least the approach speed. Raise `KeyProblem`."""
     # Drives that are slower than the approach have no steady state from which a run could start.
     extreme, path = _build_extreme_function(mechanism, spans), "rig.simulator.velocity_limit"
     fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
@@ -248,7 +248,7 @@ def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> No
 
 
 def format_allowed_velocity_limit(approach: float) -> str:
-    """Return the allowed velocity limits for an approach speed [m/s], in words."""
+    """Describe the allowed velocity limits for an `approach` speed [m/s], for a message."""
     return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
 
 
@@ -263,19 +263,20 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     delay += max(_greatest_lag(mechanism.rig.simulator, extreme), 0.0)
     start = float(extreme("approach.velocity", 1) * (0.02 + period + delay))
     if clearance <= start:
-        allowed = f"a clearance > {start:g}, v (0.02 s + T + the motion simulator's delay and lag): "
-        raise KeyProblem(
-            ("contact", "clearance"), format_value(clearance), allowed + "the start lies within it"
-        )
+        expected = f"a clearance > {start:g} m, the distance of the start from the surface"
+        expected += " (v (0.02 s + T + delay and lag of the motion simulator))"
+        raise KeyProblem(("contact", "clearance"), format_value(clearance), expected)
     limit = clearance - start
     for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
         if not abs(plane) < limit:
-            allowed = f"a number > {-limit:g} and < {limit:g}, the clearance less what the start needs"
-            raise KeyProblem(("rig", "contact_plane"), format_value(plane), allowed)
+            expected = (
+                f"a number > {-limit:g} and < {limit:g} m, the clearance less the distance of the start"
+            )
+            raise KeyProblem(("rig", "contact_plane"), format_value(plane), expected)
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
-    """Return the greatest lag -G'(0) [s] of a motion simulator behind a uniform motion, without its delay."""
+    """Return the largest lag -G'(0) [s] of the motion simulator in uniform motion, without its delay."""
     path = "rig.simulator."
     if simulator.model == "first_order":
         return extreme(path + "time_constant", 1)

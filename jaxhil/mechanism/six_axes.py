@@ -1,9 +1,9 @@
 """Content of a six-axis mechanism file as plain frozen structs (schema `jaxhil/mechanism/2`).
 
 The file describes two rigid bodies, their approach, the shapes and laws of their contacts, and a six-axis
-rig. Conventions: notebooks/guide/six_axes.md. T and C are the interface frames of target and chaser; the z
-axis of both is the docking axis, from the target to the chaser. As in `jaxhil.mechanism.structs`, the type of
-a field contains its description, unit and range.
+rig; notebooks/guide/six_axes.md defines the conventions. T and C are the interface frames of target and
+chaser. The z axis of both frames is the docking axis and points from the target to the chaser. As in
+`jaxhil.mechanism.structs`, the type of a field contains its description, unit and range.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ AxisDamping = Annotated[float, key_metadata("damping of one axis", "N s/m, N m s
 
 
 class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Free rigid body with its interface frame."""
+    """Free rigid body: its mass, inertia and interface frame."""
 
     mass: Annotated[float, key_metadata("mass of the body", "kg", gt=0.0)]
     inertia: Annotated[
@@ -121,7 +121,7 @@ class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class BodyState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """State of a body at the start."""
+    """Position, attitude and velocities of a body at the start of the run."""
 
     position: Annotated[list[Metre], vector_metadata("position of the centre of mass, in world axes")]
     attitude: Annotated[
@@ -137,7 +137,7 @@ class BodyState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Explicit states of both bodies at the start, instead of an approach."""
+    """States of both bodies at the start of the run, instead of an approach."""
 
     duration: (
         Annotated[float, key_metadata("duration of the run, rounded to ticks", "s", gt=0.0, le=1000.0)] | None
@@ -181,20 +181,20 @@ class Shape(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
 
 
 class Pattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Copies of a pair of shapes, turned about z at equal angles."""
+    """Circular pattern: copies of a shape, of a pair of shapes or of a point, at equal angles about z."""
 
     count: Annotated[int, key_metadata("number of copies", "1", ge=1, le=256)]
     phase: Annotated[float, key_metadata("angle of the first copy", "rad")] = 0.0
 
 
 class TargetPattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Additional rotation of the copies on the target."""
+    """Additional rotation of the pattern on the target about z."""
 
     phase: Annotated[float, key_metadata("angle about z", "rad")]
 
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Friction law of a contact, which gives the tangential force."""
+    """Friction law of a contact, for the tangential force."""
 
     law: Annotated[Literal["regularised", "bristle"], key_metadata("friction law")]
     coefficient: Annotated[float, key_metadata("Coulomb's friction coefficient", "1", ge=0.0, le=10.0)]
@@ -206,7 +206,7 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Keys of a contact that all contact laws have."""
+    """Keys of the table `[contact.NAME]` that all contact laws have."""
 
     chaser: Annotated[Shape, key_metadata("the chaser's shape, in C axes")]
     target: Annotated[Shape, key_metadata("the target's shape, in T axes")]
@@ -219,14 +219,13 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     damping: Annotated[float, key_metadata(DAMPING_UNITS, "N s/m", ge=0.0)] = 0.0
 
 
-KEYS_IN_SIX_AXES = {
-    key.name: key.in_six_axes() for key in CONTACT_KEYS.values()
-}  # by their names on one axis
+# Keys that only some contact laws have, as in six-axis files, by their names in one-axis files.
+KEYS_IN_SIX_AXES = {key.name: key.in_six_axes() for key in CONTACT_KEYS.values()}
 
 if TYPE_CHECKING:
 
     class Contact(ContactOfAnyLaw, frozen=True):
-        """Contact with a field for each of `KEYS_IN_SIX_AXES`."""
+        """Table `[contact.NAME]`, with a field for each key in `KEYS_IN_SIX_AXES`."""
 
         friction: Friction | None = None
 
@@ -241,7 +240,7 @@ else:
         ],
         bases=(ContactOfAnyLaw,),
         module=__name__,
-        namespace={"__doc__": "Pair of shapes that may touch, or a pattern of such pairs, and its laws."},
+        namespace={"__doc__": "Pair of shapes that may touch, or a pattern of such pairs, with their laws."},
         frozen=True,
         forbid_unknown_fields=True,
         kw_only=True,
@@ -249,7 +248,7 @@ else:
 
 
 class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Point of the chaser that a latch catches, and from then on holds by a six-axis spring."""
+    """Latch that catches a point of the chaser and then holds the chaser by a six-axis spring."""
 
     chaser: Annotated[list[Metre], vector_metadata("the point, in C axes")]
     pattern: Annotated[Pattern, key_metadata("copies of the point, held alike")] | None = None
@@ -280,7 +279,7 @@ class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class SixAxisMechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Docking mechanism on a rig, with six axes."""
+    """Docking mechanism on a six-axis rig, as described by a mechanism file, in SI units."""
 
     schema: Annotated[Literal["jaxhil/mechanism/2"], key_metadata("kind of file")]
     name: Annotated[str, key_metadata("name of the mechanism", min_length=1, max_length=100)]
@@ -306,12 +305,12 @@ AnyMechanism = Mechanism | SixAxisMechanism
 
 
 def is_six_axes(raw: object) -> bool:
-    """Return whether a raw table has the six-axis schema."""
+    """Return whether the key `schema` of a raw table is the six-axis schema."""
     return isinstance(raw, Mapping) and raw.get("schema") == SIX_AXIS_SCHEMA
 
 
 def numeric_keys_of(mechanism: AnyMechanism) -> dict[str, Range]:
-    """Return the allowed values of every real-valued key that the mechanism may have, by dotted path."""
+    """Return the allowed values of every real-valued key of the mechanism's schema, by dotted path."""
     if isinstance(mechanism, Mechanism):
         return numeric_keys()
     return numeric_keys_with(tuple(mechanism.contact), tuple(mechanism.latch))
@@ -319,7 +318,7 @@ def numeric_keys_of(mechanism: AnyMechanism) -> dict[str, Range]:
 
 @functools.cache
 def numeric_keys_with(contacts: tuple[str, ...], latches: tuple[str, ...]) -> dict[str, Range]:
-    """Return the allowed values of every real-valued key, for contacts and latches of these names."""
+    """Return the allowed values of every real-valued key, for the names of all contacts and latches."""
     names: Any = {"contact": contacts, "latch": latches}
     return ranges_of(six_axis_type(), names)
 

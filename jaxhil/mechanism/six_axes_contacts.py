@@ -1,4 +1,4 @@
-"""Validation rules for contacts and latches of a six-axis mechanism file."""
+"""Validation rules for the contacts and latches of a six-axis mechanism file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from jaxhil.mechanism.six_axes import (
 
 __all__ = ["check_contact", "check_latch"]
 
-# Required keys and optional keys of each shape.
+# Required keys and optional keys of each kind of shape.
 KEYS_OF_SHAPES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "sphere": (("centre", "radius"), ("inside",)),
     "plane": (("point", "normal"), ()),
@@ -38,7 +38,7 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
-    """Check the pair of shapes of a contact, and that it has the keys of its shapes and laws.
+    """Check that a contact has a supported pair of shapes, with all keys of its shapes and laws.
 
     Raise `KeyProblem`.
     """
@@ -47,48 +47,45 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
         _check_shape((*path, body), getattr(contact, body))
     _check_pair(path, contact)
     if contact.target_pattern is not None and contact.pattern is None:
-        raise KeyProblem(
-            (*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } beside it"
-        )
+        raise KeyProblem((*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } as well")
     check_contact_law(path, contact, mechanism.uncertainty, KEYS_IN_SIX_AXES.values())
     law = find_contact_law(contact.law)
     if not (law.damped or law.dissipates_by) and contact.damping:
-        allowed = f"0 (law {law.name} has none), or {law.damped_as}"
-        raise KeyProblem((*path, "damping"), format_value(contact.damping), allowed)
+        expected = f'0 (law {law.name} has no damping), or law = "{law.damped_as}"'
+        raise KeyProblem((*path, "damping"), format_value(contact.damping), expected)
     if contact.friction is not None:
         _check_friction((*path, "friction"), contact.friction)
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
-    """Check that the latch has one spring and the conditions for catching. Raise `KeyProblem`."""
+    """Check that a latch has exactly one spring, and its conditions for catching. Raise `KeyProblem`."""
     path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
-        allowed = "false: an approach is free until the first touch ([start] says where a latch holds)"
-        raise KeyProblem((*path, "latched"), "true", allowed)
+        expected = "false: an approach starts without a latch that holds (use [start] instead)"
+        raise KeyProblem((*path, "latched"), "true", expected)
     for key in ("depth", "angle"):
         if not latch.latched and getattr(latch, key) is None:
-            allowed = f"{describe_allowed_at(Latch, key)}, or latched = true: held from the start on"
-            raise KeyProblem((*path, key), "nothing", allowed)
+            expected = f"{describe_allowed_at(Latch, key)}, or latched = true to hold from the start on"
+            raise KeyProblem((*path, key), "nothing", expected)
     if (latch.stiffness is None) == (latch.stiffness_matrix is None):
-        found = "nothing" if latch.stiffness is None else "stiffness_matrix beside it"
+        found = "nothing" if latch.stiffness is None else "stiffness_matrix as well"
         raise KeyProblem((*path, "stiffness"), found, "six numbers, or stiffness_matrix instead")
     if latch.stiffness_matrix is not None:
         matrix = np.asarray(latch.stiffness_matrix)
         size = np.max(np.abs(matrix))
         if np.any(np.abs(matrix - matrix.T) > 1e-12 * size) or np.linalg.eigvalsh(matrix)[0] < -1e-9 * size:
-            found = "one that is not symmetric or has an eigenvalue below 0"
-            raise KeyProblem(
-                (*path, "stiffness_matrix"), found, "that of a spring: symmetric, no eigenvalue below 0"
-            )
+            found = "a matrix that is not symmetric or has an eigenvalue below 0"
+            expected = "the matrix of a spring: symmetric, without eigenvalues below 0"
+            raise KeyProblem((*path, "stiffness_matrix"), found, expected)
 
 
 def _check_shape(path: KeyPath, shape: Shape) -> None:
-    """Check the keys of a shape. Raise `KeyProblem`."""
+    """Check that a shape has the keys of its kind, with possible values. Raise `KeyProblem`."""
     required, optional = KEYS_OF_SHAPES[shape.shape]
     for key, value in _file_values(shape).items():
         if key in required and value is None:
-            allowed = f"{describe_allowed_at(Shape, key)} ({shape.shape} needs it)"
-            raise KeyProblem((*path, key), "nothing", allowed)
+            expected = f"{describe_allowed_at(Shape, key)} ({shape.shape} needs it)"
+            raise KeyProblem((*path, key), "nothing", expected)
         if key not in (*required, *optional) and value not in (None, False):
             raise KeyProblem(
                 (*path, key), format_value(value), f"nothing ({shape.shape} does not use it: unset it)"
@@ -96,47 +93,46 @@ def _check_shape(path: KeyPath, shape: Shape) -> None:
     if shape.shape == "plane" and not np.any(shape.normal):
         raise KeyProblem((*path, "normal"), format_value(shape.normal), "a direction, outwards from the body")
     if shape.shape == "capsule" and shape.start == shape.end:
-        raise KeyProblem((*path, "to"), "the point that is from", "another point; a sphere has one")
+        raise KeyProblem((*path, "to"), "the same point as from", "a different point, or the shape sphere")
     if shape.shape == "sphere" and shape.inside and not shape.radius:
-        raise KeyProblem((*path, "radius"), "0.0", "a number > 0 m, as it is touched from inside")
+        raise KeyProblem((*path, "radius"), "0.0", "a number > 0 m, because inside = true")
     if shape.mouth_radius is not None:
-        least = (shape.bottom_radius or 0.0) * math.cos(shape.half_angle or 0.0)
-        if not shape.mouth_radius > least:
-            allowed = f"a number > {least:g} m, where the rounded bottom ends"
-            raise KeyProblem((*path, "mouth_radius"), format_value(shape.mouth_radius), allowed)
+        smallest = (shape.bottom_radius or 0.0) * math.cos(shape.half_angle or 0.0)
+        if not shape.mouth_radius > smallest:
+            expected = f"a number > {smallest:g} m, the radius at which the rounded bottom ends"
+            raise KeyProblem((*path, "mouth_radius"), format_value(shape.mouth_radius), expected)
     if shape.shape == "box":
         smallest = min(shape.half_lengths or [0.0])
         if (shape.rounding or 0.0) > smallest:
-            raise KeyProblem(
-                (*path, "rounding"), format_value(shape.rounding), f"at most half_lengths, {smallest:g} m"
-            )
+            expected = f"at most {smallest:g} m, the smallest of half_lengths"
+            raise KeyProblem((*path, "rounding"), format_value(shape.rounding), expected)
 
 
 def _check_pair(path: KeyPath, contact: Contact) -> None:
-    """Check that contact between the two shapes is supported and that they fit. Raise `KeyProblem`."""
+    """Check that contact between the two shapes is supported and possible. Raise `KeyProblem`."""
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
         raise KeyProblem(
-            (*path, "chaser", "shape"), "drogue", "a drogue on the target, where it opens along +z"
+            (*path, "chaser", "shape"), "drogue", "a drogue only on the target, with its opening along +z"
         )
     is_ball = [shape.shape == "sphere" and not shape.inside for shape in (chaser, target)]
     if not any(is_ball) and not chaser.shape == target.shape == "capsule":
         found = f"{target.shape} against the chaser's {chaser.shape}"
         raise KeyProblem((*path, "target", "shape"), found, "a sphere on either body, or two capsules")
     if target.mouth_radius is not None and not chaser.radius:
-        allowed = "a number > 0 m: a drogue with a mouth is a thin shell"
-        raise KeyProblem((*path, "chaser", "radius"), format_value(chaser.radius), allowed)
+        expected = "a number > 0 m, because a drogue with mouth_radius is a thin shell"
+        raise KeyProblem((*path, "chaser", "radius"), format_value(chaser.radius), expected)
     for body, ball, socket in (("chaser", chaser, target), ("target", target, chaser)):
         narrow = (
             socket.bottom_radius if socket.shape == "drogue" else socket.radius if socket.inside else None
         )
         if narrow is not None and not (ball.radius or 0.0) < narrow:
-            allowed = f"a number < {narrow:g} m, the radius that it is to fit into"
-            raise KeyProblem((*path, body, "radius"), format_value(ball.radius), allowed)
+            expected = f"a number < {narrow:g} m, the radius of the shape around it"
+            raise KeyProblem((*path, body, "radius"), format_value(ball.radius), expected)
 
 
 def _check_friction(path: KeyPath, friction: Friction) -> None:
-    """Check that the friction has the keys of its law. Raise `KeyProblem`."""
+    """Check that a table `friction` has the keys of its friction law. Raise `KeyProblem`."""
     for law, keys in KEYS_OF_FRICTION.items():
         for key in keys:
             value = getattr(friction, key)
@@ -151,6 +147,6 @@ def _check_friction(path: KeyPath, friction: Friction) -> None:
 
 
 def _file_values(shape: Shape) -> dict[str, Any]:
-    """Return the values of all keys except `shape`, by their names in the file."""
+    """Return the values of all keys of a shape except `shape`, by their names in the file."""
     names = zip(shape.__struct_encode_fields__, shape.__struct_fields__, strict=True)
     return {key: getattr(shape, name) for key, name in names if name != "shape"}

@@ -36,7 +36,7 @@ __all__ = [
 
 MOTION_NAMES = ("translation", "rotation")
 LOAD_NAMES = ("force", "torque")
-# Keys of a motion simulator with one value for each axis.
+# Keys of a motion simulator that have one value for each axis.
 PER_AXIS_KEYS = ("natural_frequency", "damping_ratio", "time_constant", "delay")
 
 # Types of the entries of lists.
@@ -54,7 +54,7 @@ CrosstalkRow = Annotated[
     ],
     Meta(min_length=6, max_length=6),
 ]
-# Types of the entries for six axes or channels; the units are those of translation and rotation.
+# Types of the entries of lists for six axes or channels, with the units of translation and rotation.
 Hertz = Annotated[float, key_metadata("frequency of one axis", "Hz", gt=0.0)]
 Ratio = Annotated[float, key_metadata("ratio of one axis", "1", gt=0.0)]
 Second = Annotated[float, key_metadata("time of one axis", "s", ge=0.0, le=1.0)]
@@ -66,12 +66,15 @@ LoadLimit = Annotated[float, key_metadata("limit of one channel", "N, N m", gt=0
 
 
 def vector_metadata(meaning: str) -> Meta:
-    """Return the metadata of a vector with three entries."""
+    """Return the msgspec metadata of a key whose value is a vector with three entries."""
     return Meta(min_length=3, max_length=3, description=meaning)
 
 
 def six_axis_metadata(meaning: str, names: tuple[str, str] = MOTION_NAMES) -> Meta:
-    """Return the metadata of six numbers; a file may give one for all, or one for each of the `names`."""
+    """Return the msgspec metadata of a key with six numbers.
+
+    A file may also have one number for all six, or a table with one number for each of the two `names`.
+    """
     schema: Any = {"six": list(names)}
     return Meta(
         min_length=6, max_length=6, description=meaning, extra={"six": names}, extra_json_schema=schema
@@ -79,12 +82,12 @@ def six_axis_metadata(meaning: str, names: tuple[str, str] = MOTION_NAMES) -> Me
 
 
 def zeros(count: int) -> Callable[[], list[Any]]:
-    """Return a function that returns a list of `count` zeros."""
+    """Return a default factory for a list of `count` zeros."""
     return lambda: [0.0] * count
 
 
 class TargetRobot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Robot that carries the target's mechanism; omitted keys have the values of the chaser's robot."""
+    """Robot under the target; keys that are omitted have the values of the chaser's robot."""
 
     share: Annotated[
         list[Share], six_axis_metadata("share of each coordinate's motion that this robot makes")
@@ -98,9 +101,10 @@ class TargetRobot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Motion simulator with G(s) exp(-s delay) from commanded to actual motion of each axis.
+    """Motion simulator: G(s) exp(-s delay) from the commanded to the actual motion of each axis.
 
-    The axes are the six coordinates (`task`), six legs (`stewart`), or the coordinates of two robots.
+    The axes are the six coordinates of the pose (`task`), the six legs of a hexapod (`stewart`), or the
+    coordinates of two robots (`two_robots`).
     """
 
     space: Annotated[Literal["task", "stewart", "two_robots"], key_metadata("kind of axes")] = "task"
@@ -155,7 +159,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Tool(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Tool that a moving sensor carries, and the controller's assumptions about it."""
+    """Tool on a moving force sensor, and the values that the controller assumes for the tool."""
 
     mass: Annotated[float, key_metadata("mass of the tool", "kg", ge=0.0)]
     com: Annotated[list[Metre], vector_metadata("centre of mass of the tool, in C axes")]
@@ -172,7 +176,7 @@ class Tool(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Six-axis force sensor: location, delay and lag, then the errors of a sample."""
+    """Six-axis force sensor: its location, its delay and lag, then the errors of each reading."""
 
     side: Annotated[
         Literal["fixed", "moving"], key_metadata("location: under the target's mechanism, or on the flange")
@@ -208,7 +212,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sensor of the hardware's pose, which compensators and the correction of a moving force sensor use."""
+    """Position sensor, which measures the pose of the hardware for the controller."""
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     noise_std: Annotated[list[Error], six_axis_metadata("standard deviation of white noise")] = field(

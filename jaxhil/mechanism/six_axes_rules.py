@@ -1,4 +1,4 @@
-"""Validation rules for several keys of a six-axis mechanism file: bodies, start, rig and uncertainty.
+"""Validation rules that involve several keys of a six-axis mechanism file: bodies, start, rig, uncertainty.
 
 As in `jaxhil.mechanism.rules`, each rule raises a `KeyProblem` that names the key to change. Rules for shapes
 and contact laws are in `jaxhil.mechanism.six_axes_contacts`.
@@ -24,10 +24,9 @@ from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 __all__ = ["check_contact_names", "check_leg_values", "check_six_axes", "inertia_matrix"]
 
 MAX_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
-# relative tolerance of the rule that no moment of inertia exceeds the sum of the others
-INERTIA_TOLERANCE = 1e-9
-MIN_INERTIA_RATIO = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia
-QUATERNION_TOLERANCE = 1e-6  # tolerance of a quaternion's norm, which is 1
+INERTIA_TOLERANCE = 1e-9  # 1; tolerance of the rule that no moment exceeds the sum of the others
+MIN_INERTIA_RATIO = 1e-6  # 1; lower limit on the ratio of the smallest to the largest moment of inertia
+QUATERNION_TOLERANCE = 1e-6  # 1; limit on the deviation of a quaternion's norm from 1
 # Required and optional keys of each kind of axes of the motion simulator.
 KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "task": ((), ()),
@@ -38,7 +37,7 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 
 def check_six_axes(mechanism: SixAxisMechanism) -> None:
-    """Check every rule. Raise `KeyProblem` for the first violation."""
+    """Check all rules for a six-axis mechanism. Raise `KeyProblem` for the first violation."""
     check_texts(mechanism)
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         _check_body(name, body)
@@ -61,31 +60,29 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
 
 
 def check_contact_names(raw: Mapping[str, Any]) -> None:
-    """Check that the contacts and latches of a raw table have names. Raise `KeyProblem`."""
+    """Check that all contacts and latches in a raw table have names. Raise `KeyProblem`."""
     for key, kind in (("contact", Contact), ("latch", Latch)):
         table = raw.get(key)
         entries = table.items() if isinstance(table, Mapping) else ()
         fields = [name for name, value in entries
                   if name in kind.__struct_fields__ and not isinstance(value, Mapping)]  # fmt: skip
         if fields:
-            found = f"a table without a name: {', '.join(fields)}"
-            raise KeyProblem((key,), found, f"[{key}.NAME], each with a name of its own")
+            found = f"the keys of a table without a name: {', '.join(fields)}"
+            raise KeyProblem((key,), found, f"tables [{key}.NAME], each with its own name")
 
 
 def check_leg_values(raw: Mapping[str, Any]) -> None:
-    """Check that a hexapod's values are given per leg, not for translation and rotation.
-
-    Raise `KeyProblem`.
-    """
+    """Check that a hexapod has values for legs, not for translation and rotation. Raise `KeyProblem`."""
     simulator = raw["rig"]["simulator"]
     for key in PER_AXIS_KEYS:
         if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
             found = "a table of translation and rotation"
-            raise KeyProblem(("rig", "simulator", key), found, "one number, or a list of six, one each leg")
+            expected = "one number, or a list of six numbers, one for each leg"
+            raise KeyProblem(("rig", "simulator", key), found, expected)
 
 
 def inertia_matrix(inertia: Inertia) -> np.ndarray:
-    """Return inertia matrices (..., 3, 3) [kg m^2] from moments (..., 3) or from matrices."""
+    """Return inertia matrices (..., 3, 3) [kg m^2] from principal moments (..., 3) or from matrices."""
     values = np.asarray(inertia, float)
     return values if values.shape[-2:] == (3, 3) else values[..., None] * np.eye(3)
 
@@ -96,14 +93,14 @@ def _check_body(name: str, body: RigidBody) -> None:
     angle = float(np.linalg.norm(body.interface_rotation))
     if not angle < np.pi:
         found = f"a rotation by {angle:.4g} rad"
-        raise KeyProblem((name, "interface_rotation"), found, "a rotation vector shorter than pi")
+        raise KeyProblem((name, "interface_rotation"), found, "a rotation vector shorter than pi rad")
 
 
 def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -> None:
-    """Check that a rigid body can have the inertia, or that all entries are 0 if it may be `massless`.
+    """Check that a rigid body can have this inertia.
 
     Raise `KeyProblem` unless the matrix is symmetric and positive definite, and no principal moment exceeds
-    the sum of the others.
+    the sum of the others. If `massless` is true, the inertia may also be 0.
     """
     if len({isinstance(entry, list) for entry in inertia}) > 1:
         raise KeyProblem(path, format_value(inertia), "three moments, or three rows of three entries")
@@ -112,47 +109,45 @@ def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -
     if size == 0:
         if massless:
             return
-        raise KeyProblem(path, "nothing but zeros, in kg m^2", "positive principal moments")
+        raise KeyProblem(path, "only zeros", "positive principal moments")
     if np.any(np.abs(matrix - matrix.T) > 1e-12 * size):
         row, column = np.argwhere(np.abs(matrix - matrix.T) > 1e-12 * size)[0]
-        found = (
-            f"{matrix[row, column]:g} at row {row + 1}, column {column + 1}, {matrix[column, row]:g} there"
-        )
-        raise KeyProblem(path, found + " transposed", "a symmetric matrix")
+        found = f"{matrix[row, column]:g} at row {row + 1}, column {column + 1}, and {matrix[column, row]:g}"
+        raise KeyProblem(path, found + " at the transposed entry", "a symmetric matrix")
     first, second, third = map(float, np.linalg.eigvalsh(matrix / size) * size)
     if not first > 0:
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
     if first < MIN_INERTIA_RATIO * third:
         found = f"principal moments from {first:g} to {third:g} kg m^2"
-        raise KeyProblem(path, found, f"those of a body: none less than {MIN_INERTIA_RATIO:g} of the largest")
+        raise KeyProblem(path, found, f"moments of at least {MIN_INERTIA_RATIO:g} of the largest")
     if third > (first + second) * (1 + INERTIA_TOLERANCE):
         found = f"principal moments {first:.6g}, {second:.6g} and {third:.6g} kg m^2"
-        allowed = "those of a body: none more than the sum of the other two"
-        raise KeyProblem(path, found, allowed)
+        expected = "moments of a rigid body: none larger than the sum of the other two"
+        raise KeyProblem(path, found, expected)
 
 
 def _check_start(mechanism: SixAxisMechanism) -> None:
-    """Check that there is a valid approach or a valid start, not both. Raise `KeyProblem`."""
+    """Check that there is either a valid approach or a valid start. Raise `KeyProblem`."""
     approach, start = mechanism.approach, mechanism.start
     if (approach is None) == (start is None):
         if start is None:
             raise KeyProblem(
                 ("approach",), "nothing", "[approach], or [start] with the states of both bodies"
             )
-        raise KeyProblem(("start",), "[approach] beside it", "one of the two")
+        raise KeyProblem(("start",), "[approach] as well", "either [start] or [approach]")
     if start is not None:
         _check_states(start)
     if approach is None:
         return
     if not mechanism.contact:
-        raise KeyProblem(("contact",), "nothing", "[contact.NAME]: an approach ends in a touch")
+        raise KeyProblem(("contact",), "nothing", "[contact.NAME]: an approach ends with the first contact")
     angle = float(np.linalg.norm(approach.attitude))
     if angle > MAX_ATTITUDE:
-        allowed = f"a rotation vector of at most {MAX_ATTITUDE:g} rad"
-        raise KeyProblem(("approach", "attitude"), f"a rotation by {angle:.4g} rad", allowed)
+        expected = f"a rotation vector of at most {MAX_ATTITUDE:g} rad"
+        raise KeyProblem(("approach", "attitude"), f"a rotation by {angle:.4g} rad", expected)
     if not approach.velocity[2] < 0:
-        allowed = "a number < 0 m/s: the z axis of T points to the chaser, which comes along -z"
-        raise KeyProblem(("approach", "velocity", 2), format_value(approach.velocity[2]), allowed)
+        expected = "a number < 0 m/s: the z axis of T points to the chaser, which moves along -z"
+        raise KeyProblem(("approach", "velocity", 2), format_value(approach.velocity[2]), expected)
     _check_sides(mechanism)
 
 
@@ -161,23 +156,26 @@ def _check_states(start: Start) -> None:
     for name, state in (("target", start.target), ("chaser", start.chaser)):
         norm = float(np.linalg.norm(state.attitude))
         if not abs(norm - 1) <= QUATERNION_TOLERANCE:
-            allowed = f"a quaternion (w, x, y, z) of norm 1, to {QUATERNION_TOLERANCE:g}"
-            raise KeyProblem(("start", name, "attitude"), f"one of norm {norm:.8g}", allowed)
+            expected = f"a quaternion (w, x, y, z) of norm 1 within {QUATERNION_TOLERANCE:g}"
+            raise KeyProblem(("start", name, "attitude"), f"a quaternion of norm {norm:.8g}", expected)
 
 
 def _check_sides(mechanism: SixAxisMechanism) -> None:
-    """Check that each body is on its side of the interface, since a z axis is easily reversed by mistake."""
+    """Check that each body lies on the correct side of its interface frame. Raise `KeyProblem`.
+
+    A body on the other side means that a z axis was reversed by mistake.
+    """
     for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
         axis = _rotate(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
         along = float(axis @ np.asarray(body.interface))
         if along * side < 0:
             where = "behind T, at negative z" if side > 0 else "beyond C, at positive z"
             found = f"a centre of mass at z = {-along:g} m of the interface frame"
-            raise KeyProblem((name, "interface"), found, f"one {where}: z points from target to chaser")
+            raise KeyProblem((name, "interface"), found, f"a centre {where}: z points from target to chaser")
 
 
 def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
-    """Rotate a vector by a rotation vector [rad] (Rodrigues' formula)."""
+    """Rotate `vector` by the rotation vector `rotation` [rad] (Rodrigues' formula)."""
     turn = np.asarray(rotation, float)
     angle = float(np.linalg.norm(turn))
     if angle == 0:
@@ -188,51 +186,52 @@ def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
 
 
 def _check_space(simulator: Simulator) -> None:
-    """Check that the motion simulator has the keys of its kind of axes and model. Raise `KeyProblem`."""
+    """Check that the motion simulator has the keys of its `space`, and legal values. Raise `KeyProblem`."""
     path: KeyPath = ("rig", "simulator")
     required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
         value = getattr(simulator, key)
         if key in required and value is None:
-            raise KeyProblem((*path, key), "nothing", f'what space = "{simulator.space}" needs')
+            raise KeyProblem((*path, key), "nothing", f'a value (space = "{simulator.space}" needs it)')
         if key not in (*required, *optional) and value is not None:
             found = "a table" if key == "target_robot" else format_value(value)
             raise KeyProblem((*path, key), found, f'nothing (space = "{simulator.space}" does not use it)')
     if simulator.stroke is not None and not simulator.stroke[0] < simulator.stroke[1]:
-        allowed = "a longest leg longer than the shortest"
-        raise KeyProblem((*path, "stroke"), format_value(simulator.stroke), allowed)
+        expected = "[shortest, longest] leg length, in increasing order"
+        raise KeyProblem((*path, "stroke"), format_value(simulator.stroke), expected)
     robot = simulator.target_robot
     for key in PER_AXIS_KEYS if robot else ():
         unused = key != "delay" and key not in KEYS_OF_MODELS[simulator.model]
         if unused and getattr(robot, key) is not None:
-            allowed = f"nothing (model {simulator.model} does not use it)"
-            raise KeyProblem((*path, "target_robot", key), format_value(getattr(robot, key)), allowed)
+            expected = f"nothing (model {simulator.model} does not use it)"
+            raise KeyProblem((*path, "target_robot", key), format_value(getattr(robot, key)), expected)
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
-    """Check that a contact with damping or friction has a velocity to act on. Raise `KeyProblem`."""
-    # An ideal simulator with zero-order hold jumps at the ticks and has no velocity between them.
+    """Check that damping or friction has no ideal simulator with zero-order hold. Raise `KeyProblem`."""
+    # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig = mechanism.rig
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
                      for contact in mechanism.contact.values())  # fmt: skip
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
-        allowed = '"linear" for an ideal simulator with contact damping or friction (or another model)'
-        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), allowed)
+        expected = '"linear" for an ideal simulator with contact damping or friction (or another model)'
+        raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 
 def _check_sensor(rig: Rig) -> None:
-    """Check crosstalk and tool against the force sensor's side. Raise `KeyProblem`."""
+    """Check the crosstalk of the force sensor, and its tool and gravity. Raise `KeyProblem`."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     mixed = np.eye(6) + np.asarray(sensor.crosstalk)
     if not np.linalg.cond(mixed) < 100:
-        found = "channels that are nearly the same"
-        raise KeyProblem((*path, "crosstalk"), found, "entries of which 1 + E has a condition below 100")
+        found = "channels that are nearly identical"
+        expected = "a matrix E such that 1 + E has a condition number below 100"
+        raise KeyProblem((*path, "crosstalk"), found, expected)
     if sensor.side == "fixed":
         for key, entry in (("tool", sensor.tool), ("gravity", any(sensor.gravity) or None)):
             if entry is not None:
                 value = "a table" if key == "tool" else format_value(sensor.gravity)
-                allowed = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
-                raise KeyProblem((*path, key), value, allowed)
+                expected = 'nothing (a fixed sensor carries no tool that moves: unset it, or side = "moving")'
+                raise KeyProblem((*path, key), value, expected)
         return
     if sensor.tool is None:
         raise KeyProblem((*path, "tool"), "nothing", 'a table with mass and com (side = "moving" needs it)')
@@ -247,10 +246,10 @@ def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
     low, high = check_uncertainty(mechanism, path)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
-        allowed = "false, or three moments: rows drawn apart are not symmetric"
-        raise KeyProblem((*where, "independent"), "true", allowed)
+        expected = "false, or three moments: independent rows are not symmetric"
+        raise KeyProblem((*where, "independent"), "true", expected)
     if path.endswith(".stiffness_matrix") and uncertainty.independent:
-        raise KeyProblem((*where, "independent"), "true", "false: entries drawn apart are not symmetric")
+        raise KeyProblem((*where, "independent"), "true", "false: independent entries are not symmetric")
     if path == "rig.simulator.stroke" and uncertainty.independent and not high[0] < low[1]:
         raise KeyProblem((*where, "independent"), "true", "false, or strokes that keep their order")
     if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:

@@ -1,11 +1,11 @@
-"""Content of a mechanism file as plain frozen structs.
+"""Content of a one-axis mechanism file as plain frozen structs.
 
 A `Mechanism` is one docking mechanism on one rig: the two bodies, their approach, the contact, the rig
 (motion simulator, sensors, control period), and the uncertainty of the numbers. All numbers are in SI units,
-natural frequencies in Hz. The type of a field contains its description, unit and range, which the reader of
-files, the messages and the truncation of random draws use.
+natural frequencies in Hz. The type of a field contains its description, unit and range, for validation,
+messages and random draws.
 
-The structs do not validate their fields; `jaxhil.mechanism.file` reads and validates.
+The structs do not validate their fields; `jaxhil.mechanism.file` reads and validates files.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-# limits of nonzero numbers; a product of three neither overflows nor underflows
+# limits on nonzero numbers, so that a product of three neither overflows nor underflows
 MAGNITUDE_LIMITS = 1e-100, 1e100
-NO_METADATA: Mapping[str, Any] = {}  # metadata of a type without any
+NO_METADATA: Mapping[str, Any] = {}
 
 # The type refers to the registry itself, because `jaxhil.register` adds laws later.
 ContactLawName = Annotated[str, Meta(description="contact law", extra={"one_of": CONTACT_LAWS})]
@@ -61,7 +61,7 @@ Distribution = Literal["uniform", "loguniform", "normal"]
 Stiffness = Annotated[float, key_metadata("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, key_metadata("damping of the contact", "N s/m", ge=0.0)]
-# Parts of the descriptions of stiffness and damping, for laws with other units.
+# Parts of the descriptions of stiffness and damping, for the laws with other units.
 STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
     law.name for law in CONTACT_LAWS.values() if law.stiffness_unit == "N/m^n"
 )
@@ -83,7 +83,7 @@ CorrelationRow = Annotated[
 
 
 def _single_entry(value: float) -> Callable[[], list[float]]:
-    """Return a function that returns a list of one value."""
+    """Return a default factory for a list of one value."""
     return lambda: [value]
 
 
@@ -105,7 +105,7 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach of the two bodies."""
+    """Approach of the two bodies: speed, number of contacts, and phase of the first contact."""
 
     velocity: Annotated[float, key_metadata("speed of the first approach", "m/s", gt=0.0)]
     contacts: Annotated[
@@ -117,7 +117,7 @@ class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Keys of a contact that all contact laws have."""
+    """Keys of the table `[contact]` that all contact laws have."""
 
     law: ContactLawName
     stiffness: Annotated[
@@ -149,7 +149,7 @@ For piecewise_linear, `stiffness` has one list of slopes per contact, with one s
 if TYPE_CHECKING:
 
     class Contact(ContactOfAnyLaw, frozen=True):
-        """Contact with a field for each of `jaxhil.contact.laws.KEYS`."""
+        """Table `[contact]`, with a field for each key in `jaxhil.contact.laws.CONTACT_KEYS`."""
 
         def __getattr__(self, key: str) -> Any: ...
 
@@ -198,7 +198,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Force sensor: delay and lag, then noise and bias, quantum, dead zone and range."""
+    """Force sensor: delay and lag, then noise and bias, rounding to the quantum, dead zone and range."""
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     time_constant: Annotated[
@@ -270,7 +270,7 @@ class Correlation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Docking mechanism on a rig."""
+    """Docking mechanism on a one-axis rig, as described by a mechanism file, in SI units."""
 
     schema: Annotated[Literal["jaxhil/mechanism/1"], key_metadata("kind of file")]
     name: Annotated[str, key_metadata("name of the mechanism", min_length=1, max_length=100)]
@@ -286,7 +286,7 @@ class Mechanism(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Range(NamedTuple):
-    """Allowed values of a number."""
+    """Interval of the allowed values of a number, with its unit."""
 
     low: float
     high: float
@@ -313,12 +313,12 @@ class Range(NamedTuple):
 
 
 def is_computable(value: float) -> bool:
-    """Return whether a number is 0, infinite, or of a magnitude within `MAGNITUDE_LIMITS`."""
+    """Return whether a number is 0 or infinite, or its magnitude is within `MAGNITUDE_LIMITS`."""
     return value == 0.0 or math.isinf(value) or MAGNITUDE_LIMITS[0] <= abs(value) <= MAGNITUDE_LIMITS[1]
 
 
 def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: Mapping[str, Any]) -> Range:
-    """Return the allowed values of a numeric field from its type and from `extra` of `key_metadata`."""
+    """Return the allowed values of a number from its msgspec type and the `extra` of its metadata."""
     low = kind.gt if kind.gt is not None else kind.ge
     high = kind.lt if kind.lt is not None else kind.le
     return Range(
@@ -340,14 +340,14 @@ def mechanism_type() -> msgspec.inspect.StructType:
 
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
-    """Return the allowed values of every real-valued key (or of its list's entries), by dotted path."""
+    """Return the allowed values of every real-valued key, or of its list entries, by dotted path."""
     return ranges_of(mechanism_type(), NO_METADATA)
 
 
 def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:
     """Return the allowed values of every real-valued key of a struct type, by dotted path.
 
-    `names` are the names of the tables in a dictionary, by the dictionary's path.
+    `names` lists the tables of each dictionary by the path of the dictionary, such as ``contact``.
     """
     keys: dict[str, Range] = {}
 
@@ -377,7 +377,7 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
 
 
 def value_at(mechanism: Struct, path: str) -> Any:
-    """Return the value at a dotted path such as ``rig.simulator.delay``, or None below a missing table."""
+    """Return the value at a dotted path such as ``rig.simulator.delay``, or None if a table is missing."""
     return functools.reduce(_entry, path.split("."), mechanism)
 
 

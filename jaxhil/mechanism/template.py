@@ -1,4 +1,4 @@
-"""Text of a new mechanism file: the values of a mechanism, and every further key with its default.
+"""Text of a new mechanism file, with the values of a mechanism, and the defaults of all other keys.
 
 Each key has a comment with its description, unit and range. A key at its default is commented out
 (`#key = value`).
@@ -19,7 +19,7 @@ from jaxhil.mechanism.structs import Mechanism
 
 __all__ = ["format_mechanism_file"]
 
-MAX_LINE_LENGTH, COMMENT_COLUMN = 110, 36  # length of lines, and column where comments begin
+MAX_LINE_LENGTH, COMMENT_COLUMN = 110, 36  # in characters; column: where comments begin
 FILE_HEADER = """\
 Mechanism file of jaxhil: one docking mechanism on one rig. Numbers are in SI units, natural frequencies
 in Hz. A line such as "#key = value" is a key at its default: remove the "#" to change it."""
@@ -48,20 +48,20 @@ def format_mechanism_file(mechanism: Mechanism) -> str:
 
 
 def _format_uncertainty(table: TableDescription, entries: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the comment on the table ``[uncertainty]``, then one line for each entry."""
+    """Yield the comment of the table ``[uncertainty]``, then one line for each uncertain key."""
     yield from _format_comment(UNCERTAINTY_COMMENT)
     for key in table.keys:
         yield from _wrap_comment(f"#   {key.name}", _describe_key(key))
     for path, entry in entries.items():
         defaults = {key.name: key.default for key in table.keys}
-        stated = (
+        assignments = (
             f"{name} = {_format_value(value)}" for name, value in entry.items() if value != defaults.get(name)
         )
-        yield f"{json.dumps(path)} = {{ {', '.join(stated)} }}"
+        yield f"{json.dumps(path)} = {{ {', '.join(assignments)} }}"
 
 
 def _format_key_lines(key: KeyDescription, values: Mapping[str, Any]) -> Iterator[str]:
-    """Return the lines of a key with its comment; a key at its default is commented out."""
+    """Return the lines for a key and its comment; a key with its default value is commented out."""
     value = values.get(key.name)
     is_active = key.required or value != key.default
     shown = value if is_active else key.default
@@ -74,7 +74,7 @@ def _describe_key(key: KeyDescription) -> str:
 
 
 def _wrap_comment(text: str, comment: str) -> Iterator[str]:
-    """Yield a key with its comment, which continues on further lines if it is long."""
+    """Yield the lines for a key and its comment; a long comment continues on further lines."""
     column = max(COMMENT_COLUMN, len(text) + 2)
     column = column if column <= MAX_LINE_LENGTH // 2 else COMMENT_COLUMN
     parts = textwrap.wrap(comment, MAX_LINE_LENGTH - column - 2)
@@ -87,12 +87,10 @@ def _wrap_comment(text: str, comment: str) -> Iterator[str]:
 
 
 def _format_comment(text: str) -> list[str]:
-    """Return a text as comment lines."""
     return [f"# {part}" for line in text.splitlines() for part in textwrap.wrap(line, MAX_LINE_LENGTH - 2)]
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as TOML text."""
     if isinstance(value, str):
         # JSON and TOML differ only in surrogates and DEL, which the texts of a mechanism do not contain.
         return json.dumps(value, ensure_ascii=False)

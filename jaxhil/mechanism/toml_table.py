@@ -1,4 +1,4 @@
-"""Reading of TOML files with limits on size and nesting; errors are messages of one line."""
+"""Reading of TOML files, with limits on their size and nesting and with one-line error messages."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxhil.files import open_input
 
 __all__ = ["parse_toml", "read_bytes"]
 
-MAX_BYTES = 1 << 20
-MAX_KEY_PARTS = 64
+MAX_BYTES = 1 << 20  # 1 MiB, far more than a mechanism file needs
+MAX_KEY_PARTS = 64  # the memory of the parser grows with the square of this number
 
-# Tokens of a TOML text that delimit dotted keys. An unclosed string extends to where it would have to end, so
-# that the scan takes linear time.
+# Tokens of a TOML text that delimit dotted keys. An unclosed string extends to the end of its line or of the
+# text, so that the scan takes linear time.
 _TOKENS = re.compile(
     r'(?P<long>"""(?:[^"\\]|\\.|"(?!""))*(?:""")?' + r"|'''(?:[^']|'(?!''))*(?:''')?)"
     r"|(?P<part>\"(?:[^\"\\\n]|\\[^\n])*\"?|'[^'\n]*'?|[A-Za-z0-9_-]+)"
@@ -26,7 +26,7 @@ _TOKENS = re.compile(
 
 
 def read_bytes(path: Path, label: str, what: str) -> bytes:
-    """Read a file; `what` names its content in messages, for example "a mechanism".
+    """Read the bytes of a file; `what` names the content in messages, for example "a mechanism".
 
     Raise FileNotFoundError, or `InputError` for any other problem.
     """
@@ -46,7 +46,7 @@ def read_bytes(path: Path, label: str, what: str) -> bytes:
 
 
 def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
-    """Return the table of a file's bytes; `what` names its content in messages. Raise `InputError`."""
+    """Parse the bytes of a TOML file; `what` names the content in messages. Raise `InputError`."""
     if not data.strip():
         raise InputError(f"{label}: found an empty file, expected {what} in TOML")
     try:
@@ -57,20 +57,19 @@ def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
             f"{label}: found bytes that are not UTF-8 at byte {error.start}, expected {what} in TOML"
         ) from None
     if _longest_key(text) > MAX_KEY_PARTS:
-        # The parser's memory grows with the square of a dotted key's length.
         raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, expected TOML keys")
     try:
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{label}: found values nested too deeply, expected plain TOML") from None
     except ValueError as error:
-        # An integer of thousands of digits raises a ValueError that is no TOMLDecodeError.
+        # An integer with thousands of digits raises a ValueError instead of a TOMLDecodeError.
         reason = to_one_line(str(error).split(";")[0], 120)
         raise InputError(f"{label}: not valid TOML: {reason}") from None
 
 
 def _longest_key(text: str) -> int:
-    """Return the number of parts of the longest dotted key, outside comments and multi-line strings."""
+    """Return the number of parts of the longest dotted key outside comments and multi-line strings."""
     longest = parts = 0
     joined = False
     for token in _TOKENS.finditer(text):

@@ -1,22 +1,21 @@
-"""Random draws of a mechanism's uncertain numbers, from its ``[uncertainty]`` table.
+"""Random draws of the uncertain numbers of a mechanism, from the table ``[uncertainty]``.
 
-Each number has a distribution; m is its nominal value:
+The distribution of a number with the nominal value m is:
 
 - ``uniform``, ``loguniform``: between ``low`` and ``high``, or ``factor[0] m`` and ``factor[1] m``;
-- ``normal``: mean m and standard deviation ``std`` of the underlying normal distribution, truncated
-  to the values allowed for that key.
+- ``normal``: a normal distribution with mean m and standard deviation ``std``, truncated to the values that
+  are allowed for the key.
 
-One draw scales a whole list: by the drawn factor, or, for a distribution in the number's unit, by the ratio
-of the draw to the first entry (if all entries are equal, the draw is their common value). With
-``independent = true`` every entry has a draw of its own. The phase of each contact within a control period is
-drawn as well, separately for each contact, uniform on 0..1 unless the table has an entry for it: the phase
-changes the restitution, and nobody controls it. With six axes it is the phase of the first touch, and is not
-drawn if the file has a ``[start]``.
+One draw scales a whole list: by the drawn factor or, for a distribution in the unit of the number, by the
+ratio of the draw to the first entry. If all entries are equal, the draw is their common value. With
+``independent = true`` every entry has its own draw. Each contact also has a random phase within a control
+period, because the phase changes the restitution and cannot be controlled. The phase is uniform from 0 to 1,
+unless the table has an entry for it. With six axes, only the phase of the first touch is drawn, and no phase
+if the file has a ``[start]``.
 
-Draw number i depends on the seed, on i, on its entry of the table, and on the keys that precede it in
-``[correlation]`` (`jaxhil.mechanism.correlation`). It depends neither on the number of draws made at once,
-nor on the other uncertain numbers, nor (for phases) on the number of contacts. The module needs NumPy and
-SciPy, not JAX.
+Draw i of a key depends on the seed, on i, on the key's entry in the table, and on the earlier keys in
+``[correlation]`` (`jaxhil.mechanism.correlation`). The draw does not depend on the number of draws made at
+once, on other uncertain keys or, for phases, on the number of contacts.
 """
 
 from __future__ import annotations
@@ -43,20 +42,20 @@ __all__ = [
 ]
 
 PHASE_KEY = "approach.phase"
-DRAWS_PER_GENERATOR = 1024  # number of draws from one generator
+DRAWS_PER_GENERATOR = 1024
 
-_MIN_UNIFORM = 2.0**-54  # replaces a uniform number of 0
+_MIN_UNIFORM = 2.0**-54  # smaller uniform numbers are replaced by this
 _MAX_UNIFORM = 1.0 - 2.0**-53  # largest uniform number of a generator
 _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
 def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
-    """Return the draws `first` to `first + number - 1` of every uncertain number of a valid mechanism.
+    """Return random draws of every uncertain key, from draw number `first` on.
 
-    The result has by dotted path an array (number,) for a number, (number, *entries) for a list, and with one
-    axis always (number, contacts) for ``approach.phase``, in the units of the keys. Uniform numbers come from
-    a Philox generator per key and block of 1024 draws; the quantile function of the distribution converts
-    them. Raise ValueError for a negative argument.
+    The result contains an array for each key by its dotted path, in the unit of the key: (number,) for a
+    number, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number, contacts). A
+    Philox generator for each key and 1024 draws generates uniform numbers, which the quantile function of the
+    distribution converts. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected >= 0")
@@ -66,13 +65,13 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
 
 
 def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
-    """Return draws as `draw` does, from a scrambled Sobol sequence with one point per draw.
+    """Return draws of every uncertain key from a scrambled Sobol sequence, in the format of `draw`.
 
-    The points fill the unit box of all uncertain numbers more evenly than random ones, best if `number` is a
-    power of two (Sobol 1967; scrambled as in `scipy.stats.qmc.Sobol`). Raise ValueError for a negative
-    argument, or for more than 21201 uncertain entries.
+    The points fill the unit box of all uncertain numbers more evenly than random points, most evenly if
+    `number` is a power of two (Sobol 1967; scrambled as in `scipy.stats.qmc.Sobol`). Raise ValueError for a
+    negative argument, or for more than 21201 uncertain entries.
     """
-    # The import takes most of a second, and only this function needs it.
+    # The import takes most of a second, and only this function needs SciPy's generator.
     from scipy.stats import qmc
 
     if number < 0 or seed < 0:
@@ -84,27 +83,27 @@ def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[s
 
 
 def draw_at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the draws for points of the unit box, (number, sum of `count_dimensions`), as `draw` does.
+    """Return the draws for points of the unit box, (number, dimensions), in the format of `draw`.
 
-    The coordinates are correlated as the mechanism states, then converted by the quantile function of each
-    key; 0 gives the least draw.
+    Each key has the columns that `count_dimensions` states. The coordinates are correlated as the mechanism
+    states, then converted by the quantile function of each key.
     """
     return _compute_values(mechanism, correlate(mechanism, _split_by_key(mechanism, points)))
 
 
 def compute_quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return each key's quantiles at points of the unit box, as `draw_at_points` but without correlation."""
+    """Return the quantiles of each key at points of the unit box: `draw_at_points` without correlation."""
     return _compute_values(mechanism, _split_by_key(mechanism, points))
 
 
 def draw_extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
-    """Return every uncertain number at both ends of its distribution, without correlation: (2, ...)."""
+    """Return the smallest and the largest value of every uncertain key, (2, ...), without correlation."""
     ends = np.array([[0.0], [_MAX_UNIFORM]])
     return compute_quantiles(mechanism, np.repeat(ends, sum(count_dimensions(mechanism).values()), axis=1))
 
 
 def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
-    """Return the number of uniform numbers for each key, sorted by path with the phases last."""
+    """Return the number of uniform numbers in a draw of each key, sorted by path, with phases last."""
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE_KEY}):
         independent = mechanism.uncertainty[path].independent
@@ -119,29 +118,29 @@ def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
 def _split_by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
     """Split points of the unit box into the columns of each key."""
     columns = count_dimensions(mechanism)
-    edges = np.cumsum(list(columns.values()))[:-1]
-    return dict(zip(columns, np.split(points, edges, axis=1), strict=True))
+    bounds = np.cumsum(list(columns.values()))[:-1]
+    return dict(zip(columns, np.split(points, bounds, axis=1), strict=True))
 
 
 def _draw_uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:
-    """Return uniform numbers (number, count): the rows from `first` on of an infinite table for this path."""
+    """Return uniform random numbers (number, count) of the key at `path`, from draw number `first` on."""
     start = first // DRAWS_PER_GENERATOR
     blocks = [np.empty((0, count))]
     philox = np.random.Philox(key=0)
-    fresh: Any = philox.state
+    initial_state: Any = philox.state
     for block in range(start, math.ceil((first + number) / DRAWS_PER_GENERATOR)):
         digest = hashlib.sha256(f"{seed} {block} {path}".encode()).digest()
-        # Setting the key of one generator is faster than a new one, which asks the system for a seed.
-        fresh["state"]["key"] = np.frombuffer(digest[:16], "<u8")
-        philox.state = fresh
-        # Numbers fill column by column, so that the first columns do not depend on `count`.
+        # A new key for the same generator is faster than a new generator, which asks the system for a seed.
+        initial_state["state"]["key"] = np.frombuffer(digest[:16], "<u8")
+        philox.state = initial_state
+        # The numbers fill the array column by column, so that the first columns do not depend on `count`.
         blocks.append(np.random.Generator(philox).random((count, DRAWS_PER_GENERATOR)).T)
     skipped = first - start * DRAWS_PER_GENERATOR
     return np.concatenate(blocks)[skipped : skipped + number]
 
 
 def _compute_values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the values of every key from its uniform numbers."""
+    """Convert the uniform numbers of every key to values of the key."""
     has_one_axis = isinstance(mechanism, Mechanism)
     ranges = numeric_keys_of(mechanism)
     return {
@@ -163,7 +162,7 @@ def _compute_key_values(
     uniform: np.ndarray,
     per_contact: bool,
 ) -> np.ndarray:
-    """Return the values of one key from its uniform numbers (number, columns)."""
+    """Convert the uniform numbers (number, columns) of one key to values of the key."""
     number = uniform.shape[0]
     # The quantile at 0 would be outside an open range.
     uniform = np.maximum(uniform, _MIN_UNIFORM)
@@ -187,7 +186,7 @@ def _compute_key_values(
 def _build_quantile_function(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the quantile function, for uniform numbers that broadcast against `nominal`."""
+    """Return the quantile function of a distribution; its argument broadcasts against `nominal`."""
     if uncertainty.distribution == "normal":
         assert uncertainty.std is not None
         return _truncated_normal(nominal, uncertainty.std, allowed)
@@ -204,11 +203,12 @@ def _build_quantile_function(
 
 
 def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the quantile mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))) with the standardised ends a and b.
+    """Return the quantile function of a normal distribution that is truncated to the `allowed` values.
 
-    It is accurate because the mean is an allowed value, so that the ends are not in the same tail.
+    With the standardised bounds a and b, the quantile is mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))). The
+    formula is accurate because the mean is an allowed value, so that a and b are not in the same tail.
     """
-    from scipy import special  # takes long to import, and most files need none
+    from scipy import special  # takes long to import, and most files do not need SciPy
 
     with np.errstate(over="ignore"):
         below = special.ndtr((allowed.low - mean) / std)

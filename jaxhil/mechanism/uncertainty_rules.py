@@ -1,4 +1,4 @@
-"""Validation rules of the table ``[uncertainty]``, and the least and greatest draws of its entries."""
+"""Validation rules of the table ``[uncertainty]``, and the smallest and largest draws of uncertain keys."""
 
 from __future__ import annotations
 
@@ -13,52 +13,52 @@ from jaxhil.mechanism.structs import Range, Uncertainty, is_computable, value_at
 
 __all__ = ["Span", "check_uncertainty"]
 
-Span = tuple[np.ndarray, np.ndarray]
-POLYNOMIALS = ("rig.simulator.numerator", "rig.simulator.denominator")  # cannot be uncertain
+Span = tuple[np.ndarray, np.ndarray]  # smallest and largest draw of each entry of a key's value
+POLYNOMIALS = ("rig.simulator.numerator", "rig.simulator.denominator")  # keys that cannot be uncertain
 
 
 def check_uncertainty(mechanism: AnyMechanism, path: str) -> Span:
-    """Check an uncertain key; return the least and the greatest draw of each of its entries.
+    """Check the distribution of an uncertain key; return the smallest and largest draw of each entry.
 
-    Raise `KeyProblem`.
+    Raise `KeyProblem` if the distribution, or a value that it can draw, is invalid.
     """
     uncertainty = mechanism.uncertainty[path]
     where = ("uncertainty", path)
     ranges = numeric_keys_of(mechanism)
     key_ranges = {key: allowed for key, allowed in ranges.items() if key not in POLYNOMIALS}
     if path not in key_ranges:
-        allowed = f"the dotted path of a numeric key{suggest_names(path, key_ranges)}"
+        expected = f"the dotted path of a numeric key{suggest_names(path, key_ranges)}"
         if path in POLYNOMIALS:
-            allowed += " other than a polynomial, which fixes G(0) = 1"
-        raise KeyProblem(where, "no such uncertain key", allowed)
+            expected += " other than a polynomial, because G(0) = 1 is fixed"
+        raise KeyProblem(where, "no such uncertain key", expected)
     value = value_at(mechanism, path)
     if value is None or value == [] or np.all(np.isinf(value)):
-        allowed = f"a key with a value: set {path}, or unset its uncertainty"
-        raise KeyProblem(where, f"{format_value(value)} as its value", allowed)
+        expected = f"a key with a value: set {path}, or unset its uncertainty"
+        raise KeyProblem(where, f"{format_value(value)} as its value", expected)
     nominal = np.asarray(value, dtype=float)
     low, high = _compute_span(where, path, uncertainty, nominal, key_ranges[path])
     ends = [float(end) for end in np.concatenate((low.ravel(), high.ravel()))]
     if uncertainty.distribution != "normal":
         outside = [end for end in ends if not (key_ranges[path].allows(end) and math.isfinite(end))]
         if outside:
-            raise KeyProblem(where, f"values as far as {outside[0]:g}", str(key_ranges[path]))
+            raise KeyProblem(where, f"draws as far as {outside[0]:g}", str(key_ranges[path]))
         beyond = [end for end in ends if not is_computable(end)]
         if beyond:
-            raise KeyProblem(where, f"values as far as {beyond[0]:g}", add_magnitude_limits(key_ranges[path]))
+            raise KeyProblem(where, f"draws as far as {beyond[0]:g}", add_magnitude_limits(key_ranges[path]))
     if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
         largest = high[2] if uncertainty.independent else low[2]
         if not low[0] * low[1] > largest:
-            allowed = "a stable motion simulator throughout: a1 a2 > a3"
-            raise KeyProblem(where, "values for which it is not stable", allowed)
+            expected = "a stable motion simulator for all draws: a1 a2 > a3"
+            raise KeyProblem(where, "draws with an unstable motion simulator", expected)
     return low, high
 
 
 def _compute_span(
     where: tuple[str, str], path: str, uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Span:
-    """Return the least and greatest draw of each entry. Raise `KeyProblem` for a wrong distribution."""
+    """Return the smallest and largest draw of each entry. Raise `KeyProblem` for an invalid distribution."""
     kind = uncertainty.distribution
     keys = {k for k in ("low", "high", "factor", "std") if getattr(uncertainty, k) is not None}
     choices = [{"std"}] if kind == "normal" else [{"factor"}, {"low", "high"}]
@@ -77,7 +77,7 @@ def _compute_span(
         raise KeyProblem((*where, key), format_value(bounds), "low < high")
     if kind == "loguniform" and not bounds[0] > 0.0:
         raise KeyProblem((*where, key), format_value(bounds[0]), "a number > 0 for loguniform")
-    # An end that overflows is infinite, and the caller rejects it.
+    # A bound that overflows becomes infinite, and the caller rejects the infinite bound.
     with np.errstate(over="ignore"):
         if uncertainty.factor:
             ends = [nominal * bound for bound in bounds]

@@ -176,7 +176,7 @@ def _try(
         return slope_at(space, now), (now._replace(states=None), memories)
 
     step = take_looped_step(slope, flight.states, length)
-    now, memories = step.found
+    now, memories = step.extra
     level: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
     return now._replace(states=level), memories, _size(space, step.error, speed) / TOLERANCE
 
