@@ -73,7 +73,7 @@ def test_incomplete_contact_law_is_refused(registered):
     ):
         message = refusal(needs)
         assert message.startswith("contact.law: found 'squared_spring', expected a law ")
-        assert message.endswith(f"(ContactLaw.{method})")
+        assert message.endswith(f"a law that defines ContactLaw.{method}")
     assert "contact.law: found 'none', expected one of linear, " in refusal(laws.find_contact_law, "none")
 
 

@@ -62,13 +62,13 @@ class ContactLaw(abc.ABC):
         """Return whether the force depends on the deepest penetration so far.
 
         If so, the simulation also updates the state of the law between samples. `step` must reset the
-        state at d <= 0; otherwise only the deepest point since the last call may change the state.
+        state at d <= 0. Between two calls, only the deepest point of the motion may affect the state.
         """
         return False
 
     @property
     def jumps(self) -> bool:
-        """Return whether the force jumps when the motion reverses. Its peak may then lie between samples."""
+        """Return whether the force jumps when the motion reverses, with its peak possibly between samples."""
         return False
 
     @property
@@ -87,7 +87,7 @@ class ContactLaw(abc.ABC):
 
     @property
     def simulated(self) -> ContactLaw:
-        """Return the law that the simulation uses for this law; laws with equal forces share a program."""
+        """Return the law that replaces this law in the simulation: laws with equal forces share a program."""
         return self
 
     def specialised(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
@@ -163,7 +163,7 @@ class ContactLaw(abc.ABC):
     # Magnitudes of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Estimate the largest peak force [N] of successive contacts; by default for a linear law."""
+        """Estimate the largest peak force [N] of a mechanism's contacts, by default with a linear law."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:

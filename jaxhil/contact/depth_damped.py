@@ -46,7 +46,7 @@ class DepthDamped(PowerLaw):
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the b whose damping force at the deepest point equals that of `HuntCrossley`, chi = pi zeta/v.
+        """Add the b with the same damping force at the deepest point as Hunt and Crossley's chi = pi zeta/v.
 
         zeta is the damping ratio `ratio`, and v the approach speed.
         """

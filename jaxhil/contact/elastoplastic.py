@@ -1,4 +1,4 @@
-"""Elastoplastic contact law: the force decreases along a steeper slope than it increased."""
+"""Elastoplastic contact law: the slope of the force is steeper in unloading than in loading."""
 
 from typing import ClassVar
 
@@ -15,8 +15,8 @@ class Elastoplastic(ContactLaw):
 
     k is `stiffness` [N/m], r is `unloading_ratio` >= 1, and the state d_max [m] is the deepest penetration so
     far. Loading beyond d_max follows F = k d. Unloading and reloading below d_max follow the slope k_u; the
-    force is 0 for d <= d_max (1 - 1/r). The mechanism stores k d_max^2/2 = M v^2/2 and returns the fraction
-    1/r, so that e = 1/sqrt(r). The law has no damping.
+    force is 0 for d <= d_max (1 - 1/r). The mechanism takes up the energy k d_max^2/2 = M v^2/2 and
+    returns the fraction 1/r, so that e = 1/sqrt(r). The law has no damping.
 
     d_max is reset when the mechanism leaves the surface (d <= 0), so that every contact starts undeformed. It
     is not reset while F = 0 at d > 0.

@@ -1,4 +1,4 @@
-"""Hunt and Crossley's contact law: a power of the penetration, with damping proportional to that power."""
+"""Hunt and Crossley's contact law: F = k d^n (1 + (3/2) chi d'), clamped at 0."""
 
 from typing import ClassVar
 
@@ -18,9 +18,9 @@ class HuntCrossley(PowerLaw):
 
     name: ClassVar[str] = "hunt_crossley"
     damping_unit: ClassVar[str] = "s/m"
-    QUICK: ClassVar = (1.0, 1.5)  # exponents n that need no general power function, which is slow
+    FAST_EXPONENTS: ClassVar = (1.0, 1.5)  # exponents n that need no general power function, which is slow
 
-    # n, if it is in `QUICK` and equal for all batch elements; else None
+    # n, if it is in `FAST_EXPONENTS` and equal for all batch elements; else None
     exponent: float | None = None
 
     @property
@@ -28,8 +28,8 @@ class HuntCrossley(PowerLaw):
         return True
 
     def specialised(self, contact, drawn):
-        is_quick = not drawn("exponent") and contact.exponent in self.QUICK
-        return HuntCrossley(contact.exponent) if is_quick else self
+        is_fast = not drawn("exponent") and contact.exponent in self.FAST_EXPONENTS
+        return HuntCrossley(contact.exponent) if is_fast else self
 
     def step(self, parameters, state, penetration, rate):
         # The inner `where` keeps the derivative of d^n finite at d <= 0.
@@ -53,7 +53,7 @@ class HuntCrossley(PowerLaw):
         )
 
     def damping_ratio(self, damping, mass, velocity, frequency):
-        """Return zeta = chi v/pi, because e is about 1 - chi v, and exp(-pi zeta) for a linear oscillator."""
+        """Return zeta = chi v/pi: e is about 1 - chi v, and about 1 - pi zeta for a linear oscillator."""
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):

@@ -183,7 +183,7 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Return e, and peak force and duration in the units M v^2/D and D/v, D^(n+1) = (n + 1) M v^2 / k."""
+    """Return e, peak force / (M v^2 / D) and duration / (D / v), where D^(n+1) = (n + 1) M v^2 / k."""
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
 
@@ -210,19 +210,19 @@ def _hunt_crossley_shape_jvp(primals, tangents):
 def _shape_at_roots(half_span, at_peak, onset, exponent):
     """Return the results of `_hunt_crossley_shape` from the roots S = `half_span` and u = `at_peak`."""
     symmetry, _ = _langevin(half_span)
-    share = exponent / (exponent + 1)
+    exponent_ratio = exponent / (exponent + 1)
     # The force is stationary in y / q^2 = `at_peak`, which needs no derivative.
     y = onset**2 * at_peak
     potential = _scaled_potential(jnp.stack([onset, y]))
     depth_power = potential[0] - y * at_peak * potential[1]
-    peak = (exponent + 1) * depth_power**share * (1 + y)
+    peak = (exponent + 1) * depth_power**exponent_ratio * (1 + y)
     ratio = 1 / (2 - symmetry)  # S / q, also at q = 0
-    duration = 2 * ratio ** (1 - 2 * share) * _duration_integral(half_span, exponent)
+    duration = 2 * ratio ** (1 - 2 * exponent_ratio) * _duration_integral(half_span, exponent)
     return symmetry * ratio, peak, duration
 
 
 def _solve_half_span(onset):
-    """Return the root S >= 0 of S + L(S) = q."""
+    """Return the root S >= 0 of S + L(S) = q, with q = `onset` (`ideal_hunt_crossley`)."""
 
     def newton(_, s):
         symmetry, slope = _langevin(s)
@@ -233,17 +233,17 @@ def _solve_half_span(onset):
 
 
 def _solve_peak(onset, exponent):
-    """Return the root u = y / q^2 of G(q^2 u) / q^2 + n / (n + 1) u = G(q) / q^2."""
-    share = exponent / (exponent + 1)
+    """Return the root u = y / q^2 of G(q^2 u) / q^2 + n / (n + 1) u = G(q) / q^2 (`ideal_hunt_crossley`)."""
+    exponent_ratio = exponent / (exponent + 1)
     potential = _scaled_potential(onset)
 
     def newton(_, u):
         y = onset**2 * u
-        residual = y * u * _scaled_potential(y) + share * u - potential
-        return u - residual / (y / (1 + y) + share)
+        residual = y * u * _scaled_potential(y) + exponent_ratio * u - potential
+        return u - residual / (y / (1 + y) + exponent_ratio)
 
     # G is convex and G >= 0, so Newton's method descends from the start to the root.
-    return lax.fori_loop(0, 8, newton, potential / share)
+    return lax.fori_loop(0, 8, newton, potential / exponent_ratio)
 
 
 def _scaled_potential(y):
@@ -277,12 +277,15 @@ _QUADRATURE_WEIGHTS = (
 
 
 def _duration_integral(half_span, exponent):
-    """Integrate R^(-n/(n+1)) over tau in (0, 1), R = (G(S) - G(s)) / (S^2 (1 - s/S)), 1 - s/S = tau^(n+1)."""
+    """Integrate R^(-n/(n+1)) over tau in (0, 1), for the duration in `ideal_hunt_crossley`.
+
+    R = (G(S) - G(s)) / (S^2 (1 - s/S)) with 1 - s/S = tau^(n+1).
+    """
     column = (-1,) + (1,) * half_span.ndim
     log_node = jnp.asarray(_QUADRATURE_LOG_NODES, half_span.dtype).reshape(column)
     weight = jnp.asarray(_QUADRATURE_WEIGHTS, half_span.dtype).reshape(column)
     power = (exponent + 1)[None] * log_node
-    # This is bounded away from 0, where R is undefined and only has a limit.
+    # A lower bound keeps 1 - s/S away from 0, where the formula for R is undefined.
     below_end = jnp.exp(jnp.maximum(power, math.log(jnp.finfo(half_span.dtype).tiny) / 2))
     fraction = -jnp.expm1(power)
 

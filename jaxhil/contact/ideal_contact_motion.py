@@ -74,17 +74,17 @@ def integrate_contact(
     restitution is computed from the speed at the end of the push and may exceed 1.
 
     The function can be jitted, vmapped and differentiated in forward mode, also with respect to `times` and
-    to the variables that `push` encloses. Shapes are as for the closed forms: one batch shape and one dtype,
-    slopes and depths with a leading axis.
+    to the variables that `push` encloses. All arrays have one batch shape and one dtype; slopes and depths
+    have a leading axis of segments.
 
     Args:
         law: contact law.
-        parameters: its parameters (`jaxhil.contact.laws.ContactParameters`).
+        parameters: parameters of the law (`jaxhil.contact.laws.ContactParameters`).
         mass: equivalent mass M [kg].
         velocity: approach speed v [m/s].
         push: p(t) [N], a function of the time since the first touch [s], (*batch), for
-            0 <= t <= `push_duration`. It may have kinks and jumps, but no detail shorter than 1/50 of its
-            duration.
+            0 <= t <= `push_duration`. p may have kinks and jumps, but no detail shorter than
+            1/50 of `push_duration`.
         push_duration: end of the push [s]; later p = 0.
         times: requested times since the first touch [s], in any order. Before 0 and after the end the motion
             is uniform.
@@ -113,7 +113,7 @@ class _Problem(NamedTuple):
     """Arguments of `integrate_contact`."""
 
     law: Any  # contact law
-    parameters: Any  # its parameters (`jaxhil.contact.laws.ContactParameters`)
+    parameters: Any  # parameters of the law (`jaxhil.contact.laws.ContactParameters`)
     mass: Array  # equivalent mass M [kg]
     approach: Array  # approach speed v [m/s]
     push: Any  # function p(t) [N], or None
@@ -165,8 +165,8 @@ def _event_value(problem, state, time, depth, rate):
     hold = problem.law.hold(problem.parameters, state.memory, depth, rate)
     # Force and depth are scaled to order 1; otherwise the root of their minimum would be hard to find.
     hold = hold / jnp.where(state.hold_scale > 0, state.hold_scale, 1)
-    share = depth / jnp.where(state.deepest > 0, state.deepest, 1)
-    separation = jnp.where(hold < share, hold, share)
+    scaled_depth = depth / jnp.where(state.deepest > 0, state.deepest, 1)
+    separation = jnp.where(hold < scaled_depth, hold, scaled_depth)
     event = jnp.where(state.phase == INWARD, rate, separation)
     return jnp.where(state.phase == FREE, problem.push_end - time, event)
 

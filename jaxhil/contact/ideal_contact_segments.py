@@ -25,32 +25,32 @@ def solve_chained_oscillators(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Return restitution, peak force [N] and duration [s] of an ideal piecewise-linear contact."""
-    segments = slopes.shape[0]
+    """Return restitution, peak force [N] and duration [s] as for `ideal_piecewise_linear`."""
+    count = slopes.shape[0]
     zero = jnp.zeros_like(velocity)
     thicknesses = jnp.diff(depths, axis=0, prepend=zero[None])
     accelerations = jnp.cumsum(slopes[:-1] * thicknesses, axis=0) / mass[None]
-    layers = _Segment(
-        number=jnp.arange(segments),
+    segments = _Segment(
+        number=jnp.arange(count),
         stiffness=slopes / mass[None],
         acceleration=jnp.concatenate([zero[None], accelerations]),
         thickness=jnp.concatenate([thicknesses, jnp.full_like(zero, jnp.inf)[None]]),
     )
-    there_and_back = _Segment(*(jnp.concatenate([field, field[::-1]]) for field in layers))
-    inward = jnp.arange(2 * segments) < segments
+    inward_and_outward = _Segment(*(jnp.concatenate([field, field[::-1]]) for field in segments))
+    inward = jnp.arange(2 * count) < count
     decay = damping / (2 * mass)
     start = _State(
         depth=zero,
         velocity=velocity,
         time=zero,
         peak=2 * decay * velocity,
-        segment=jnp.zeros(velocity.shape, layers.number.dtype),
+        segment=jnp.zeros(velocity.shape, segments.number.dtype),
         ended=jnp.zeros(velocity.shape, bool),
     )
     end, _ = lax.scan(
         lambda state, phase: (_traverse(decay, *phase, state), None),
         start,
-        (there_and_back, inward),
+        (inward_and_outward, inward),
     )
     return -end.velocity / velocity, mass * end.peak, end.time
 
@@ -58,7 +58,7 @@ def solve_chained_oscillators(
 def arccosine_over_sine(cosine):
     """Return acos(c) / sqrt(1 - c^2) for 0 <= c < 1 and its analytic continuation for c >= 1.
 
-    Above 1 it is acosh(c) / sqrt(c^2 - 1).
+    For c > 1 the function is acosh(c) / sqrt(c^2 - 1).
     """
     near = jnp.abs(cosine - 1) < 0.02
     below = (cosine < 1) & ~near
@@ -100,7 +100,7 @@ class _State(NamedTuple):
 
 
 class _SegmentPassage(NamedTuple):
-    """Motion through one segment."""
+    """Motion of the bodies through one segment, inward or outward."""
 
     spring: Array  # spring force divided by mass at the start [m/s^2]
     velocity: Array  # velocity at the start [m/s]
@@ -111,11 +111,11 @@ class _SegmentPassage(NamedTuple):
     culmination: Array  # time until the force is largest [s]
 
 
-def _traverse(decay, layer: _Segment, inward, state: _State) -> _State:
+def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
     """Advance the state through one segment: to the far depth, the turning point or the separation."""
-    active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= layer.number))
-    passage = _compute_passage(decay, layer, inward, state, active)
-    stiffness = layer.stiffness
+    active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= segment.number))
+    passage = _compute_passage(decay, segment, inward, state, active)
+    stiffness = segment.stiffness
     distances, speeds = _free_motion(
         decay[None],
         stiffness[None],
@@ -152,18 +152,18 @@ def _traverse(decay, layer: _Segment, inward, state: _State) -> _State:
     )
     chosen = _State(*(jnp.where(active, a, b) for a, b in zip(new, state, strict=True)))
     # After the last segment the outward motion begins, so that `ended` is reset.
-    innermost = inward & jnp.isinf(layer.thickness)
+    innermost = inward & jnp.isinf(segment.thickness)
     return chosen._replace(ended=jnp.where(innermost, False, chosen.ended))
 
 
-def _compute_passage(decay, layer: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion through a segment for the `active` batch elements, with times without derivative."""
-    stiffness, turns_here = layer.stiffness, state.segment == layer.number
+def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
+    """Compute the motion of the `active` batch elements through a segment; its times have no derivative."""
+    stiffness, turns_here = segment.stiffness, state.segment == segment.number
     # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
-    depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, layer.thickness))
+    depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))
     depth = jnp.where(active, depth, 0.0)
     velocity = jnp.where(active, state.velocity, 0.0)
-    spring = layer.acceleration + stiffness * depth
+    spring = segment.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
     # Unless the motion crosses a depth, it ends at d' = 0 or at F = 0. Inward, F is largest at the start or
@@ -180,9 +180,9 @@ def _compute_passage(decay, layer: _Segment, inward, state: _State, active) -> _
         )
     )
     farthest, _ = _free_motion(*fixed, event)
-    boundary = jnp.where(inward, layer.thickness, -depth)
+    boundary = jnp.where(inward, segment.thickness, -depth)
     # The first segment always ends by separation: without damping, force and depth vanish together.
-    crosses = jnp.where(inward, farthest > boundary, (farthest < boundary) & (layer.number > 0))
+    crosses = jnp.where(inward, farthest > boundary, (farthest < boundary) & (segment.number > 0))
     target = jnp.where(crosses, boundary, 0.0)
     start = jnp.where(crosses & ~inward, event, 0.0)
     crossing = _crossing_time(*fixed, *lax.stop_gradient((target, start)))
@@ -194,7 +194,7 @@ def _crossing_time(decay, stiffness, spring, velocity, target, start):
     """Return the time [s], without derivative, to travel the distance `target`; 0 if `target` is 0.
 
     `start` is 0 for the inward motion, and the time of separation for the outward motion. Since d is concave
-    in time, Newton's method approaches the crossing from there without overshooting, until rounding stops it.
+    in time, Newton's method approaches the crossing from `start` without overshoot, until rounding stops it.
     """
 
     def advance(carry):
@@ -242,7 +242,7 @@ def _free_motion(decay, stiffness, spring, velocity, time):
 
 @jax.custom_jvp
 def _impulse_response(decay, stiffness, time):
-    """Return the impulse response S = e^(-a t) sin(w t) / w, w^2 = k - a^2, with S' and int S."""
+    """Return the impulse response S = e^(-a t) sin(w t) / w (w^2 = k - a^2), its rate S', and int S."""
     over, rate = _characteristic_root(decay, stiffness)
     half = jnp.where(over, 0.0, rate * time) / 2
     sine = jnp.sin(half)
@@ -304,7 +304,7 @@ def _impulse_response_jvp(primals, tangents):
 
 
 def _characteristic_root(decay, stiffness):
-    """Return whether a^2 > k (overdamped), and sqrt(|a^2 - k|) bounded away from 0."""
+    """Return whether a^2 > k (overdamped), and sqrt(|a^2 - k|) > 0, for a = `decay` and k = `stiffness`."""
     discriminant = decay**2 - stiffness
     floor = float(jnp.finfo(discriminant.dtype).tiny)
     return discriminant > 0, jnp.sqrt(jnp.maximum(jnp.abs(discriminant), floor))

@@ -77,7 +77,8 @@ class Preloaded(ContactLaw):
     def perturb_damping(self, drawn, ratio, mass, velocity):
         """Add friction that dissipates the fraction 1 - exp(-2 pi zeta) of the kinetic energy.
 
-        zeta is the damping ratio `ratio`. The path is twice the deepest penetration without friction.
+        zeta is the damping ratio `ratio`. The friction acts over twice the deepest penetration, computed
+        without friction.
         """
         preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]
         energy = (mass * velocity**2)[:, 0] / 2

@@ -42,7 +42,7 @@ class Regression:
 class RegressionFamily(NamedTuple):
     """Regressions of one contact law that differ in one nonlinear parameter, such as an exponent.
 
-    Identification searches the value of the parameter between `low` and `high`.
+    Identification chooses the value of the parameter, from `low` to `high`.
     """
 
     make: Callable[[float], Regression]  # returns the regression for a value of the parameter

@@ -1,4 +1,4 @@
-"""Conversion of a raw table into a `Mechanism`, key by key.
+"""Conversion of a table parsed from TOML or JSON into a `Mechanism`, key by key.
 
 The table is compared with the struct types of `jaxhil.mechanism.structs`. A message about an invalid key
 states the key's path, the value found and the allowed values. Rules that involve several keys are in
@@ -94,12 +94,12 @@ def format_entry_count(entries: Sequence[object]) -> str:
 
 
 def add_magnitude_limits(allowed: object) -> str:
-    """Add the range of magnitudes that computations support to the text `allowed`."""
+    """Append the supported range of magnitudes to `allowed`, the text of a key's allowed values."""
     return f"{allowed}, of a magnitude from {MAGNITUDE_LIMITS[0]:g} to {MAGNITUDE_LIMITS[1]:g}"
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
-    """Convert a raw table to a `Mechanism`. Raise `KeyProblem` for the first unknown or invalid key.
+    """Convert a parsed table to a `Mechanism`. Raise `KeyProblem` for the first unknown or invalid key.
 
     Integers are accepted as numbers. `contact.stiffness` and `contact.damping` may be a single number instead
     of a list. Leading zeros of a transfer function's polynomials are dropped.
@@ -108,7 +108,7 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
 
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
-    """Convert a raw table to a struct of type `kind`. Raise `KeyProblem` for an unknown or invalid key."""
+    """Convert a parsed table to a struct of type `kind`. Raise `KeyProblem` for an unknown or invalid key."""
     return msgspec.convert(_convert(_type_info(kind), raw, (), NO_METADATA), kind)
 
 

@@ -84,7 +84,7 @@ def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
 def remove_keys(
     keys: Sequence[str], matrix: Sequence[Sequence[Any]], removed: Collection[str]
 ) -> tuple[list[str], list[list[Any]]] | None:
-    """Return keys and lower triangle of the matrix without the `removed` keys, or None if no key remains."""
+    """Remove keys from the lower triangle of a correlation matrix; return None if no key remains."""
     rest = [i for i, key in enumerate(keys) if key not in removed]
     triangle = [[matrix[row][column] for column in rest if column <= row] for row in rest]
     return ([keys[i] for i in rest], triangle) if rest else None

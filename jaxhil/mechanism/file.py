@@ -87,7 +87,7 @@ def load(
         unset: PATHs of keys to remove afterwards, as for ``--unset``.
 
     Raises:
-        InputError: if the file or a change is wrong, or the mechanism has six axes.
+        InputError: if the file or a change is invalid, or the mechanism has six axes.
     """
     raw, sha256, label = _read_table(path_or_name)
     return LoadedMechanism(
@@ -106,7 +106,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 (hex) of the file with this mechanism, or of the content if no file was read."""
+    """Return the SHA-256 (hex) of the mechanism's file, or of its content if it was not read from a file."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 
@@ -164,7 +164,7 @@ def builtin_names() -> list[str]:
 def suite_names() -> list[str]:
     """Return the names of the standard suites.
 
-    The suites are built-in mechanism files for comparing compensators: one rig, each with one difficulty.
+    Each suite is a built-in mechanism with the same rig and one difficulty, for comparing compensators.
     """
     return [name for name in _builtin_paths() if name.startswith(SUITE_PREFIX)]
 
@@ -186,7 +186,7 @@ def builtin_path(name: str) -> Path:
 
 
 def _read_table(path_or_name: str | os.PathLike[str] | None) -> tuple[dict[str, Any], str, str]:
-    """Return the raw table of a mechanism file, the SHA-256 of its bytes, and its printable name."""
+    """Return the parsed table of a mechanism file, the SHA-256 of its bytes, and its printable name."""
     name = DEFAULT_MECHANISM if path_or_name is None else path_or_name
     if isinstance(name, str) and name in (*builtin_names(), *suite_names(), *six_axis_names()):
         path, label = builtin_path(name), name
@@ -221,7 +221,7 @@ def _make_missing_error(label: str) -> InputError:
 
 
 def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
-    """Convert a raw table to a mechanism and check all rules. Raise `KeyProblem` for an invalid key."""
+    """Convert a parsed table to a mechanism and check all rules. Raise `KeyProblem` for an invalid key."""
     if is_six_axes(raw):
         check_contact_names(raw)
         six_axis_mechanism = to_struct(SixAxisMechanism, raw)
@@ -242,7 +242,7 @@ def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
 
 
 def _find_problem(raw: Mapping[str, Any]) -> str:
-    """Return the message about the first invalid key of a raw table, or an empty text."""
+    """Return the message about the first invalid key of a parsed table, or an empty text."""
     try:
         _validate(raw)
     except KeyProblem as problem:
@@ -251,7 +251,7 @@ def _find_problem(raw: Mapping[str, Any]) -> str:
 
 
 def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the requested changes, by the option or the argument that requests them (for messages)."""
+    """Return the requested changes, by the name of the option or argument for messages."""
     is_mapping = isinstance(overrides, Mapping)
     return {
         "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),

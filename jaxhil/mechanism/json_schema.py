@@ -1,4 +1,4 @@
-"""JSON Schema of mechanism files, with which editors complete keys, show descriptions and mark errors.
+"""JSON Schema of mechanism files, for completion, descriptions and error marks in editors.
 
 The schema contains the allowed values of each key. Rules that involve several keys are checked when a file is
 read.

@@ -85,7 +85,7 @@ def _parse_text(text: str) -> tuple[KeyPath, Any]:
 
 
 def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[str, Any]:
-    """Return a copy of a raw table with a new value at `path`; create the missing tables on the path.
+    """Return a copy of a parsed table with a new value at `path`; create the missing tables on the path.
 
     The value None removes the key with all keys below it, and their entries in ``[uncertainty]`` and
     ``[correlation]``. Raise `KeyProblem` if the schema has no such path, a list has no such entry, or the key
@@ -107,13 +107,13 @@ def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[st
 
 
 def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
-    """Return the numeric keys that a raw six-axis table may have, with their allowed ranges."""
+    """Return the numeric keys that a parsed six-axis table may have, with their allowed ranges."""
     tables = (raw.get(key) for key in ("contact", "latch"))
     return numeric_keys_with(*(tuple(map(str, t)) if isinstance(t, Mapping) else () for t in tables))
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
-    """Return the path before ``=`` and the position after ``=``; messages show `key` if it is not None."""
+    """Return the path before ``=`` and the position after ``=``; messages show `key`, or else `text`."""
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
@@ -157,7 +157,7 @@ def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
 
 
 def _remove_key(raw: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
-    """Return a raw table without the key at `path`, its uncertainty and its correlation."""
+    """Return a parsed table without the key at `path`, its uncertainty and its correlation."""
     changed, key = _remove_from_table(raw, path, 0), format_key_path(path)
     if isinstance(table := changed.get("uncertainty"), Mapping):
         entries = {name: entry for name, entry in table.items() if not f"{name}.".startswith(f"{key}.")}
@@ -169,7 +169,7 @@ def _remove_key(raw: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
 
 
 def _remove_correlations(raw: dict[str, Any], certain: list[str]) -> dict[str, Any]:
-    """Return a raw table without the correlations of `certain` keys, whose uncertainty is removed."""
+    """Return a parsed table without the correlations of the keys `certain`, which are no longer uncertain."""
     table = raw.get("correlation")
     if not certain or table is None:
         return raw

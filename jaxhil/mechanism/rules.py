@@ -200,8 +200,8 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
     """Check that G(s) is strictly proper and stable, with G(0) = 1. Raise `KeyProblem`."""
     path = ("rig", "simulator")
     if len(numerator) >= len(denominator):
-        found = f"degree {len(numerator) - 1} over degree {len(denominator) - 1}"
-        expected = "a strictly proper transfer function, with a degree below that of the denominator"
+        found = f"degree {len(numerator) - 1}, and degree {len(denominator) - 1} of the denominator"
+        expected = "a degree below that of the denominator (a strictly proper transfer function)"
         raise KeyProblem((*path, "numerator"), found, expected)
     if not is_hurwitz(denominator):
         expected = "a stable motion simulator: every pole in the open left half plane"
@@ -214,7 +214,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 
 
 def _check_hold(mechanism: Mechanism) -> None:
-    """Check that a damped contact has no ideal simulator with zero-order hold. Raise `KeyProblem`."""
+    """Check that no ideal simulator with zero-order hold has a damped contact. Raise `KeyProblem`."""
     # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)

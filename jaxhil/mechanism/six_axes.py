@@ -153,7 +153,7 @@ class Shape(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
     shape: Annotated[ShapeName, key_metadata("kind of shape")]
     centre: Annotated[list[Metre], vector_metadata("centre of the sphere or box")] | None = None
     radius: Annotated[float, key_metadata("radius of the sphere or capsule", "m", ge=0.0)] | None = None
-    inside: Annotated[bool, key_metadata("whether a sphere is touched from inside, like a tether's end")] = (
+    inside: Annotated[bool, key_metadata("whether the sphere is touched from inside, as for a tether")] = (
         False
     )
     point: Annotated[list[Metre], vector_metadata("point on the plane")] | None = None
@@ -181,7 +181,7 @@ class Shape(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True,
 
 
 class Pattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Circular pattern: copies of a shape, of a pair of shapes or of a point, at equal angles about z."""
+    """Circular pattern: copies of a pair of shapes, or of a latch point, at equal angles about z."""
 
     count: Annotated[int, key_metadata("number of copies", "1", ge=1, le=256)]
     phase: Annotated[float, key_metadata("angle of the first copy", "rad")] = 0.0
@@ -251,7 +251,7 @@ class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Latch that catches a point of the chaser and then holds the chaser by a six-axis spring."""
 
     chaser: Annotated[list[Metre], vector_metadata("the point, in C axes")]
-    pattern: Annotated[Pattern, key_metadata("copies of the point, held alike")] | None = None
+    pattern: Annotated[Pattern, key_metadata("copies of the point, with the same spring")] | None = None
     depth: (
         Annotated[float, key_metadata("least depth below the plane z = 0 of T for catching", "m", ge=0.0)]
         | None
@@ -268,7 +268,11 @@ class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     stiffness_matrix: (
         Annotated[
             list[StiffnessRow],
-            Meta(min_length=6, max_length=6, description="its matrix instead, in T axes: force, then moment"),
+            Meta(
+                min_length=6,
+                max_length=6,
+                description="stiffness matrix, instead of stiffness, in T axes: force, moment",
+            ),
         ]
         | None
     ) = None
@@ -305,7 +309,7 @@ AnyMechanism = Mechanism | SixAxisMechanism
 
 
 def is_six_axes(raw: object) -> bool:
-    """Return whether the key `schema` of a raw table is the six-axis schema."""
+    """Return whether the key `schema` of a parsed table is the six-axis schema."""
     return isinstance(raw, Mapping) and raw.get("schema") == SIX_AXIS_SCHEMA
 
 
@@ -318,7 +322,7 @@ def numeric_keys_of(mechanism: AnyMechanism) -> dict[str, Range]:
 
 @functools.cache
 def numeric_keys_with(contacts: tuple[str, ...], latches: tuple[str, ...]) -> dict[str, Range]:
-    """Return the allowed values of every real-valued key, for the names of all contacts and latches."""
+    """Return the allowed values of every real-valued key, given the names of all contacts and latches."""
     names: Any = {"contact": contacts, "latch": latches}
     return ranges_of(six_axis_type(), names)
 

@@ -58,7 +58,7 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
-    """Check that a latch has exactly one spring, and its conditions for catching. Raise `KeyProblem`."""
+    """Check that a latch has exactly one stiffness, and conditions for catching. Raise `KeyProblem`."""
     path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
         expected = "false: an approach starts without a latch that holds (use [start] instead)"
@@ -72,15 +72,15 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
         raise KeyProblem((*path, "stiffness"), found, "six numbers, or stiffness_matrix instead")
     if latch.stiffness_matrix is not None:
         matrix = np.asarray(latch.stiffness_matrix)
-        size = np.max(np.abs(matrix))
-        if np.any(np.abs(matrix - matrix.T) > 1e-12 * size) or np.linalg.eigvalsh(matrix)[0] < -1e-9 * size:
+        scale = np.max(np.abs(matrix))
+        if np.any(np.abs(matrix - matrix.T) > 1e-12 * scale) or np.linalg.eigvalsh(matrix)[0] < -1e-9 * scale:
             found = "a matrix that is not symmetric or has an eigenvalue below 0"
             expected = "the matrix of a spring: symmetric, without eigenvalues below 0"
             raise KeyProblem((*path, "stiffness_matrix"), found, expected)
 
 
 def _check_shape(path: KeyPath, shape: Shape) -> None:
-    """Check that a shape has the keys of its kind, with possible values. Raise `KeyProblem`."""
+    """Check that a shape has the keys of its kind, with valid values. Raise `KeyProblem`."""
     required, optional = KEYS_OF_SHAPES[shape.shape]
     for key, value in _file_values(shape).items():
         if key in required and value is None:
@@ -109,7 +109,7 @@ def _check_shape(path: KeyPath, shape: Shape) -> None:
 
 
 def _check_pair(path: KeyPath, contact: Contact) -> None:
-    """Check that contact between the two shapes is supported and possible. Raise `KeyProblem`."""
+    """Check that a pair of shapes is supported, and that a sphere fits into a hollow shape."""
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
         raise KeyProblem(
@@ -123,11 +123,11 @@ def _check_pair(path: KeyPath, contact: Contact) -> None:
         expected = "a number > 0 m, because a drogue with mouth_radius is a thin shell"
         raise KeyProblem((*path, "chaser", "radius"), format_value(chaser.radius), expected)
     for body, ball, socket in (("chaser", chaser, target), ("target", target, chaser)):
-        narrow = (
+        inner_radius = (
             socket.bottom_radius if socket.shape == "drogue" else socket.radius if socket.inside else None
         )
-        if narrow is not None and not (ball.radius or 0.0) < narrow:
-            expected = f"a number < {narrow:g} m, the radius of the shape around it"
+        if inner_radius is not None and not (ball.radius or 0.0) < inner_radius:
+            expected = f"a number < {inner_radius:g} m, the radius of the shape around it"
             raise KeyProblem((*path, body, "radius"), format_value(ball.radius), expected)
 
 

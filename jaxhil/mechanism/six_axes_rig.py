@@ -87,7 +87,7 @@ def zeros(count: int) -> Callable[[], list[Any]]:
 
 
 class TargetRobot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Robot under the target; keys that are omitted have the values of the chaser's robot."""
+    """Robot that moves the target's mechanism; omitted keys have the values of the chaser's robot."""
 
     share: Annotated[
         list[Share], six_axis_metadata("share of each coordinate's motion that this robot makes")
@@ -197,7 +197,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         default_factory=zeros(6)
     )
     quantum: Annotated[
-        list[LoadMagnitude], six_axis_metadata("step to whose multiples a reading is rounded", LOAD_NAMES)
+        list[LoadMagnitude], six_axis_metadata("resolution: every reading is a multiple of this", LOAD_NAMES)
     ] = field(default_factory=zeros(6))
     dead_zone: Annotated[
         list[LoadMagnitude], six_axis_metadata("magnitude below which the reading is 0", LOAD_NAMES)
@@ -218,7 +218,7 @@ class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     noise_std: Annotated[list[Error], six_axis_metadata("standard deviation of white noise")] = field(
         default_factory=zeros(6)
     )
-    quantum: Annotated[list[Error], six_axis_metadata("step to whose multiples a reading is rounded")] = (
+    quantum: Annotated[list[Error], six_axis_metadata("resolution: every reading is a multiple of this")] = (
         field(default_factory=zeros(6))
     )
 

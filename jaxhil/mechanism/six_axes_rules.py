@@ -45,7 +45,9 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     for table, names in (("contact", mechanism.contact), ("latch", mechanism.latch)):
         for name in names:
             if not NAME_PATTERN.fullmatch(name):
-                raise KeyProblem((table, name), "this name", "at most 60 letters, digits, - and _")
+                raise KeyProblem(
+                    (table, name), f"the name {format_value(name)}", "at most 60 letters, digits, - and _"
+                )
     for name, contact in mechanism.contact.items():
         check_contact(mechanism, name, contact)
     for name, latch in mechanism.latch.items():
@@ -60,7 +62,7 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
 
 
 def check_contact_names(raw: Mapping[str, Any]) -> None:
-    """Check that all contacts and latches in a raw table have names. Raise `KeyProblem`."""
+    """Check that all contacts and latches in a parsed table have names. Raise `KeyProblem`."""
     for key, kind in (("contact", Contact), ("latch", Latch)):
         table = raw.get(key)
         entries = table.items() if isinstance(table, Mapping) else ()
@@ -105,16 +107,16 @@ def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -
     if len({isinstance(entry, list) for entry in inertia}) > 1:
         raise KeyProblem(path, format_value(inertia), "three moments, or three rows of three entries")
     matrix = inertia_matrix(inertia)
-    size = np.max(np.abs(matrix))
-    if size == 0:
+    scale = np.max(np.abs(matrix))
+    if scale == 0:
         if massless:
             return
         raise KeyProblem(path, "only zeros", "positive principal moments")
-    if np.any(np.abs(matrix - matrix.T) > 1e-12 * size):
-        row, column = np.argwhere(np.abs(matrix - matrix.T) > 1e-12 * size)[0]
+    if np.any(np.abs(matrix - matrix.T) > 1e-12 * scale):
+        row, column = np.argwhere(np.abs(matrix - matrix.T) > 1e-12 * scale)[0]
         found = f"{matrix[row, column]:g} at row {row + 1}, column {column + 1}, and {matrix[column, row]:g}"
         raise KeyProblem(path, found + " at the transposed entry", "a symmetric matrix")
-    first, second, third = map(float, np.linalg.eigvalsh(matrix / size) * size)
+    first, second, third = map(float, np.linalg.eigvalsh(matrix / scale) * scale)
     if not first > 0:
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
     if first < MIN_INERTIA_RATIO * third:
@@ -167,26 +169,25 @@ def _check_sides(mechanism: SixAxisMechanism) -> None:
     """
     for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
         axis = _rotate(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
-        along = float(axis @ np.asarray(body.interface))
-        if along * side < 0:
+        projection = float(axis @ np.asarray(body.interface))
+        if projection * side < 0:
             where = "behind T, at negative z" if side > 0 else "beyond C, at positive z"
-            found = f"a centre of mass at z = {-along:g} m of the interface frame"
+            found = f"a centre of mass at z = {-projection:g} m of the interface frame"
             raise KeyProblem((name, "interface"), found, f"a centre {where}: z points from target to chaser")
 
 
 def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
     """Rotate `vector` by the rotation vector `rotation` [rad] (Rodrigues' formula)."""
-    turn = np.asarray(rotation, float)
-    angle = float(np.linalg.norm(turn))
+    angle = float(np.linalg.norm(rotation))
     if angle == 0:
         return vector
-    axis = turn / angle
-    across = np.cross(axis, vector)
-    return vector + np.sin(angle) * across + (1 - np.cos(angle)) * np.cross(axis, across)
+    axis = np.asarray(rotation, float) / angle
+    perpendicular = np.cross(axis, vector)
+    return vector + np.sin(angle) * perpendicular + (1 - np.cos(angle)) * np.cross(axis, perpendicular)
 
 
 def _check_space(simulator: Simulator) -> None:
-    """Check that the motion simulator has the keys of its `space`, and legal values. Raise `KeyProblem`."""
+    """Check that the motion simulator has the keys of its `space`, with valid values. Raise `KeyProblem`."""
     path: KeyPath = ("rig", "simulator")
     required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
@@ -208,7 +209,7 @@ def _check_space(simulator: Simulator) -> None:
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
-    """Check that damping or friction has no ideal simulator with zero-order hold. Raise `KeyProblem`."""
+    """Check that no ideal simulator with zero-order hold has damping or friction. Raise `KeyProblem`."""
     # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig = mechanism.rig
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
@@ -221,8 +222,8 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
 def _check_sensor(rig: Rig) -> None:
     """Check the crosstalk of the force sensor, and its tool and gravity. Raise `KeyProblem`."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
-    mixed = np.eye(6) + np.asarray(sensor.crosstalk)
-    if not np.linalg.cond(mixed) < 100:
+    mixing = np.eye(6) + np.asarray(sensor.crosstalk)
+    if not np.linalg.cond(mixing) < 100:
         found = "channels that are nearly identical"
         expected = "a matrix E such that 1 + E has a condition number below 100"
         raise KeyProblem((*path, "crosstalk"), found, expected)

@@ -53,9 +53,9 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
     """Return random draws of every uncertain key, from draw number `first` on.
 
     The result contains an array for each key by its dotted path, in the unit of the key: (number,) for a
-    number, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number, contacts). A
-    Philox generator for each key and 1024 draws generates uniform numbers, which the quantile function of the
-    distribution converts. Raise ValueError for a negative argument.
+    number, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number, contacts). For
+    each key and every 1024 draws a Philox generator draws uniform numbers, which the quantile function of the
+    key's distribution converts. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected >= 0")

@@ -30,7 +30,7 @@ def check_uncertainty(mechanism: AnyMechanism, path: str) -> Span:
         expected = f"the dotted path of a numeric key{suggest_names(path, key_ranges)}"
         if path in POLYNOMIALS:
             expected += " other than a polynomial, because G(0) = 1 is fixed"
-        raise KeyProblem(where, "no such uncertain key", expected)
+        raise KeyProblem(where, "a key that cannot be uncertain", expected)
     value = value_at(mechanism, path)
     if value is None or value == [] or np.all(np.isinf(value)):
         expected = f"a key with a value: set {path}, or unset its uncertainty"
