@@ -1,13 +1,13 @@
 """Contact simulation of a hardware-in-the-loop docking rig, and the controller that runs on the rig.
 
-    load       read a mechanism file, or a built-in one, with one axis or with six
-    simulate   simulate the contacts of a mechanism under a compensator, once
-    jacobian   differentiate a metric of each contact with respect to mechanism and gains
-    register   add a compensator or a contact law of your own
+    load       read a mechanism file or a built-in mechanism, with one axis or six axes
+    simulate   simulate the contacts of a mechanism with a compensator, once
+    jacobian   differentiate a metric of each contact with respect to mechanism parameters and gains
+    register   add your own compensator or contact law
 
-Numbers are in SI units; arrays are NumPy arrays of float64, whatever precision JAX uses. A wrong argument
-raises `InputError` with a message of one line. Modules are imported on first use: the rig's controller,
-`jaxhil.rig`, needs neither JAX nor NumPy.
+Numbers are in SI units. Arrays are NumPy arrays of float64, whatever precision JAX uses. An invalid argument
+raises `InputError` with a one-line message. Modules are imported on first use, so that the rig's controller
+`jaxhil.rig` needs neither JAX nor NumPy.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""`jaxhil.simulate` for mechanisms of one axis or of six axes."""
+"""Public function `jaxhil.simulate`, for mechanisms with one axis or six axes."""
 
 import os
 from collections.abc import Mapping
@@ -33,18 +33,18 @@ def simulate(
     *,
     seed: int = 0,
 ) -> Any:
-    """Run the contacts of a nominal mechanism once; with six axes, its episodes.
+    """Simulate the contacts of a nominal mechanism on the rig once, with a compensator.
 
     Args:
-        mechanism: Result of `jaxhil.load`, name of a built-in mechanism, or path.
+        mechanism: Result of `jaxhil.load`, name of a built-in mechanism, or path of a mechanism file.
         compensator: Name of a compensator; with six axes "none", "phase_lead" or "phase_lead_per_axis".
-        gains: None for the literature's gains, a dict of some gains (the others are the literature's), the
-            name of one of the compensator's settings, or the path of a gain file; with a file, the
-            compensator "none" means that of the file.
+            With a gain file, "none" stands for the compensator of the file.
+        gains: None for the literature's gains, a dict of gains by name (missing gains keep the literature's
+            values), the name of one of the compensator's settings, or the path of a gain file.
         seed: Seed of the sensors' noise.
 
     Returns:
-        A `Run`, or a `SixAxisRun` for six axes.
+        A `Run` for a mechanism with one axis, or a `SixAxisRun` for a mechanism with six axes.
 
     Raises:
         InputError: An argument is invalid.

@@ -1,7 +1,7 @@
-"""Error class for wrong input, and functions that put values into its one-line messages.
+"""Error class for invalid input, and functions that format values for its one-line messages.
 
-Wrong input (a file, a key, an option) raises an `InputError`. Its message is a single printable line that
-names the place, the value found there and the allowed values.
+Invalid input (a file, a key, an option) raises an `InputError`. Its message is one printable line with the
+file and key, or the option, the value found, and the expected values.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ __all__ = ["InputError", "format_value", "to_one_line"]
 
 
 class InputError(ValueError):
-    """Error for unusable input, with a message of one line: ``FILE: key.path: found X, expected Y``."""
+    """Error for invalid input, with a one-line message: ``FILE: key.path: found X, expected Y``."""
 
 
 def to_one_line(text: str, limit: int | None = None) -> str:
-    """Return `text` with every unprintable character escaped, cut to `limit` characters."""
+    """Escape every unprintable character of `text`; shorten the result to at most `limit` characters."""
     escaped = "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode()
         for character in text
@@ -34,7 +34,7 @@ def format_value(value: object, limit: int = 60) -> str:
         # The text of a table is long, and `repr` fails on deeply nested tables.
         return "a table"
     if isinstance(value, str):
-        # Cutting before the escaping as well limits the work for a long text.
+        # A long text is shortened before the escaping too, which saves time.
         value = value[: limit + 1]
     try:
         return to_one_line(repr(value), limit)

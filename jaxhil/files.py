@@ -1,8 +1,8 @@
-"""Atomic writes, checksummed ("sealed") files, and protection of files that this program did not write.
+"""Atomic writes, checksummed files, and protection of files that this program did not write.
 
-The program writes regular files only. A link, a pipe or a device in the place of a file is neither followed,
-opened nor replaced. A sealed file begins with the SHA-256 of its content, as a line of hexadecimal digits,
-which is checked before the content is used.
+The program writes regular files only. It neither follows, opens nor replaces a link, a pipe or a device that
+has the name of a file. A checksummed file begins with the SHA-256 of its content, as a line of hexadecimal
+digits. The checksum is verified before the content is used.
 """
 
 import ctypes
@@ -22,11 +22,11 @@ from typing import BinaryIO
 from jaxhil.errors import InputError, format_value, to_one_line
 
 TEMPORARY_SUFFIX = ".tmp"  # suffix of the temporary name under which a file is first written
-CHECKSUM_LENGTH = 65  # number of bytes before the content of a sealed file
+CHECKSUM_LENGTH = 65  # number of bytes before the content of a checksummed file
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_PROCESS_TOKEN = secrets.token_hex(4)  # a process number alone is not unique, since it is used again
+_PROCESS_TOKEN = secrets.token_hex(4)  # the system reuses process numbers, so that they are not unique
 _TEMPORARY_NAME_PATTERN = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY_SUFFIX)}")
 _name_counter = count()
 
@@ -46,7 +46,7 @@ def report_write_errors(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def to_path(path: object) -> Path:
-    """Return a caller's argument as a `Path`. Raise `InputError` if it is not a path."""
+    """Convert a user's argument to a `Path`. Raise `InputError` if the argument is not a path."""
     if isinstance(path, (str, os.PathLike)) and isinstance(os.fspath(path), str):
         return Path(path)
     raise InputError(f"path: found {format_value(path)}, expected a path")
@@ -65,7 +65,7 @@ def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
 
 
 def write_atomically(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """Write a file atomically; a `lasting` file survives a power cut once this function has returned.
+    """Write a file atomically. A `lasting` file is on disk, safe from a power cut, when the function returns.
 
     Raise OSError if the file cannot be written, or if `path` exists and is not a regular file.
     """
@@ -110,34 +110,31 @@ def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
 
 
 def write_checksummed(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """Write the content after its seal with `write_atomically`; the seal reveals any later damage."""
-    seal = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
-    write_atomically(path, seal + bytes(content), lasting)
+    """Write a checksummed file (a line with the SHA-256 of the content, then the content) atomically."""
+    checksum = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
+    write_atomically(path, checksum + bytes(content), lasting)
 
 
 def read_checksummed(path: Path) -> bytes | None:
-    """Return what `write_checksummed` wrote, or None if the file is missing or differs by any bit."""
+    """Return the content of a checksummed file, or None if the file cannot be read or is damaged."""
     try:
         with open_regular(path) as file:
-            sealed = file.read()
+            whole = file.read()
     except (OSError, ValueError):
         return None
-    content = sealed[CHECKSUM_LENGTH:]
-    return (
-        content
-        if sealed[:CHECKSUM_LENGTH] == hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
-        else None
-    )
+    content = whole[CHECKSUM_LENGTH:]
+    checksum = hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
+    return content if whole[:CHECKSUM_LENGTH] == checksum else None
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a regular file for reading. Raise OSError at once for a link, a pipe or a device."""
+    """Open a regular file for reading. Raise OSError, without waiting, for a link, a pipe or a device."""
     _check_regular(os.lstat(path).st_mode)
     return _open_checked(path, _OPEN_FLAGS)
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a user's file for reading; links are followed. Raise OSError for a pipe, a device or a folder."""
+    """Open a user's file for reading and follow links. Raise OSError for a pipe, a device or a folder."""
     mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
@@ -146,7 +143,7 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
-    """Open a file for reading. Raise OSError unless the open file is a regular one."""
+    """Open a file for reading. Raise OSError unless the opened file is a regular file."""
     descriptor = os.open(path, flags)
     try:
         _check_regular(os.fstat(descriptor).st_mode)
@@ -158,7 +155,10 @@ def _open_checked(path: str | os.PathLike[str], flags: int) -> BinaryIO:
 
 @contextmanager
 def lock_file(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on a file. Raise BlockingIOError if it is locked, or another OSError."""
+    """Hold an exclusive lock on a file, which is created if it does not exist.
+
+    Raise BlockingIOError if the file is locked already, or another OSError if it cannot be opened.
+    """
     import fcntl
 
     with suppress(FileNotFoundError):
@@ -173,9 +173,9 @@ def lock_file(path: Path) -> Iterator[None]:
 
 
 def resolve_output_path(path: str | os.PathLike[str]) -> Path:
-    """Return the file to which a user's output path leads; links are followed.
+    """Follow the links of a user's output path and return the path of the file itself.
 
-    Raise OSError if the file exists and is not a regular one.
+    Raise OSError if the file exists and is not a regular file.
     """
     target = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     with suppress(FileNotFoundError):
@@ -186,7 +186,7 @@ def resolve_output_path(path: str | os.PathLike[str]) -> Path:
 def exchange_names(first: Path, other: Path) -> None:
     """Exchange the names of two files or folders atomically.
 
-    Raise OSError; its number is ENOSYS or EINVAL if the system does not support the exchange.
+    Raise OSError if the exchange fails, with errno ENOSYS or EINVAL if the system does not support it.
     """
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
@@ -208,7 +208,10 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the temporary files and folders of processes that no longer run. Raise OSError."""
+    """Remove the temporary files and folders in `folder` whose processes no longer run.
+
+    Raise OSError if the folder cannot be read or a file cannot be removed.
+    """
     with os.scandir(folder) as entries:
         for entry in entries:
             name = _TEMPORARY_NAME_PATTERN.fullmatch(entry.name)
@@ -222,17 +225,17 @@ def remove_stale(folder: Path) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a name is one of `temporary_name`."""
+    """Return whether a file name has the form of the names that `temporary_name` returns."""
     return _TEMPORARY_NAME_PATTERN.fullmatch(name) is not None
 
 
 def temporary_name() -> str:
-    """Return a new name for a file or folder that this process has not finished writing."""
+    """Return a unique name for a file or folder while this process writes it."""
     return f".jaxhil-{os.getpid()}-{_PROCESS_TOKEN}-{next(_name_counter)}{TEMPORARY_SUFFIX}"
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the entries of a folder to disk, so that they survive a power cut. Raise OSError."""
+    """Flush the entries of a folder to disk, so that they survive a power cut. Raise OSError on failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -241,7 +244,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _is_process_running(process: int, token: str) -> bool:
-    """Return whether the process that made a temporary name still runs."""
+    """Return whether the process with a number and token from a temporary name still runs."""
     if process == os.getpid():
         return token == _PROCESS_TOKEN
     try:
@@ -254,12 +257,12 @@ def _is_process_running(process: int, token: str) -> bool:
 
 
 def _check_regular(mode: int) -> None:
-    """Raise OSError unless `mode` is that of a regular file."""
+    """Raise OSError unless a file with the `st_mode` value `mode` is a regular file."""
     if not stat.S_ISREG(mode):
         raise OSError(errno.EEXIST, f"found {_describe_kind(mode)}, expected a plain file")
 
 
 def _describe_kind(mode: int) -> str:
-    """Return the kind of file, in words, that `mode` states."""
+    """Return the kind of a file with the `st_mode` value `mode` in words, such as "a link"."""
     kinds = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFREG: "a file"}
     return kinds.get(stat.S_IFMT(mode), "a device")

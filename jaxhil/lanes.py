@@ -1,4 +1,7 @@
-"""Operations on batches of scenarios, lane by lane; the last axes of every array are the lanes."""
+"""Operations on batches, lane by lane.
+
+A lane is one element of a batch, such as one scenario. The last axes of every array are the lanes.
+"""
 
 from typing import Any
 
@@ -8,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 
 def select_lanes(condition: Bool[Array, "*batch"], when_true: Any, when_false: Any) -> Any:
-    """Return the leaves of `when_true` on the lanes where the condition holds, else those of `when_false`.
+    """Select the leaves of `when_true` in lanes that satisfy the condition, else the leaves of `when_false`.
 
     Args:
-        condition: Condition of each lane.
+        condition: Whether each lane takes its values from `when_true`.
         when_true: Pytree of arrays whose last axes are the lanes.
         when_false: Pytree of the same structure and shapes.
     """
@@ -23,7 +26,7 @@ def select_lanes(condition: Bool[Array, "*batch"], when_true: Any, when_false: A
 
 
 def safe_sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root; it and its derivative are 0 where the number is not positive."""
+    """Return the square root. Where `square` is not positive, the root and its derivative are 0."""
     positive = square > 0
-    # The branch that is not selected must not be sqrt(0): its derivative would be 0 times infinity.
+    # JAX also differentiates the branch that is not selected: with sqrt(0) this would give 0 times infinity.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)

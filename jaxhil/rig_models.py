@@ -1,4 +1,4 @@
-"""Choice of the rig model for a mechanism: along one axis or in six."""
+"""Choice of the rig model for a mechanism with one axis or six axes."""
 
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
@@ -7,7 +7,7 @@ from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 def choose_rig_model(mechanism: AnyMechanism) -> RigModel:
-    """Return the rig model for a mechanism; six-axis code is imported only if needed.
+    """Return the rig model for a mechanism. The six-axis code is imported only for a six-axis mechanism.
 
     Example:
         >>> import jaxhil

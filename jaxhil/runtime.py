@@ -1,6 +1,6 @@
-"""Former name of `jaxhil.rig`, available for one more release.
+"""Deprecated alias of the package `jaxhil.rig`, available for one more release.
 
-Its modules, such as `jaxhil.runtime.controller`, are those of `jaxhil.rig`.
+The alias has the same modules: `jaxhil.runtime.controller` is `jaxhil.rig.controller`.
 """
 
 import sys
